@@ -16,22 +16,9 @@ from unprocess_gen.config.accuracy import choose_methods, is_steep
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
+from unprocess_gen.core import types
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, stream_key
-from unprocess_gen.core.types import (
-    FLOAT32,
-    AccuracyPlan,
-    CameraPlan,
-    DarkFramePlan,
-    DarkFrames,
-    Facts,
-    IspPlan,
-    NoisePlan,
-    OutputPlan,
-    Plan,
-    ScenePlan,
-    SensorPlan,
-    SourcePlan,
-)
+from unprocess_gen.core.types import DarkFrames, Facts, Plan
 from unprocess_gen.planning.draws import COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
@@ -91,10 +78,9 @@ def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: i
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
-    shading = dark_frames.shading
-    black_dn = dark_frames.black_dn if shading is None else shading.black_dn
-    dark = DarkFramePlan(frame.sha256, shift, black_dn, dark_frames.scale, "" if shading is None else shading.sha256)
-    return plan.replace(dark=dark)
+    shading, scale = dark_frames.shading, dark_frames.scale
+    black_dn, map_sha256 = (dark_frames.black_dn, "") if shading is None else (shading.black_dn, shading.sha256)
+    return plan.replace(dark=types.DarkFramePlan(frame.sha256, shift, black_dn, scale, map_sha256))
 
 
 def _even_place(word: int, available: int, needed: int) -> int:
@@ -150,7 +136,7 @@ class Planner:
         self._levels = [kind(level, number) for number, level in enumerate(levels)]
         budget, counts_electrons = config.accuracy, interpretation.uses_physics(config.noise)
         self._accuracy, self._steep_accuracy = (
-            AccuracyPlan(
+            types.AccuracyPlan(
                 config.accuracy.name,
                 choose_methods(
                     budget,
@@ -163,12 +149,12 @@ class Planner:
             for steep in (False, True)
         )
         self._scene_name, self._highlight = config.scene.name, (config.gains.highlight, config.gains.threshold)
-        self._source = SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
-        self._isp = IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
+        self._source = types.SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
+        self._isp = types.IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
         sensor = config.sensor
-        self._sensor = SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
-        self._output = OutputPlan(
-            config.output.dtype, config.output.layout, FLOAT32 if interpretation.has_float_clean(config) else ""
+        self._sensor = types.SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
+        self._output = types.OutputPlan(
+            config.output.dtype, config.output.layout, types.FLOAT32 if interpretation.has_float_clean(config) else ""
         )
 
     def levels(
@@ -186,7 +172,7 @@ class Planner:
             raise ValueError("a physical profile needs the facts of the pixels")
         key = stream_key(seed, source_sha256, occurrence)
         uniforms = parameter_uniforms(key, COUNT)
-        scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
+        scene = types.ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         camera = self._draw_camera(uniforms)
         steep = self._steep_accuracy != self._accuracy and is_steep(camera, scene.exposure)
         accuracy = self._steep_accuracy if steep else self._accuracy
@@ -203,10 +189,10 @@ class Planner:
             plan = Plan(seed, key, self._source, scene, camera, self._isp, self._sensor, noise, accuracy, self._output)
             yield plan, selection
 
-    def _draw_camera(self, uniforms: Sequence[float]) -> CameraPlan:
+    def _draw_camera(self, uniforms: Sequence[float]) -> types.CameraPlan:
         """Draw colours and gains."""
         name, weights, rgb2cam = plan_camera(self._camera, uniforms)
-        return CameraPlan(
+        return types.CameraPlan(
             name,
             weights,
             rgb2cam,
@@ -217,7 +203,7 @@ class Planner:
         )
 
 
-NoiseAndSelection = tuple[NoisePlan, Selection | None]
+NoiseAndSelection = tuple[types.NoisePlan, Selection | None]
 """Noise of a plan, and the selection of effects of a physical profile."""
 
 
@@ -263,7 +249,7 @@ class TwoNumberLevel:
         a_dn, b_dn2 = self.two_numbers(uniforms)
         effects, skipped = plan_effects(self._config, a_dn, b_dn2, self._span_dn)
         noise, clip = self._config.noise, self._config.sensor.clip
-        plan = NoisePlan(
+        plan = types.NoisePlan(
             noise.name, noise.law, a_dn, b_dn2, effects, skipped, clip, self._saturated, level=self._number
         )
         return plan, None
@@ -310,7 +296,7 @@ class PhysicalLevel:
             physics = replace(physics, frame_size=(image.facts.height, image.facts.width))
         selection = select_effects(self._rules, physics, image.facts, image.signals)
         profile = self._noise.noise
-        plan = NoisePlan(
+        plan = types.NoisePlan(
             profile.name,
             profile.law,
             physics.dn_per_e,

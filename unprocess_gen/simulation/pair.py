@@ -10,6 +10,7 @@ clip and round both frames (`_reference_pair`).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -120,14 +121,9 @@ def _passes(plans: Sequence[Plan]) -> Iterator[list[Plan]]:
 
     Each pass recomputes the clean frame, which costs less than storing it unrounded.
     """
-    some: list[Plan] = []
-    for plan in plans:
-        if some and (len(some) == FRAMES_PER_PASS or pass_key(plan) != pass_key(some[0])):
-            yield some
-            some = []
-        some.append(plan)
-    if some:
-        yield some
+    for _, group in itertools.groupby(plans, pass_key):
+        alike = list(group)
+        yield from (alike[n : n + FRAMES_PER_PASS] for n in range(0, len(alike), FRAMES_PER_PASS))
 
 
 def reference_pair(
@@ -234,13 +230,9 @@ def _check_image(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> None:
     if plan.output.layout == PACKED and (srgb.shape[0] % 2 or srgb.shape[1] % 2):
         raise ValueError(f"srgb={list(srgb.shape)}: odd side; expected even height and width for layout={PACKED}")
     if plan.noise.physics is not None and "lens_shading" in plan.noise.effects:
-        _check_inside(srgb.shape, plan.noise.physics.frame_size, origin)
-
-
-def _check_inside(shape: tuple[int, ...], frame_size: tuple[int, int], origin: tuple[int, int]) -> None:
-    """Raise ValueError if an image is not inside the frame to which the lens shading belongs."""
-    if origin[0] + shape[0] > frame_size[0] or origin[1] + shape[1] > frame_size[1]:
-        raise ValueError(
-            f"srgb={list(shape)}: exceeds the frame {list(frame_size)} of the lens shading at {list(origin)}; "
-            "expected a part of the frame"
-        )
+        height, width = plan.noise.physics.frame_size
+        if origin[0] + srgb.shape[0] > height or origin[1] + srgb.shape[1] > width:
+            raise ValueError(
+                f"srgb={list(srgb.shape)}: exceeds the frame {[height, width]} of the lens shading at {list(origin)}; "
+                "expected a part of the frame"
+            )

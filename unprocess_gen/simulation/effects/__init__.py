@@ -7,7 +7,6 @@ a number in `random_streams.STREAMS`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from unprocess_gen.core.types import Facts, Plan
 from unprocess_gen.simulation.effects.black_error import BlackError, BlackErrorNumbers
@@ -82,7 +81,6 @@ def profile_keys() -> dict[str, tuple[Effect, Number]]:
     return {key: keys[key] for key in dict.fromkeys((*_KEYS_OF_PROFILES, *keys))}
 
 
-@dataclass(frozen=True, kw_only=True)
 class Physics(
     LensShadingNumbers, PrnuNumbers, ShotNumbers, DarkCurrentNumbers, HotPixelNumbers, FullWellNumbers,
     GainByColourNumbers, ReadNumbers, RowNumbers, ColumnNumbers, ColumnTemporalNumbers, BlackErrorNumbers,

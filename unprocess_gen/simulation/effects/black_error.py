@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
-from unprocess_gen.simulation.effects.numbers import LARGEST, SITES, number
+from unprocess_gen.simulation.effects.numbers import LARGEST, SITES, Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
 
-@dataclass(frozen=True, kw_only=True)
-class BlackErrorNumbers:
+class BlackErrorNumbers(Numbers):
     """Black-level errors of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the 2x2 tile, DN."""
 
     black_error_dn: tuple[float, float, float, float] = number(
@@ -49,7 +45,7 @@ class BlackError(Effect):
         """Predict the largest error as an offset of all pixels."""
         return independent(frame, 0.0, max(abs(error) for error in frame.physics.black_error_dn))
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets by plane."""
         return {"planes_dn": plan.physics.black_error_dn}
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
-from unprocess_gen.simulation.effects.numbers import number_in_dn
+from unprocess_gen.simulation.effects.numbers import Numbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import LineOffsets, Words
 
 
-@dataclass(frozen=True, kw_only=True)
-class ColumnNumbers:
+class ColumnNumbers(Numbers):
     """Standard deviation of column offsets, DN."""
 
     column_std_dn: float = number_in_dn(
@@ -43,7 +39,7 @@ class Column(Effect):
         """Predict independent offsets of columns, the same in all frames."""
         return fixed_in_clip(frame, offsets_of_columns(frame, frame.physics.column_std_dn))
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the body."""
         physics = plan.physics
         return {"fixed_columns": LineOffsets(Words(physics.body_key, "column"), physics.column_std_dn)}

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, slot_words
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues, slot_words
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import number_in_dn
+from unprocess_gen.simulation.effects.numbers import Numbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import LineOffsets
 
 
-@dataclass(frozen=True, kw_only=True)
-class ColumnTemporalNumbers:
+class ColumnTemporalNumbers(Numbers):
     """Standard deviation of the temporal column offsets, DN."""
 
     column_temporal_std_dn: float = number_in_dn(
@@ -48,7 +44,7 @@ class ColumnTemporal(Effect):
         """Predict independent offsets of columns, new in every frame."""
         return new_in_every_frame(frame, offsets_of_columns(frame, frame.physics.column_temporal_std_dn))
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the frame."""
         std_dn = plan.physics.column_temporal_std_dn
         return {"columns": LineOffsets(slot_words(plan, "column_temporal"), std_dn)}

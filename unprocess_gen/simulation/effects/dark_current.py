@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, known_offset, poisson_noise
-from unprocess_gen.simulation.effects.numbers import Number, rate
+from unprocess_gen.simulation.effects.numbers import Number, Numbers, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import UniformCounts
@@ -34,8 +31,7 @@ HEAT = {
 """Keys of the profile from which the warmth of the sensor follows."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DarkCurrentNumbers:
+class DarkCurrentNumbers(Numbers):
     """Mean dark signal of the exposure, electrons."""
 
     dark_e: float = rate(
@@ -75,7 +71,7 @@ class DarkCurrent(Effect):
         offset_dn = physics.dn_per_e * physics.dark_e if physics.dark_offset == "kept" else 0.0
         return independent(frame, self.variance(frame, level_dn), offset_dn)
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the counts of one rate."""
         physics = plan.physics
         removed_e = physics.dark_e if physics.dark_offset == "removed" else 0.0

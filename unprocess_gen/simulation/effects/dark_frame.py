@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import DarkPixels, Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, Shape
+from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, SlotValues
 from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, EffectNoise, Site, uniform
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
@@ -107,7 +106,7 @@ class DarkFrame(Effect):
         """Return the dark frame."""
         return dark_frame_offsets(part.plan, part.dark_pixels, part.shape, part.origin)
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site with the dither, and the offsets by site."""
         dither = SiteNoise("dark_dither", dither_std_dn(plan), DITHER_LAW, DITHER_SHAPE)
         return {"noise": dither, "has_site_offsets": True}

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 from unprocess_gen.simulation.slots import DeadPixels as DeadSlot
 
 
-@dataclass(frozen=True, kw_only=True)
-class DeadPixelNumbers:
+class DeadPixelNumbers(Numbers):
     """Fraction of pixels that read 0."""
 
     dead_pixel_share: float = number(0.0, "fraction of dead pixels, which read 0", high=1.0, highest=1.0)
@@ -47,7 +43,7 @@ class DeadPixels(Effect):
         depth_dn = frame.black_level_dn + level_dn
         return frame.physics.dead_pixel_share if depth_dn * depth_dn > masking else 0.0
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the pixels that read 0."""
         physics = plan.physics
         return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share)}

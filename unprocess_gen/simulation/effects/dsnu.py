@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
-from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import NormalPattern
 
 
-@dataclass(frozen=True, kw_only=True)
-class DsnuNumbers:
+class DsnuNumbers(Numbers):
     """Standard deviation of the pixels' offsets, electrons."""
 
     dsnu_std_e: float = number(
@@ -51,7 +47,7 @@ class Dsnu(Effect):
         std_dn = frame.physics.dsnu_std_e * frame.physics.dn_per_e
         return independent(frame, 0.0, fixed_variance=std_dn * std_dn)
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets by site of the body."""
         physics = plan.physics
         return {"sites_dn": NormalPattern(physics.body_key, "dsnu", physics.dsnu_std_e * physics.dn_per_e)}

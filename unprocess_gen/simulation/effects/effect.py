@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.random_streams import Words, words
 from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import Number, numbers_of
+from unprocess_gen.simulation.effects.numbers import Number, Numbers, numbers_of
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.slots import Words as SlotWords
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from unprocess_gen.simulation.effects import Physics
 
 Shape = tuple[int, int]
+SlotValues = dict[str, Any]
+"""What an effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
 
 
 def frame_words(plan: Plan, stream: str, shape: tuple[int, ...], origin: Shape = (0, 0)) -> Words:
@@ -75,10 +77,6 @@ def slot_words(plan: Plan, stream: str) -> SlotWords:
     return SlotWords(plan.stream_key, stream, plan.noise.level, plan.noise.draw, plan.noise.frame)
 
 
-class NoNumbers:
-    """Numbers of an effect without any."""
-
-
 class Effect:
     """Effect of the sensor; a method that an effect does not define changes nothing.
 
@@ -119,7 +117,7 @@ class Effect:
     name: ClassVar[str]
     meaning: ClassVar[str]
     cost_ns: ClassVar[float]
-    numbers: ClassVar[type[Any]] = NoNumbers
+    numbers: ClassVar[type[Numbers]] = Numbers
     keys: ClassVar[Mapping[str, Number]] = {}
     heat: ClassVar[bool] = False
     has_switch: ClassVar[bool] = True
@@ -134,7 +132,7 @@ class Effect:
     @property
     def declared(self) -> dict[str, Number]:
         """Numbers by the names of their fields."""
-        return {} if self.numbers is NoNumbers else numbers_of(self.numbers)
+        return numbers_of(self.numbers)
 
     def light_factor(self, part: Part) -> Float | None:
         """Return the factor on the light of the clean frame, [H, W] of float32 values; None if it is 1."""
@@ -171,7 +169,7 @@ class Effect:
     def mean_electrons(self, part: Part) -> Float | float | None:
         """Return the electrons that the effect adds to the average of many frames."""
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Return what the effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
         return {}
 

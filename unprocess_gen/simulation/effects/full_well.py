@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
 FARTHEST_NORMAL, FARTHEST_HOT = 6.4, 7.7
 """Largest normal deviate in standard deviations, and largest hot-pixel current in means, of a 32-bit uniform."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FullWellNumbers:
+class FullWellNumbers(Numbers):
     """Saturation capacity, electrons."""
 
     full_well_e: float = number(0.0, "saturation capacity", unit="electrons", low=1.0, high=1e9, highest=1e9)
@@ -47,7 +44,7 @@ class FullWell(Effect):
         reach_e = _reach(signal_e) + _reach(physics.dark_e) + _reach(FARTHEST_HOT * physics.hot_pixel_e)
         return independent(frame, 0.0, max(reach_e - physics.full_well_e, 0.0) * physics.dn_per_e)
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the limit of the well."""
         return {"full_well_e": plan.physics.full_well_e}
 

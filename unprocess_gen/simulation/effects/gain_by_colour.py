@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 from unprocess_gen.core.types import Plan
-from unprocess_gen.simulation.effects.effect import Effect
-from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
+from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
 COLOURS = ("red", "green", "blue")
 
 
-@dataclass(frozen=True, kw_only=True)
-class GainByColourNumbers:
+class GainByColourNumbers(Numbers):
     """System gain of red, green and blue, relative to ``dn_per_e``."""
 
     gain_by_colour: tuple[float, float, float] = number(
@@ -51,6 +48,6 @@ class GainByColour(Effect):
         most_dn = shot_dn * max(abs(math.sqrt(gain) - 1) for gain in frame.physics.gain_by_colour)
         return independent(frame, most_dn * most_dn)
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the gains by plane."""
         return {"plane_gains": self.plane_gains(plan)}

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
 from decimal import Decimal, localcontext
-from typing import Any
 
 import numpy as np
 
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import number, rate
+from unprocess_gen.simulation.effects.numbers import Numbers, number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import BrightPixels
 
 
-@dataclass(frozen=True, kw_only=True)
-class HotPixelNumbers:
+class HotPixelNumbers(Numbers):
     """Fraction of hot pixels, and the mean of their exponentially distributed excess, electrons per exposure."""
 
     hot_pixel_share: float = number(0.0, "fraction of hot pixels", high=1.0, highest=1.0)
@@ -66,7 +63,7 @@ class HotPixels(Effect):
         least = math.floor(math.sqrt(masking) / physics.dn_per_e) + 1
         return _share_of_counts(physics.hot_pixel_share, physics.hot_pixel_e, least)
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the bright defects."""
         physics = plan.physics
         return {"bright": BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)}

@@ -6,15 +6,12 @@ or describe it with the centre at 1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, Shape
-from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, SlotValues
+from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.slots import RadialFactor
 
@@ -24,8 +21,7 @@ PLACES = 64
 Coefficients = tuple[float, float, float]
 
 
-@dataclass(frozen=True, kw_only=True)
-class LensShadingNumbers:
+class LensShadingNumbers(Numbers):
     """Coefficients of r², r⁴ and r⁶ in the relative illumination; r is 1 in the corners."""
 
     lens_shading: tuple[float, float, float] = number(
@@ -113,6 +109,6 @@ class LensShading(Effect):
         places = illumination_at(np.arange(PLACES + 1) / PLACES, frame.physics.lens_shading)
         return independent(frame, 0.0, level_dn * float(1 - places.min()))
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the factor on the light."""
         return {"light": RadialFactor(plan.physics.lens_shading, plan.physics.frame_size)}

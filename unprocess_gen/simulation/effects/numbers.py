@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, dataclass_transform
 
 METADATA = "number"
 """Key of a field's metadata that holds its `Number`."""
@@ -93,6 +93,15 @@ class Number:
     def in_branch(self) -> bool:
         """True for a key of the branches, false for a key of the profile."""
         return bool(self.forms or self.words)
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+@dataclass(frozen=True, kw_only=True)
+class Numbers:
+    """Numbers of an effect; a class that derives from it is a frozen dataclass of keyword arguments."""
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
 
 def number(default: Any, meaning: str, **details: Any) -> Any:

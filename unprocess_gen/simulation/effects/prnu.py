@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, gaussian
-from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import NormalPattern
 
 
-@dataclass(frozen=True, kw_only=True)
-class PrnuNumbers:
+class PrnuNumbers(Numbers):
     """Standard deviation of the pixels' relative gain."""
 
     prnu_std: float = number(
@@ -60,7 +56,7 @@ class Prnu(Effect):
         squared = physics.dn_per_e * physics.dn_per_e
         return independent(frame, squared * MEAN_ABS_NORMAL * change_e, fixed_variance=squared * change_e * change_e)
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the factor on the electrons."""
         physics = plan.physics
         return {"electrons": NormalPattern(physics.body_key, "prnu", physics.prnu_std, mean=1.0, least=0.0)}

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian, tukey_noise
-from unprocess_gen.simulation.effects.numbers import SHAPE, number, number_in_dn
+from unprocess_gen.simulation.effects.numbers import SHAPE, Numbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadNumbers:
+class ReadNumbers(Numbers):
     """Distribution of the read noise, shape of Tukey's lambda, and standard deviation, DN."""
 
     read_law: str = number(
@@ -65,7 +61,7 @@ class Read(Effect):
         """Return the square of the standard deviation, DN²."""
         return frame.physics.read_std_dn * frame.physics.read_std_dn
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site."""
         physics = plan.physics
         return {"noise": SiteNoise("read", physics.read_std_dn, physics.read_law, physics.read_shape)}

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, slot_words
+from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues, slot_words
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
-from unprocess_gen.simulation.effects.numbers import number, number_in_dn
+from unprocess_gen.simulation.effects.numbers import Numbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
 from unprocess_gen.simulation.slots import LineOffsets
 
 
-@dataclass(frozen=True, kw_only=True)
-class RowNumbers:
+class RowNumbers(Numbers):
     """Standard deviation of row offsets, DN, and correlation of the offsets of neighbouring rows."""
 
     row_std_dn: float = number_in_dn(
@@ -67,7 +63,7 @@ class Row(Effect):
             rows, rows_of_plane = max(rows / together, 1.0), max(rows_of_plane / together, 1.0)
         return new_in_every_frame(frame, (variance, variance, variance / rows, variance / rows_of_plane))
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of rows."""
         physics = plan.physics
         return {"rows": LineOffsets(slot_words(plan, "row"), physics.row_std_dn, physics.row_correlation)}

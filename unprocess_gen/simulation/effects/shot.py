@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 from unprocess_gen.core.types import NEAR_NORMAL, Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, frame_words
+from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, SlotValues, frame_words
 from unprocess_gen.simulation.effects.expectation import ALWAYS_COUNTED, EffectNoise, Site, poisson_noise
-from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.numbers import DN, Numbers, number
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.near_normal import counts_or_normals, near_limits
 from unprocess_gen.simulation.reference.poisson import poisson
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShotNumbers:
+class ShotNumbers(Numbers):
     """System gain K, DN per electron."""
 
     dn_per_e: float = number(
@@ -55,7 +51,7 @@ class Shot(Effect):
         """Return K times the signal, DN²."""
         return frame.physics.dn_per_e * level_dn
 
-    def slots(self, plan: Plan) -> dict[str, Any]:
+    def slots(self, plan: Plan) -> SlotValues:
         """Fill the counts of light."""
         return {"light_stream": "shot"}
 

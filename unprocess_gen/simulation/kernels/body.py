@@ -86,22 +86,20 @@ def light_factor(patterns: Patterns, body: Body, shape: Shape, origin: Shape, is
 
 def _kept(compute: Any, slot: Any, shape: Shape, origin: Shape) -> Any:
     """Return a pattern of a crop from the cache for crops of its size."""
-    cached = _small if shape[0] * shape[1] <= SMALL_SITES else _large
-    return cached(compute, slot, shape, origin)
+    return _caches[shape[0] * shape[1] > SMALL_SITES](compute, slot, shape, origin)
 
 
 def _compute(compute: Any, slot: Any, shape: Shape, origin: Shape) -> Any:
     return compute(slot, shape, origin)
 
 
-_small = functools.lru_cache(maxsize=SMALL_PATTERNS)(_compute)
-_large = functools.lru_cache(maxsize=LARGE_PATTERNS)(_compute)
+_caches = [functools.lru_cache(maxsize=count)(_compute) for count in (SMALL_PATTERNS, LARGE_PATTERNS)]
 
 
 def forget_bodies() -> None:
     """Drop the cached patterns, so that the next frame computes them, as the first frame of a body does."""
-    _small.cache_clear()
-    _large.cache_clear()
+    for cache in _caches:
+        cache.cache_clear()
 
 
 def _radial_factor(slot: RadialFactor, shape: Shape, origin: Shape) -> SiteMap:

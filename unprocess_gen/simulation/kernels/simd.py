@@ -60,29 +60,28 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 class VectorType(types.Type):
     """Describe a vector of eight numbers to Numba."""
 
-    def __init__(self, element: types.Number) -> None:
-        self.element = element
+    def __init__(self, element: types.Number, llvm_element: ir.Type) -> None:
+        self.element, self.llvm = element, ir.VectorType(llvm_element, VECTOR_WIDTH)
         super().__init__(name=f"vector({element})")
 
 
-_FLOAT32, _FLOAT64 = VectorType(types.float32), VectorType(types.float64)
-_UINT32, _UINT64 = VectorType(types.uint32), VectorType(types.uint64)
+_VECTORS = {
+    types.float32: VectorType(types.float32, ir.FloatType()),
+    types.float64: VectorType(types.float64, ir.DoubleType()),
+    types.uint32: VectorType(types.uint32, ir.IntType(32)),
+    types.uint64: VectorType(types.uint64, ir.IntType(64)),
+}
+_FLOAT32, _FLOAT64, _UINT32, _UINT64 = _VECTORS.values()
 _UNSIGNED: dict[types.Type, types.Type] = {
     _FLOAT32: _UINT32, _FLOAT64: _UINT64, types.float32: types.uint32, types.float64: types.uint64,
 }  # fmt: skip
-_FLOATS = {unsigned: of_floats for of_floats, unsigned in _UNSIGNED.items()}
-_LLVM_VECTORS = {
-    _FLOAT32: ir.VectorType(ir.FloatType(), VECTOR_WIDTH),
-    _FLOAT64: ir.VectorType(ir.DoubleType(), VECTOR_WIDTH),
-    _UINT32: ir.VectorType(ir.IntType(32), VECTOR_WIDTH),
-    _UINT64: ir.VectorType(ir.IntType(64), VECTOR_WIDTH),
-}
+_FLOATS = {unsigned: floats for floats, unsigned in _UNSIGNED.items()}
 
 
 @register_model(VectorType)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, vector_type: VectorType) -> None:
-        super().__init__(manager, vector_type, _LLVM_VECTORS[vector_type])
+        super().__init__(manager, vector_type, vector_type.llvm)
 
 
 def _register(function: Any, typer: Callable[..., Any], build: Callable[..., Any], *operands: Any) -> None:
@@ -145,7 +144,7 @@ def _per_lane(code: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _splat(builder: Any, number: Any, vector_type: VectorType) -> Any:
-    empty, first = ir.Constant(_LLVM_VECTORS[vector_type], ir.Undefined), ir.Constant(ir.IntType(32), 0)
+    empty, first = ir.Constant(vector_type.llvm, ir.Undefined), ir.Constant(ir.IntType(32), 0)
     return _shuffle(builder, [0] * VECTOR_WIDTH, builder.insert_element(empty, number, first), empty)
 
 
@@ -286,11 +285,11 @@ def _address(builder: Any, llvm_type: ir.Type, pointer: Any, at: Any) -> Any:
 
 
 def _build_load(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
-    address = _address(builder, _LLVM_VECTORS[call.return_type], *arguments)
+    address = _address(builder, call.return_type.llvm, *arguments)
     return builder.load(address, align=call.args[0].dtype.bitwidth // 8)
 
 
-@_compiled(lambda pointer, at: VectorType(pointer.dtype), _build_load)
+@_compiled(lambda pointer, at: _VECTORS[pointer.dtype], _build_load)
 def load(pointer: Pointer, at: Index) -> Vector:
     """Load the vector of elements ``at`` to ``at + 7``."""
     return pointer[at : at + VECTOR_WIDTH].copy()
@@ -314,7 +313,7 @@ def store(pointer: Pointer, at: Index, lanes: Vector) -> None:
 def _build_columns(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
     """Load each row at once and transpose, because single loads would take three times as long."""
     table, starts, at = arguments
-    row_type, rows = ir.VectorType(_LLVM_VECTORS[_FLOAT64].element, 4), []
+    row_type, rows = ir.VectorType(_FLOAT64.llvm.element, 4), []
     for lane in range(VECTOR_WIDTH):
         start = builder.load(builder.gep(starts, [builder.add(at, ir.Constant(at.type, lane))]))
         start = builder.zext(start, ir.IntType(64))
@@ -363,9 +362,7 @@ def less_than(x: Any, y: Any) -> Vector:
     return np.asarray(np.where(x < y, ~unsigned.type(0), unsigned.type(0)))
 
 
-@_compiled(
-    lambda: _UINT32, lambda context, builder, call, arguments: ir.Constant(_LLVM_VECTORS[call.return_type], None)
-)
+@_compiled(lambda: _UINT32, lambda context, builder, call, arguments: ir.Constant(call.return_type.llvm, None))
 def uint32_zeros() -> Vector:
     """Return a uint32 vector of zeros."""
     return np.zeros(VECTOR_WIDTH, dtype=np.uint32)
@@ -448,7 +445,7 @@ _CONVERSIONS = {
 def _convert_to(vector_type: VectorType) -> Callable[[_Function], _Function]:
     def build(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
         convert = _CONVERSIONS[call.args[0].element, vector_type.element]
-        return convert(builder, arguments[0], _LLVM_VECTORS[vector_type])
+        return convert(builder, arguments[0], vector_type.llvm)
 
     return _compiled(lambda x: vector_type, build)
 

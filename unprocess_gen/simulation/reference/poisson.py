@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_density
-from unprocess_gen.core.lookup_tables import SEGMENTS, normal_table, sha256
+from unprocess_gen.core.lookup_tables import sha256
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
+from unprocess_gen.simulation.reference.noise import normals
 
 LIMIT = 64.0
 """Smallest rate for which counts are computed by the expansion."""
@@ -201,13 +202,11 @@ def poisson(words: Words, rate: Float) -> Float:
     ndarray of float64
         Counts, same shape.
     """
-    tail = _tail(words)
-    low = words >> np.uint32(31) == 1
     high = rate >= LIMIT
+    low = (rate > 0) & ~high
     counts = np.zeros(words.shape)
-    counts[high] = _by_expansion(tail[high], low[high], rate[high])
-    some = (rate > 0) & ~high
-    counts[some] = _by_cdf(np.where(low, tail, 1 - tail)[some], rate[some])
+    counts[high] = _by_expansion(words[high], rate[high])
+    counts[low] = _by_cdf(words[low], rate[low])
     return counts
 
 
@@ -216,25 +215,16 @@ def _tail(words: Words) -> Float:
     return np.asarray(((words & np.uint32(0x7FFFFFFF)).astype(np.float64) + 0.5) * 2.0**-32)
 
 
-def _quantile(tail: Float) -> Float:
-    """Return the upper normal quantile of tail probabilities in [2**-33, ½), with an error below 1.5e-7."""
-    mantissa, exponent = np.frexp(tail * 2.0**33)
-    position = (2 * mantissa - 1) * SEGMENTS
-    segment = np.floor(position)
-    row = normal_table()[(exponent - 1) * SEGMENTS + segment.astype(np.int32)]
-    t = (position - segment) / SEGMENTS
-    return np.asarray(row[..., 0] + t * (row[..., 1] + t * row[..., 2]))
-
-
-def _by_expansion(tail: Float, low: NDArray[np.bool_], rate: Float) -> Float:
-    """Return floor(x) for rates from `LIMIT`, from tail probabilities and the side of the tail."""
-    z = _quantile(tail)
+def _by_expansion(words: Words, rate: Float) -> Float:
+    """Return floor(x) for rates from `LIMIT`; a step of Newton's method refines the normal of each word."""
+    is_low, z = words >> np.uint32(31) == 1, normals(words)
+    z = np.where(is_low, -z, z)
     cell = np.floor(z * TAIL_CELLS)
     row = poisson_tables().tails[cell.astype(np.int64)]
     offset = z - (cell + 0.5) / TAIL_CELLS
     slope = _horner(row[..., 1:] * np.arange(1, ORDER + 1), offset)
-    z = z - (_horner(row, offset) - tail) / slope
-    return np.asarray(np.floor(expansion(rate, np.where(low, -z, z))))
+    z = z - (_horner(row, offset) - _tail(words)) / slope
+    return np.asarray(np.floor(expansion(rate, np.where(is_low, -z, z))))
 
 
 def expansion(rate: Float, w: Float) -> Float:
@@ -275,9 +265,10 @@ def _horner(rows: Float, offset: Float) -> Float:
     return np.asarray(total)
 
 
-def _by_cdf(uniform: Float, rate: Float) -> Float:
-    """Return the smallest k with P(K <= k) >= ``uniform`` for rates in (0, `LIMIT`), by bisection."""
-    tables = poisson_tables()
+def _by_cdf(words: Words, rate: Float) -> Float:
+    """Return the smallest k with P(K <= k) >= the probability of a word for rates in (0, `LIMIT`), by bisection."""
+    tables, tail = poisson_tables(), _tail(words)
+    uniform = np.where(words >> np.uint32(31), tail, 1 - tail)
     cell = np.floor(np.sqrt(rate) * RATE_CELLS).astype(np.int64)
     low, high = tables.least[cell], tables.most[cell] + 1
     for _ in range(MOST.bit_length()):
