@@ -15,7 +15,6 @@ from helpers.kernels import approximate_counts, counts_of_one_rate, exact_counts
 from helpers.kernels import counts as fast
 from helpers.promise_report import Figure
 
-from unprocess_gen.core import lookup_tables as tables
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.simulation.kernels import poisson as kernels
 from unprocess_gen.simulation.kernels.normal import normal_quantiles
@@ -432,10 +431,3 @@ def test_the_hash_covers_every_table() -> None:
         wrong = table.copy()
         wrong.flat[wrong.size // 2] += 1
         assert poissons.digest(right._replace(**{name: wrong})) != poissons.TABLES_SHA256
-
-
-def test_the_tail_table_and_the_normal_table_share_cells() -> None:
-    """The normal of a word equals that of `noise.normals` bit for bit."""
-    words = np.random.default_rng(12).integers(0, SIGN, 100_000, dtype=np.uint32)
-    assert (poissons._quantile(poissons._tail(words)) == normals(words)).all()
-    assert tables.SEGMENTS == 32
