@@ -51,7 +51,7 @@ from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardResult, Tally
 from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, shard_rows
 from unprocess_gen.pipeline.worker import make_image
-from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, fingerprint, read_dataset
+from unprocess_gen.pipeline.workspace import add_parquet, dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkPlaces, with_dark_places
 
 Facts = dict[str, Any]
@@ -311,10 +311,7 @@ class _Repair:
         if digest and (digest == recorded or (not self._facts and self._is_proved(digest))):
             return
         check_parquet(config.output)
-        part = self._temporary / parquet.NAME
-        parquet.write_parquet(self._manifest_file, part)
-        new = {PARQUET_SHA256: file_sha256(part)}
-        self._place(part, self._folder / parquet.NAME)
+        new = add_parquet(self._storage, self._manifest_file)
         yield RepairStep(parquet.NAME, "written from manifest.csv")
         if self._facts and new[PARQUET_SHA256] != recorded:
             self._storage.write("dataset.json", dataset_text(self._facts | new))

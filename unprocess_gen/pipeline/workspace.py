@@ -233,20 +233,12 @@ class Workspace:
                     digest.update(text)
                     stream.write(text)
             manifest_sha256 = digest.hexdigest()
-            derived = self._write_parquet(manifest) if with_parquet else {}
+            derived = add_parquet(self.storage, manifest) if with_parquet else {}
             (self.storage / "manifest.csv").commit(manifest)
             dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, derived | facts_of(tally))
             self.storage.write("dataset.json", dataset_text(dataset))
             self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
         return dataset
-
-    def _write_parquet(self, manifest: Path) -> dict[str, Any]:
-        """Write ``manifest.parquet``; return what ``dataset.json`` holds about it."""
-        path = self.storage.scratch / parquet.NAME
-        parquet.write_parquet(manifest, path)
-        sha256 = file_sha256(path)
-        (self.storage / parquet.NAME).commit(path)
-        return {PARQUET_SHA256: sha256}
 
     def _manifest(self, shards: int, entries: list[dict[str, Any]], tally: Tally) -> Iterator[bytes]:
         """Yield the text of the manifest; append the entry of each shard, and add its counts."""
@@ -255,6 +247,15 @@ class Workspace:
             entries.append(record.entry)
             tally.add(record.tally)
             yield record.csv
+
+
+def add_parquet(storage: Storage, manifest: Path) -> dict[str, Any]:
+    """Write ``manifest.parquet``; return what ``dataset.json`` holds about it."""
+    path = storage.scratch / parquet.NAME
+    parquet.write_parquet(manifest, path)
+    sha256 = file_sha256(path)
+    (storage / parquet.NAME).commit(path)
+    return {PARQUET_SHA256: sha256}
 
 
 def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:
