@@ -364,10 +364,10 @@ def test_config_yaml_omits_the_use_of_assumed_numbers_without_any(settings: Sett
     ("overrides", "decided"),
     [
         (("noise=imx385_iso3200",), "noisy"),
-        (("noise=nikon_d850",), "pinned"),
-        (("noise=nikon_d850", "sensor.clip=black"), "pinned"),
+        (("noise=nikon_d850",), "white"),
+        (("noise=nikon_d850", "sensor.clip=black"), "white"),
         (("noise=nikon_d850", "output.dtype=float32", "sensor.clip=none", "noise.full_well_e=null"), "noisy"),
-        (("noise=nikon_d850", "output.dtype=float32", "sensor.clip=none", "noise.full_well_e=60000"), "pinned"),
+        (("noise=nikon_d850", "output.dtype=float32", "sensor.clip=none", "noise.full_well_e=60000"), "white"),
         (("noise=nikon_d850", "sensor.saturated=noisy"), "noisy"),
         (("noise=imx385_iso3200", "sensor.saturated=pinned"), "pinned"),
     ],
@@ -375,7 +375,7 @@ def test_config_yaml_omits_the_use_of_assumed_numbers_without_any(settings: Sett
 def test_auto_pins_saturated_sites_of_limited_physical_profiles(
     overrides: tuple[str, ...], decided: str, settings: Settings
 ) -> None:
-    """Plans and recorded configs have the decision; 0.1 records noisy or pinned."""
+    """Plans and recorded configs have the decision; 0.1 and 0.2 record noisy or pinned."""
     config = settings(*overrides)
     validate_config(config)
     assert plan_image(config, "0" * 64, facts=Facts(64, 48, 256, 0, 255)).noise.saturated == decided

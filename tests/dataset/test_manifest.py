@@ -153,7 +153,7 @@ plans = st.builds(
         effects=st.lists(word, max_size=3).map(tuple),
         skipped=st.lists(word, max_size=3).map(tuple),
         sensor_clip=st.sampled_from(["sensor", "black"]),
-        saturated=st.sampled_from(["noisy", "pinned"]),
+        saturated=st.sampled_from(["noisy", "pinned", "white"]),
         physics=st.none() | physics,
         level=st.integers(0, 99),
         draw=st.integers(0, 99),

@@ -97,3 +97,23 @@ def test_pinning_changes_saturated_sites_only(distribution: str) -> None:
     np.testing.assert_array_equal(free.clean, pinned.clean)
     assert (pinned.noisy[white] == WHITE).all()
     np.testing.assert_array_equal(pinned.noisy[~white], free.noisy[~white])
+
+
+def test_noise_behind_a_full_well_remains(settings: Settings) -> None:
+    """``canon_70d`` saturates below white at ISO 100: the electrons end, read noise and dead pixels come after it."""
+    chosen = ("noise=canon_70d", "noise.iso=100", "scene=daylight", "sensor=generic_14bit", "gains=unity")
+    defects = ("effects.dead_pixels=on", "noise.dead_pixel_share=1e-3", "effects.prnu=off")
+    plan = planned(settings, flat(65535), *chosen, *defects)
+    pair = make_pair(flat(65535), plan)
+    physics = plan.noise.physics
+    assert physics is not None and "full_well" in plan.noise.effects
+    well_dn = plan.sensor.black_level_dn + physics.full_well_e * physics.dn_per_e
+    assert (pair.clean == round(well_dn)).all()
+    assert pair.counts.saturated == pair.clean.size
+    dead = pair.noisy == 0
+    assert 0.2e-3 < dead.mean() < 5e-3
+    difference = pair.noisy[~dead] - well_dn
+    shot_dn2 = physics.dn_per_e**2 * physics.full_well_e
+    count, behind_dn2 = difference.size, physics.read_std_dn**2 + physics.row_std_dn**2 + 1 / 12
+    assert behind_dn2 * (1 - 6 * math.sqrt(2 / count)) < difference.var() < behind_dn2 + 0.341 * shot_dn2 * 1.2
+    assert float(difference.mean()) > -math.sqrt(shot_dn2)

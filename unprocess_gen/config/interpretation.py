@@ -209,12 +209,12 @@ def saturated_as(config: Config) -> str:
     """Return the noisy value of sites whose clean frame is saturated.
 
     Without a full well, and without clipping of the noisy frame, nothing stops noise above white. Otherwise half of it
-    is cut off, and the mean of the noisy frame at white is below white.
+    is cut off, and the mean of the noisy frame at white is below white. Settings of 0.2 record ``pinned`` for ``auto``.
     """
     if config.sensor.saturated != "auto":
         return config.sensor.saturated
     limited = config.noise.full_well_e is not None or config.sensor.clip != NO_CLIP
-    return "pinned" if is_physical(config.noise) and limited else "noisy"
+    return "white" if is_physical(config.noise) and limited else "noisy"
 
 
 def effect_switch(effects: EffectsConfig, effect: str) -> str:

@@ -188,8 +188,9 @@ class SensorConfig(Group):
         with float32
     saturated
         noisy value at sites where the clean frame is saturated: noisy is the clipped value plus noise, as in
-        the article; pinned is the white level; auto is pinned for physical profiles that reach a full well or
-        the end of the converter, otherwise noisy
+        the article; pinned is the level at which the clean frame saturates; white is the white level where the
+        converter ends, and sites at a full well keep the noise behind it; auto is white for physical profiles
+        with a full well or a converter that ends, otherwise noisy
     dark_offset
         mean of the dark current: removed as a camera does with optical-black pixels, or kept
     units
@@ -202,7 +203,7 @@ class SensorConfig(Group):
     white_level_dn: int = key(4095, limits.WHITE_LEVEL, unit="DN")
     pattern: str = key("RGGB", Choice("RGGB", "BGGR", "GRBG", "GBRG"))
     clip: str = key("sensor", Choice("sensor", "black", "none"))
-    saturated: str = key("noisy", Choice("noisy", "pinned", "auto"))
+    saturated: str = key("noisy", Choice("noisy", "pinned", "white", "auto"))
     dark_offset: str = key("removed", Choice("removed", "kept"))
     units: Any = key("image", NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"))
 

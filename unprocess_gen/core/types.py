@@ -358,7 +358,8 @@ class NoisePlan:
     sensor_clip : str
         Clipping of the noisy frame (`sensor.noisy_limits`).
     saturated : str
-        Noisy value at sites where the clean frame is saturated: ``"noisy"``, or ``"pinned"`` to white.
+        Noisy value at sites where the clean frame is saturated: ``"noisy"``, ``"pinned"`` to its value, or ``"white"``
+        if the converter ends there; sites at a full well keep the noise behind it, and count as saturated.
     physics : Physics or None
         Numbers of a physical profile. None for two-parameter profiles, whose one effect is ``heteroscedastic``.
     level, draw, frame : int
@@ -560,6 +561,19 @@ class Plan:
     def brightest_dn(self) -> float:
         """Value of `brightest` in DN, unrounded."""
         return self.brightest * float(self.sensor.span_dn) + float(self.sensor.black_level_dn)
+
+    @property
+    def pins_saturated(self) -> bool:
+        """Whether noisy sites have the value of the clean frame where that saturates."""
+        return self.noise.saturated == "pinned" or (self.noise.saturated == "white" and self.brightest == 1)
+
+    @property
+    def saturated_value(self) -> float:
+        """Value of clean sites that count as saturated: white, or the full well below it with ``"white"``."""
+        value_dn = self.brightest_dn if self.noise.saturated == "white" else float(self.sensor.white_level_dn)
+        if not self.output.clean_normalised:
+            return float(round(value_dn))
+        return float(np.float32((value_dn - self.sensor.black_level_dn) / self.sensor.span_dn))
 
 
 PARTS: dict[str, Any] = {

@@ -171,7 +171,7 @@ def _reference_pair(
     light = _scene_light(srgb, plan, origin, curve)
     clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest)
     noisy_dn = order.noisy(clean_dn, plan, origin, dark_pixels)
-    if plan.noise.saturated == "pinned":
+    if plan.pins_saturated:
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
 
     limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, plan.noise.sensor_clip)
@@ -185,7 +185,7 @@ def _reference_pair(
         clean_clipped_high=int((light > plan.brightest).sum()),
         noisy_clipped_low=int((read_dn < limits_dn[0]).sum()),
         noisy_clipped_high=int((read_dn > limits_dn[1]).sum()),
-        saturated=int((clean == (1 if output.clean_normalised else sensor.white_level_dn)).sum()),
+        saturated=int((clean == plan.saturated_value).sum()),
         zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
     )
     if output.layout == PACKED:

@@ -113,7 +113,7 @@ def readout_of(
         averaged=first.noise.averaged,
         black_dn=np.float32(0) if counts_from_black else float(first.sensor.black_level_dn),
         span_dn=float(first.sensor.span_dn),
-        white=1.0 if first.output.clean_normalised else float(first.sensor.white_level_dn),
+        white=first.saturated_value,
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
@@ -121,7 +121,7 @@ def readout_of(
 
 def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:
     """Return the noisy DN of saturated sites, and the clean value from which they are; infinity if they keep noise."""
-    if plan.noise.saturated != "pinned":
+    if not plan.pins_saturated:
         return np.inf, np.inf
     if counts_from_black:
         above_black = np.float32((plan.brightest_dn - plan.sensor.black_level_dn) * (1 - FLOAT32_MARGIN))
