@@ -176,7 +176,15 @@ def test_columns_have_the_order_of_the_contract() -> None:
 
 (UNMEASURED,) = (column.empty_if for column in COLUMNS if column.name == "source_noise_dn")
 OF_DARK_FRAMES = {column.empty_if for column in COLUMNS if column.name.startswith("dark_") and column.since == "0.2"}
-BY_DEFAULT = {"it is 0", "all are 1", "all are 0", "there is no lens shading", UNMEASURED, *OF_DARK_FRAMES}
+BY_DEFAULT = {
+    "exposure_ratio is 1",
+    "it is 0",
+    "all are 1",
+    "all are 0",
+    "there is no lens shading",
+    UNMEASURED,
+    *OF_DARK_FRAMES,
+}
 """Conditions of numbers that version 0.1 did not have."""
 
 

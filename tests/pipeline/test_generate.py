@@ -490,4 +490,4 @@ def test_summary_adds_up_the_counts_of_the_manifest(dataset: Path) -> None:
     rows = [sample.row for sample in RawPairs(dataset)]
     known = facts(dataset)["sites"]
     assert known["all"] == sum(row["width"] * row["height"] for row in rows)
-    assert {name: sum(row[name] for row in rows) for name in COUNTS} == {name: known[name] for name in COUNTS}
+    assert {name: sum(row[name] or 0 for row in rows) for name in COUNTS} == {name: known[name] for name in COUNTS}

@@ -117,3 +117,16 @@ def test_noise_behind_a_full_well_remains(settings: Settings) -> None:
     count, behind_dn2 = difference.size, physics.read_std_dn**2 + physics.row_std_dn**2 + 1 / 12
     assert behind_dn2 * (1 - 6 * math.sqrt(2 / count)) < difference.var() < behind_dn2 + 0.341 * shot_dn2 * 1.2
     assert float(difference.mean()) > -math.sqrt(shot_dn2)
+
+
+@pytest.mark.parametrize("accuracy", ["exact", "fast"])
+def test_light_above_white_is_counted_whatever_the_exposure_ratio(accuracy: str, settings: Settings) -> None:
+    """It is clipped before the ratio divides it, so the darkened frame has a plateau, whose sites are these."""
+    srgb = np.random.Generator(np.random.Philox(key=7)).integers(180, 256, (96, 130, 3), dtype=np.uint8)
+    counts = {}
+    for ratio in (1, 10):
+        chosen = ("noise=none", "gains=fig6_bottom", f"accuracy={accuracy}", f"scene.exposure_ratio={ratio}")
+        counts[ratio] = make_pair(srgb, planned(settings, srgb, *chosen)).counts
+    assert 0 < counts[1].clean_clipped_high == counts[10].light_clipped_high
+    assert counts[1].light_clipped_high is None
+    assert counts[10].clean_clipped_high == 0

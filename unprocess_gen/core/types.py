@@ -601,6 +601,8 @@ class Counts:
         Sites of the clean frame at the white level.
     zero_variance : int
         Sites whose noise variance is 0, because a fitted b is negative or no noise is simulated.
+    light_clipped_high : int or None
+        Sites whose light is above white before the exposure ratio divides it; None without a ratio.
     """
 
     clean_clipped_low: int
@@ -609,6 +611,7 @@ class Counts:
     noisy_clipped_high: int
     saturated: int
     zero_variance: int
+    light_clipped_high: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

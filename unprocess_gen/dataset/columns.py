@@ -337,7 +337,8 @@ COLUMNS = (
     Column("law_distance", "largest accepted CDF distance of shot plus read noise", NOT_NEGATIVE, AccuracyPlan),
     Column("scene", "name of the scene", ANY_TEXT, ScenePlan, "name"),
     Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
-    Column("saturated_as", "noisy sites whose clean site is saturated: noisy, pinned to it, or white without a full well",
+    Column("saturated_as", "noisy sites whose clean site is saturated: noisy, pinned to it, or white where the "
+           "converter ends",
            Words(("noisy", "pinned", "white")), NoisePlan, "saturated"),
     Column("noise_law", "distribution of a two-parameter profile: gaussian or poisson", Words(("gaussian", "poisson")),
            NoisePlan, "law"),
@@ -400,6 +401,8 @@ COLUMNS = (
     Column("dark_variance_dn2", "noise variance of a site at black, by all simulated effects except hot pixels, dead "
            "pixels and rounding; ug.noise_std uses it",
            FINITE, unit="DN²", since="0.3", in_json=False, empty_if="the source failed"),
+    Column("light_clipped_high", "sites whose light is above white before the exposure ratio divides it", COUNT, Counts,
+           unit="sites", since="0.3", in_json=False, empty_if="exposure_ratio is 1"),
     *_columns_of_numbers(*(name for name, number in NUMBERS.items() if number.since not in ("", "0.2"))),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""

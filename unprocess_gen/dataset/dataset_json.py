@@ -40,6 +40,7 @@ class ShardFacts(msgspec.Struct, frozen=True):
     bytes: Count
     sha256: Digest | None
     source_noise_dn: list[Amount | None] | None = None
+    light_clipped_high: list[Count | None] | None = None
 
 
 class RunFacts(msgspec.Struct, frozen=True):

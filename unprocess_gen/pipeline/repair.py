@@ -225,11 +225,15 @@ class _Repair:
             yield from sorted([*self._rows_inside(entry), *failures[number]], key=lambda row: int(image_key(row)))
 
     def _rows_inside(self, entry: Facts) -> Iterator[Row]:
-        """Yield the rows of an intact shard; ``source_noise_dn``, which they lack, is in its entry."""
+        """Yield the rows of an intact shard; measured columns that they lack are in its entry."""
         if entry["file"] is None or _digest(self._folder / entry["file"]) != entry["sha256"]:
             return
         contents = json_inside(self._folder / entry["file"])
-        images = group_by_image(row for content in contents for row in rows_of_json(content))
+        clipped = itertools.chain(entry.get("light_clipped_high", ()), itertools.repeat(None))
+        pairs = (row for content in contents for row in rows_of_json(content))
+        images = group_by_image(
+            {**row, "light_clipped_high": count} for row, count in zip(pairs, clipped, strict=False)
+        )
         noises = itertools.chain(entry.get("source_noise_dn", ()), itertools.repeat(None))
         for rows, noise in zip(images, noises, strict=False):
             yield from ({**row, "source_noise_dn": noise} for row in rows)

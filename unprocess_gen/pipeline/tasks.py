@@ -195,14 +195,17 @@ class ShardResult:
             "failed": len(self.rows) - pairs,
             "bytes": self.bytes,
             "sha256": self.sha256,
-            **self._source_noise(),
+            **self._only_in_manifest(),
         }
 
-    def _source_noise(self) -> dict[str, list[Value]]:
-        """Return the column ``source_noise_dn`` of each image, from which a lost manifest is restored."""
-        pairs = (row for row in self.rows if row["status"] == "ok")
-        values = [rows[0]["source_noise_dn"] for rows in group_by_image(pairs)]
-        return {"source_noise_dn": values} if any(value is not None for value in values) else {}
+    def _only_in_manifest(self) -> dict[str, list[Value]]:
+        """Return the measured columns that KEY.json lacks, from which a lost manifest is restored."""
+        pairs = [row for row in self.rows if row["status"] == "ok"]
+        values = {
+            "source_noise_dn": [rows[0]["source_noise_dn"] for rows in group_by_image(pairs)],
+            "light_clipped_high": [row["light_clipped_high"] for row in pairs],
+        }
+        return {name: column for name, column in values.items() if any(value is not None for value in column)}
 
     def report(self) -> ShardReport:
         """Describe the shard for the coordinator."""

@@ -168,7 +168,8 @@ def _reference_pair(
     Noise is added to the clean frame before both are clipped, then rounded or normalised.
     """
     sensor, output = plan.sensor, plan.output
-    light = _scene_light(srgb, plan, origin, curve)
+    photograph = unprocess(srgb, plan, origin, curve)
+    light = _scene_light(photograph, plan, origin)
     clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest)
     noisy_dn = order.noisy(clean_dn, plan, origin, dark_pixels)
     if plan.pins_saturated:
@@ -187,15 +188,15 @@ def _reference_pair(
         noisy_clipped_high=int((read_dn > limits_dn[1]).sum()),
         saturated=int((clean == plan.saturated_value).sum()),
         zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
+        light_clipped_high=None if plan.scene.exposure == 1 else int((photograph > 1).sum()),
     )
     if output.layout == PACKED:
         clean, noisy = pack(clean, sensor.pattern, origin), pack(noisy, sensor.pattern, origin)
     return Pair(clean, noisy, counts)
 
 
-def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None) -> Float:
-    """Return the light of the scene at each CFA site, 0 at black and 1 at white, before clipping."""
-    light = unprocess(srgb, plan, origin, curve)
+def _scene_light(light: Float, plan: Plan, origin: tuple[int, int]) -> Float:
+    """Return the light of the scene at each CFA site from that of the photograph, before clipping at black and white."""
     if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
         light = np.minimum(light, 1) * plan.scene.exposure
     factor = order.light_factor(plan, light.shape, origin)

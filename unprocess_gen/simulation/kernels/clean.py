@@ -54,6 +54,7 @@ class Scene(NamedTuple):
     exposure: float
     brightest: float
     clipped: float  # light above it counts as clipped
+    white: float  # light above it counts as clipped before the exposure; infinity without an exposure ratio
     black_dn: Any  # float, or uint32 in Scene32
     span_dn: float
     dn_per_signal: float  # scale of the signal with gray_mean
@@ -100,6 +101,7 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] 
         exposure=f(exposure),
         brightest=f(brightest),
         clipped=f(brightest * (1 + FLOAT32_MARGIN) if in_float32 else brightest),
+        white=f(np.inf if exposure == 1 else 1 + FLOAT32_MARGIN if in_float32 else 1),
         black_dn=np.uint32(black_dn) if in_float32 else float(black_dn),
         span_dn=f(span_dn),
         dn_per_signal=f(exposure * span_dn if in_float32 else 1.0),
@@ -239,7 +241,7 @@ def fill_clean(scene: Any, codes: Pointer, strip: Strip, workspace: Workspace, c
         _fill_signal(codes, strip, scene, signal)
     has_negative, has_bright = _fill_linear(scene, strip, workspace)
     if has_bright:
-        _recompute_bright(scene, strip, workspace)
+        counts[6] += _recompute_bright(scene, strip, workspace)
         counts[1] += count_outside(strip, workspace.bright_light, 0.0, scene.clipped)[1]
     if has_negative:
         light = workspace.bright_light if scene.response.steps[1] else workspace.signal
@@ -261,11 +263,12 @@ def _fill_linear(scene: Any, strip: Strip, workspace: Workspace) -> tuple[bool, 
 
 
 @inner
-def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> None:
+def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> int:
     """Recompute vectors that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
 
-    ``bright_light`` receives their light, and 0 elsewhere.
+    ``bright_light`` receives their light, and 0 elsewhere. Return how many sites are above ``scene.white``.
     """
+    above_white = 0
     limits, light_per_signal = _load_sites(scene.limits, strip), _load_sites(scene.light_per_signal, strip)
     gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
     most = np.inf if scene.exposure == 1.0 else 1.0  # otherwise light above white would reappear
@@ -277,7 +280,13 @@ def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> None:
             continue
         i = signal * light_per_signal
         m = simd.maximum(i - scene.highlight_threshold, 0.0) / scene.divisor * scene.steepness
-        light = simd.minimum(i * gains + i * (m * m) * headroom, most) * scene.exposure
-        light = _with_response(scene, light, x, strip)
+        light = i * gains + i * (m * m) * headroom
+        if scene.white < np.inf:
+            simd.store(workspace.bright_light, x, light)
+            for site in range(n * VECTOR_WIDTH, (n + 1) * VECTOR_WIDTH):
+                if strip.first <= site < strip.after:
+                    above_white += workspace.bright_light[site] > scene.white
+        light = _with_response(scene, simd.minimum(light, most) * scene.exposure, x, strip)
         simd.store(workspace.bright_light, x, light)
         _store_clean(scene, simd.minimum(simd.maximum(light, 0.0), scene.brightest) * scene.span_dn, x, workspace)
+    return above_white

@@ -89,8 +89,9 @@ class Output(NamedTuple):
     may_saturate: bool  # whether any site of the clean frame can be saturated
 
 
-CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE = range(6)
+CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE, LIGHT_HIGH = range(7)
 """Places of the members of `Counts` in the counts of a frame."""
+COUNTS = 7
 
 
 @functools.lru_cache(maxsize=4)

@@ -23,6 +23,7 @@ from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
+    COUNTS,
     Output,
     ReadOut,
     average_patterns,
@@ -59,10 +60,11 @@ def render_pairs(
         One pair per plan; all share the clean array.
     """
     clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin, dark_pixels)
-    clean_low, clean_high, _, _, saturated, _ = counts[0]
+    clean_low, clean_high, _, _, saturated, _, light_high = counts[0]
+    light = None if plans[0].scene.exposure == 1 else light_high
     return [
-        Pair(clean, frame, Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance))
-        for frame, (_, _, noisy_low, noisy_high, _, zero_variance) in zip(noisy, counts, strict=True)
+        Pair(clean, frame, Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, light))
+        for frame, (_, _, noisy_low, noisy_high, _, zero_variance, _) in zip(noisy, counts, strict=True)
     ]
 
 
@@ -82,7 +84,7 @@ def _fill_frames(
     frame_shape = (4, shape[0] // 2, shape[1] // 2) if first.output.layout == PACKED else shape
     clean = np.empty(frame_shape, dtype=np.float32 if first.output.clean_normalised else np.uint16)
     noisy = np.empty((count, *frame_shape), dtype=np.float32 if first.output.normalised else np.uint16)
-    counts = np.zeros((max(count, 1), 6), dtype=np.int64)
+    counts = np.zeros((max(count, 1), COUNTS), dtype=np.int64)
     codes_per_channel = 256 if srgb.itemsize == 1 else 65536
     scene, noise, readout = _records(tuple(plans), shape, codes_per_channel, origin, dark_pixels)
     scratch = scratch_of_thread(np.float32 if uses_scene32(first) else np.float64)
@@ -163,7 +165,9 @@ def _render(
             source, target = pointer_to(codes, 3 * (y * width + x)), pointer_to(clean_sites, first)
             may_saturate = fill_clean(light, source, strip, buffers, all_counts)
             for n in range(noisy.shape[0]):
-                output = Output(pointer_to(noisy_sites, n * sites + first), pointer_to(all_counts, 6 * n), may_saturate)
+                output = Output(
+                    pointer_to(noisy_sites, n * sites + first), pointer_to(all_counts, COUNTS * n), may_saturate
+                )
                 draw_noise(sampler, n, load_key(key_words, n), strip, buffers)
                 read_noisy(frames, sampler, n, output, strip, buffers)
                 count_zero_variance(frames, n, output, strip, buffers)
