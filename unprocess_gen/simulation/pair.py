@@ -196,7 +196,7 @@ def _reference_pair(
 
 
 def _scene_light(light: Float, plan: Plan, origin: tuple[int, int]) -> Float:
-    """Return the light of the scene at each CFA site from that of the photograph, before clipping at black and white."""
+    """Return the light of the scene at each CFA site from that of the photograph, before clipping to the levels."""
     if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
         light = np.minimum(light, 1) * plan.scene.exposure
     factor = order.light_factor(plan, light.shape, origin)
