@@ -564,7 +564,7 @@ class Plan:
 
     @property
     def pins_saturated(self) -> bool:
-        """Whether noisy sites have the value of the clean frame where that saturates."""
+        """True if noisy sites have the value of the clean frame where that saturates."""
         return self.noise.saturated == "pinned" or (self.noise.saturated == "white" and self.brightest == 1)
 
     @property
