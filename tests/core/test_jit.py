@@ -215,7 +215,7 @@ def test_kernels_of_other_packages_call_no_unhashed_files() -> None:
         for value in vars(module).values()
         if hasattr(value, "py_func")
     }
-    assert len(kernels) > 80
+    assert len(kernels) > 60
     for function in kernels:
         for name in function.__code__.co_names:
             for called in callees(function.__globals__.get(name)):
