@@ -338,7 +338,7 @@ def test_config_yaml_contains_every_other_key(settings: Settings) -> None:
                 continue
             assert set(loaded[field.name]) - {"kind"} == names
         else:
-            assert field.name in loaded or field.name in NOT_DATA[""]
+            assert field.name in loaded or field.name in NOT_DATA[""] or ("", field.name) in later
 
 
 def test_recorded_config_without_a_later_key_does_what_0_1_did(settings: Settings) -> None:

@@ -160,6 +160,7 @@ plans = st.builds(
         frame=st.integers(0, 10**9),
     ),
     accuracy=st.builds(AccuracyPlan, name=word, methods=st.lists(word, max_size=3).map(tuple)),
+    split=st.sampled_from(["", "train", "fold-3"]),
 )
 names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40).filter(
     BY_NAME["source"].allowed.__contains__
@@ -196,12 +197,13 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     failed = {condition for condition in conditions if "the source failed" in condition}
     passed = {"the source did not fail"}
     same = "the clean array has the dtype of the noisy one, or the source failed"
-    unassumed = "no effect uses one, or effects.assumed is off"
-    absent = {unassumed, same, *BY_DEFAULT}
+    unassumed, unsplit = "no effect uses one, or effects.assumed is off", "there are no splits, or the source failed"
+    absent = {unassumed, unsplit, same, *BY_DEFAULT}
     measured = pair_row("0" * 8, SOURCE, SHA256, 1, 0, PHYSICAL, PAIR, ("1" * 32, "2" * 32), PATCH, 1.5)
     holding = {
         "pair": (row_of(PHYSICAL), passed | absent),
         "measured": (measured, passed | absent - {UNMEASURED}),
+        "split": (row_of(PHYSICAL.replace(split="val")), passed | absent - {unsplit}),
         "dark frame": (row_of(DARK), passed | absent - OF_DARK_FRAMES),
         "assumed": (row_of(PHYSICAL.replace(assumed=("prnu_std",))), passed | absent - {unassumed}),
         "float clean": (row_of(PHYSICAL.replace(clean_dtype="float32")), passed | absent - {same}),
@@ -438,6 +440,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     camera, noise = (dataclasses.replace(part, name=LONGEST_NAME) for part in (PLAN.camera, PLAN.noise))
     plan = PLAN.replace(seed=2**63 - 1, stream_key=2**64 - 1, camera=camera, noise=noise)
     plan = plan.replace(
+        split="s" * 32,
         scene=ScenePlan(LONGEST_NAME, LONGEST),
         weights=(LONGEST,) * 4, rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST,
         gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,

@@ -161,6 +161,9 @@ MAX_BRANCH_NUMBER = 1e9
 
 MAX_ISO = 1e7
 
+MAX_SPLITS = 16
+"""Most splits. Chosen: more than any benchmark has."""
+
 BOOLEAN = Limit("true or false")
 """OmegaConf converts and checks it."""
 
@@ -226,6 +229,23 @@ ISO_RANGE = Limit("the lowest and the highest ISO, [100, 6400]")
 BLACK_ERROR = Limit(
     "a number, four (the 2x2 sites), [by_colour, R, G1, B, G2], or a table, [by_stop, [four], …] or [by_log_iso, "
     "[four], …], whose fours are in the order R, G1, B, G2 if by_colour precedes it"
+)
+
+
+def _are_shares(value: Any) -> bool:
+    """Check names and shares of splits."""
+    if not isinstance(value, dict) or not 1 <= len(value) <= MAX_SPLITS:
+        return False
+    has_names = all(isinstance(name, str) and re.fullmatch(r"[\w-]{1,32}", name, re.ASCII) for name in value)
+    has_shares = all(is_number(share) and share > 0 for share in value.values())
+    return has_names and has_shares and abs(math.fsum(value.values()) - 1) <= 1e-9
+
+
+SPLIT = Limit(
+    "null, or shares above 0 that sum to 1 by name, such as {train: 0.8, val: 0.2}; "
+    f"up to {MAX_SPLITS} names of up to 32 letters, digits, _ and -",
+    _are_shares,
+    lambda value: value_text(value)[:80],
 )
 
 BLACK_LEVEL = LevelRange("0 to 2^bits - 2", lambda group: (0, 2**group.bits - 2))

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Optional, TypeVar
 from unprocess_gen.config import limits
 from unprocess_gen.config.limits import Choice, Integers, IsoForm, Limit, NumberList, NumberOrWord, Numbers
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
+from unprocess_gen.config.values import is_number
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.effects.numbers import SHAPE, SITES, Number
@@ -644,6 +645,10 @@ class Config(Group):
     ----------
     seed
         seed of all random streams
+    split
+        shares of named parts of the dataset, such as {train: 0.8, val: 0.1, test: 0.1}; the column split names the
+        part of each image, which depends on seed and file only: patches, noise levels and frames of a clip stay
+        together
     out
         folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the
         datasets
@@ -669,10 +674,18 @@ class Config(Group):
     output: OutputConfig = field(default_factory=OutputConfig)
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
     seed: int = key(0, Integers(0, 2**63 - 1))
+    split: Any = key(None, limits.SPLIT, null="no splits", since="0.3")
     out: str = key("ds", limits.OUTPUT_PLACE, decides_data=False)
     n_jobs: int = key(-1, Integers(1, 1024, other=-1, remark=" or -1 for one per core"), decides_data=False)
     self_test: str = key("stop", Choice("stop", "go_on"), decides_data=False)
     check_disk: bool = key(True, limits.BOOLEAN, decides_data=False)
+
+    def __post_init__(self) -> None:
+        """Write the names of splits as text and their shares as floats, because users may write 1 or 1.0."""
+        super().__post_init__()
+        if isinstance(self.split, dict):
+            shares = {str(name): float(one) if is_number(one) else one for name, one in self.split.items()}
+            object.__setattr__(self, "split", FrozenMapping(shares))
 
 
 GROUPS: dict[str, type[Any]] = {

@@ -43,6 +43,8 @@ def value_text(value: Any) -> str:
     """Format a value for a message as YAML writes it: ``null``, ``true``, lists in brackets."""
     if isinstance(value, list | tuple):
         return "[" + ", ".join(value_text(item) for item in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{value_text(name)}: {value_text(item)}" for name, item in value.items()) + "}"
     if is_integer(value) and value.bit_length() > MAX_PRINTED_BITS:
         return f"an integer of {value.bit_length()} bits"  # Python refuses to convert the longest to text
     if isinstance(value, bool):

@@ -78,6 +78,28 @@ def stream_key(seed: int, source_sha256: str, occurrence: int = 0) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
+def split_uniform(seed: int, source_sha256: str) -> float:
+    """Return the number that decides the split of an image.
+
+    Identical files have the same number, because copies of a photograph must not be in training and test data. Adding
+    or removing files does not change it.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the dataset.
+    source_sha256 : str
+        SHA-256 of the source file, or of the first file of its clip, as hex digits.
+
+    Returns
+    -------
+    float
+        k·2**-53 with a 53-bit integer k; in [0, 1).
+    """
+    name = f"unprocess_gen split 1\0{seed}\0{source_sha256}"
+    return float(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big") >> 11) * 2.0**-53
+
+
 def body_key(seed: int, profile: str, unit: str) -> int:
     """Return the key of the fixed patterns of a camera body, shared by all frames of this body.
 

@@ -499,6 +499,8 @@ class Plan:
         Noise and limits of the noisy frame.
     accuracy, output : AccuracyPlan, OutputPlan
         Methods of the simulation, and format of the frames.
+    split : str
+        Part of the dataset that the image belongs to; empty without splits. It decides no pixel.
     """
 
     seed: int
@@ -511,6 +513,7 @@ class Plan:
     noise: NoisePlan
     accuracy: AccuracyPlan
     output: OutputPlan = OutputPlan()
+    split: str = ""
 
     @property
     def physics(self) -> Physics:

@@ -404,6 +404,9 @@ COLUMNS = (
     Column("light_clipped_high", "sites whose light is above white before the exposure ratio divides it", COUNT, Counts,
            unit="sites", since="0.3", in_json=False, empty_if="exposure_ratio is 1"),
     *_columns_of_numbers(*(name for name, number in NUMBERS.items() if number.since not in ("", "0.2"))),
+    Column("split", "part of the dataset that the image belongs to",
+           Text(re.compile(r"[\w-]{1,32}", re.ASCII), "up to 32 letters, digits, _ and -"), Plan, since="0.3",
+           empty_if="there are no splits, or the source failed"),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 

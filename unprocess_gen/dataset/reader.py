@@ -5,17 +5,17 @@ from __future__ import annotations
 import copy
 import csv
 import operator
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
-from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row
+from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row, Value
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
 from unprocess_gen.dataset.shards import (
@@ -39,6 +39,10 @@ FINISHED = ("0", "3")
 """Exit codes of jobs that left a dataset: complete, and complete with failed sources."""
 
 
+Place = str | Path | ObjectPath
+"""Folder of a dataset or sweep, or its URL."""
+
+
 class _Frames(NamedTuple):
     clean: Frame
     noisy: Frame
@@ -57,7 +61,7 @@ class Sample(_Frames):
     row : dict
         Manifest row: value by column.
     dataset : str
-        Name of the dataset's folder; for a sweep as in ``sweep.csv``.
+        Name of the dataset's folder; for a sweep as in ``sweep.csv``. Its path if several datasets have the same name.
     """
 
     dataset: str
@@ -106,20 +110,26 @@ class RawPairs:
 
     Parameters
     ----------
-    path : str or Path
+    path : str or Path, or a list of them
         Folder of a finished dataset, or of a sweep; or its URL in an object store, such as ``s3://bucket/ds``. A
-        sweep's datasets follow each other as in its ``sweep.csv``; jobs that left no dataset are omitted.
+        sweep's datasets follow each other as in its ``sweep.csv``; jobs that left no dataset are omitted. The pairs of
+        a list follow each other in its order.
     arrays_only : bool
         Items are tuples ``(clean, noisy)`` without the row, which PyTorch's default ``collate_fn`` stacks if all frames
         have one size. It cannot stack rows, because cells without a value are None.
+    split : str, optional
+        Only pairs of this split (key ``split`` of the settings), by default all.
 
     Attributes
     ----------
-    path : Path or ObjectPath
-        The folder.
+    path : Path or ObjectPath, or a tuple of them
+        The folder, or the folders of a list.
 
     Raises
     ------
+    ConfigError
+        If the list is empty, no pair is in the split, or the datasets of a list differ in dtype or layout with
+        ``arrays_only``.
     DamageError
         If a manifest, a shard or ``sweep.csv`` is missing or damaged; for shards when a pair is read.
     IndexError
@@ -138,11 +148,21 @@ class RawPairs:
     (dtype('uint16'), '00000000')
     """
 
-    def __init__(self, path: str | Path | ObjectPath, *, arrays_only: bool = False) -> None:
-        self.path = any_path(path)
+    def __init__(self, path: Place | Sequence[Place], *, arrays_only: bool = False, split: str | None = None) -> None:
+        places = [path] if isinstance(path, Place) else path
+        roots, is_list = tuple(map(any_path, places)), not isinstance(path, Place)
+        if not roots:
+            raise ConfigError("RawPairs([]): no dataset; expected at least one folder")
+        self.path = roots if is_list else roots[0]
         self.arrays_only = arrays_only
-        self._datasets = [_Dataset(folder) for folder in _dataset_folders(self.path)]
-        offsets = [dataset.offsets() for dataset in self._datasets]
+        self._datasets = [_Dataset(folder) for root in roots for folder in _dataset_folders(root)]
+        if is_list:
+            _name_apart(self._datasets)
+        offsets = [dataset.offsets(split) for dataset in self._datasets]
+        if is_list and arrays_only:
+            _check_formats(self._datasets)
+        if split is not None:
+            _check_split(split, self._datasets)
         self._offsets: NDArray[np.int64] = np.concatenate([np.empty(0, np.int64), *offsets])
         self._dataset_of: NDArray[np.int32] = np.repeat(
             np.arange(len(offsets), dtype=np.int32), [len(some) for some in offsets]
@@ -157,7 +177,8 @@ class RawPairs:
         return len(self._offsets)
 
     def __repr__(self) -> str:
-        return f"RawPairs({str(self.path)!r}, length={len(self)})"
+        path = [*map(str, self.path)] if isinstance(self.path, tuple) else str(self.path)
+        return f"RawPairs({path!r}, length={len(self)})"
 
     def __iter__(self) -> Iterator[Sample]:
         return (self[number] for number in range(len(self)))
@@ -189,12 +210,21 @@ class _Dataset:
         self._columns: tuple[str, ...] = ()
         self._indexes: dict[int, dict[str, Member]] = {}
         self._members = 0
+        self.formats: set[tuple[Value, ...]] = set()
+        self.splits: set[str] = set()
 
-    def offsets(self) -> NDArray[np.int64]:
-        """Return the offsets of the rows of all pairs."""
+    def offsets(self, split: str | None = None) -> NDArray[np.int64]:
+        """Return the offsets of the rows of all pairs, or of those in a split; note all formats and splits."""
         self._columns = read_columns(self._manifest)
         rows = rows_with_offsets(self._manifest)
-        return np.fromiter((at for at, row in rows if row["status"] == "ok"), dtype=np.int64)
+        return np.fromiter((place for place, row in rows if self._is_pair(row, split)), dtype=np.int64)
+
+    def _is_pair(self, row: Row, split: str | None) -> bool:
+        if row["status"] != "ok":
+            return False
+        self.formats.add((row["dtype"], row["clean_dtype"] or row["dtype"], row["layout"]))
+        self.splits.add(str(row["split"]))
+        return split in (None, row["split"])
 
     def read(self, offset: int) -> Sample:
         """Return the pair whose row begins at a byte."""
@@ -225,6 +255,30 @@ class _Dataset:
                 self._members = len(index)
             self._indexes[shard] = index
         return index
+
+
+def _name_apart(datasets: Sequence[_Dataset]) -> None:
+    """Name datasets by their paths if folders have the same name."""
+    if len({dataset.name for dataset in datasets}) < len(datasets):
+        for dataset in datasets:
+            dataset.name = str(dataset.path)
+
+
+def _check_formats(datasets: Sequence[_Dataset]) -> None:
+    """Raise ConfigError if frames of several datasets cannot be stacked, whatever their sizes."""
+    first = {form: dataset.name for dataset in reversed(datasets) for form in dataset.formats}
+    if len(first) > 1:
+        kinds = "; ".join(f"{name}: {noisy}, clean {clean}, {layout}" for (noisy, clean, layout), name in first.items())
+        problem = "the frames differ in dtype or layout"
+        raise ConfigError(f"RawPairs: arrays_only=True: {problem} ({kinds}); expected one; use arrays_only=False")
+
+
+def _check_split(split: str, datasets: Sequence[_Dataset]) -> None:
+    """Raise ConfigError if no pair is in a split."""
+    names = sorted(set().union(*(dataset.splits for dataset in datasets)) - {""})
+    if split not in names:
+        expected = f"expected one of {', '.join(names)}" if names else "there are no splits; generate with split={…}"
+        raise ConfigError(f"RawPairs: split={split[:40]!r}: no pair is in it; {expected}")
 
 
 def _dataset_folders(path: AnyPath) -> list[AnyPath]:

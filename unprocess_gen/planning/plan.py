@@ -6,7 +6,9 @@ A pair is a pure function of pixels and plan. Draws come from the stream ``param
 
 from __future__ import annotations
 
+import bisect
 import functools
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +19,7 @@ from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core import types
-from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, stream_key
+from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, split_uniform, stream_key
 from unprocess_gen.core.types import DarkFrames, Facts, Plan
 from unprocess_gen.planning.draws import COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
@@ -151,6 +153,7 @@ class Planner:
         self._scene_name, self._highlight = config.scene.name, (config.gains.highlight, config.gains.threshold)
         self._source = types.SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
         self._isp = types.IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
+        self._splits: dict[str, float] = config.split or {}
         sensor = config.sensor
         self._sensor = types.SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
         self._output = types.OutputPlan(
@@ -176,7 +179,7 @@ class Planner:
         camera = self._draw_camera(uniforms)
         steep = self._steep_accuracy != self._accuracy and is_steep(camera, scene.exposure)
         accuracy = self._steep_accuracy if steep else self._accuracy
-        signals = None
+        signals, split = None, self._draw_split(seed, source_sha256)
         if self._is_physical and facts is not None:
             signals = signal_range(facts, self._isp, camera, scene.exposure, float(self._sensor.span_dn))
         image = Image(seed, key, facts, signals, dark_frames)
@@ -186,8 +189,15 @@ class Planner:
                 for counter in NOISE_COUNTERS:
                     uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)
-            plan = Plan(seed, key, self._source, scene, camera, self._isp, self._sensor, noise, accuracy, self._output)
-            yield plan, selection
+            parts = self._source, scene, camera, self._isp, self._sensor, noise, accuracy, self._output
+            yield Plan(seed, key, *parts, split), selection
+
+    def _draw_split(self, seed: int, source_sha256: str) -> str:
+        """Name the split of an image, empty without splits; the last one takes what the others leave."""
+        if not self._splits:
+            return ""
+        names, ends = list(self._splits), list(itertools.accumulate(self._splits.values()))
+        return names[bisect.bisect_right(ends[:-1], split_uniform(seed, source_sha256))]
 
     def _draw_camera(self, uniforms: Sequence[float]) -> types.CameraPlan:
         """Draw colours and gains."""

@@ -34,6 +34,7 @@ def format_estimate(estimate: RunEstimate) -> str:
         f"sources   {len(run.sources)} in {config.source.root or 'the built-in scenes'}; {len(read)} of them read",
         *(f"          {note}" for note in notes if note),
         f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}",
+        *_labelled("splits", [_split_sentence(config, len(run.sources))]),
         *_patch_lines(config, read),
         f"bytes     {about}{estimate.bytes:,} in shards, {byte_size(estimate.bytes)}{basis}",
         f"disk      {byte_size(estimate.free_bytes)} free"
@@ -62,6 +63,12 @@ def _labelled(label: str, sentences: Iterable[str | None], indent: str = "") -> 
         line for text in texts for line in textwrap.wrap(text, 110, subsequent_indent=indent, break_on_hyphens=False)
     ]
     return [f"{label if number == 0 else '':10}{line}" for number, line in enumerate(lines)]
+
+
+def _split_sentence(config: Config, sources: int) -> str:
+    """State the share of each split, and the number of sources that it leads to expect; empty without splits."""
+    expected = (f"{name} {share:.4g} (about {share * sources:.0f})" for name, share in (config.split or {}).items())
+    return f"{', '.join(expected)} of {sources} sources" if config.split else ""
 
 
 def _patch_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
