@@ -89,7 +89,63 @@ def more_signal(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.ran
     return rounded(exact + 0.05 * (clean - plan.sensor.black_level_dn), plan)
 
 
+def standard_deviation(clean: NDArray[np.float64], plan: Plan) -> NDArray[np.float64]:
+    """Return the standard deviation of the noise that the plan states without row noise."""
+    slope, intercept = plan.noise.variance_line
+    return np.sqrt(slope * (clean - plan.sensor.black_level_dn) + intercept)
+
+
+def filtered(*weights: tuple[int, int, float]) -> Fault:
+    """Add shifted noise to the noise: distances in rows and columns, and weights; its variance is kept."""
+
+    def change(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+        clean, exact = unrounded(srgb, plan)
+        std = standard_deviation(clean, plan)
+        z = (exact - clean) / std
+        terms = (weight * np.roll(z, (y, x), (0, 1)) for y, x, weight in weights)
+        scale = sum(weight * weight for _, _, weight in weights) ** 0.5
+        return rounded(clean + std * sum(terms) / scale, plan)
+
+    return change
+
+
+def blurred(share: float) -> Fault:
+    """Give each of the eight neighbours of a site an eighth of a share of its noise."""
+    places = ((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1))
+    return filtered(*((y, x, share / 8 if y or x else 1 - share) for y, x in places))
+
+
+def white_sites(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Set a share of 1e-4 of all sites to the largest DN."""
+    return np.where(draws.random(noisy.shape) < 1e-4, 2**plan.sensor.bits - 1, noisy).astype(np.uint16)
+
+
+def even_codes(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Round to even DN."""
+    _, exact = unrounded(srgb, plan)
+    return rounded(2 * np.rint(exact / 2), plan)
+
+
+def repeated_noise(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Add the same normal deviates to every frame."""
+    clean, _ = unrounded(srgb, plan)
+    deviates = np.random.default_rng(0).standard_normal(clean.shape)
+    return rounded(clean + standard_deviation(clean, plan) * deviates, plan)
+
+
+SITE_FAULTS: dict[str, Fault] = {
+    "blur of 5 % over 3 x 3 sites, variance kept": blurred(0.05),
+    "correlation 0.05 of adjacent sites": filtered((0, 0, 1.0), (0, 1, 0.05)),
+    "correlation 0.05 of diagonal sites": filtered((0, 0, 1.0), (1, -1, 0.05)),
+    "correlation 0.05 of neighbours of a plane": filtered((0, 0, 1.0), (2, 0, 0.05)),
+    "correlation 0.05 of diagonal neighbours of a plane": filtered((0, 0, 1.0), (2, 2, 0.05)),
+    "a share of 1e-4 of white sites": white_sites,
+    "even DN only": even_codes,
+}
+"""Faults that every kind of noise can have."""
+
 FAULTS: dict[str, Fault] = {
+    **SITE_FAULTS,
     "black level off by 20 DN": black_level,
     "row noise removed": with_numbers(row_std_dn=0.0),
     "green sites swapped": swapped_greens,

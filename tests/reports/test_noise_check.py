@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,16 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.noise_faults import FAULTS, Fault, replace_noisy_frames, with_numbers
+from helpers.noise_faults import (
+    FAULTS,
+    SITE_FAULTS,
+    Fault,
+    repeated_noise,
+    replace_noisy_frames,
+    with_numbers,
+)
 from helpers.promise_report import Figure
+from numpy.typing import NDArray
 
 from unprocess_gen import RawPairs, make_pair
 from unprocess_gen.config.schema import replaced
@@ -24,6 +32,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import Facts, Patch, Plan
 from unprocess_gen.dataset.manifest import plan_from_row, read_rows
+from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.noise_check import checks
 from unprocess_gen.reports.noise_check.checks import (
@@ -70,6 +79,22 @@ LAWS = {
 }
 
 
+def with_bars(srgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Set an eighth of the rows above and below to black."""
+    bar = len(srgb) // 8
+    return np.pad(srgb[bar:-bar], ((bar, bar), (0, 0), (0, 0)))
+
+
+KINDS: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
+    "scene": lambda srgb: srgb,
+    "black bars": with_bars,
+    "patch of 64": lambda srgb: with_bars(srgb)[:64, :64].copy(),
+    "black": np.zeros_like,
+    "white": lambda srgb: np.full_like(srgb, 255),
+    "one colour": lambda srgb: np.broadcast_to(srgb[:1, :1], srgb.shape).copy(),
+}
+"""Pictures in which many sites have exactly the same clean value, by what they show."""
+
 Checked = tuple[Plan, Scores]
 
 
@@ -79,6 +104,7 @@ def checked(
     number: int,
     side: int = 192,
     faults: Iterable[Fault] = (lambda srgb, noisy, plan, draws: noisy,),
+    kind: str = "scene",
     **numbers: Any,
 ) -> list[Checked]:
     """Plan and scores of a pair for each fault; ``numbers``: physical numbers of the row."""
@@ -86,7 +112,9 @@ def checked(
     picture = synthetic.scene(synthetic.NAMES[number % len(synthetic.NAMES)])
     height, width = (min(side, length) // 2 * 2 for length in picture.shape[:2])
     y, x = (int(draws.integers(0, n - m + 1)) // 2 * 2 for n, m in zip(picture.shape, (height, width), strict=False))
-    srgb = np.ascontiguousarray(picture[y : y + height, x : x + width])
+    srgb = KINDS[kind](np.ascontiguousarray(picture[y : y + height, x : x + width]))
+    if kind != "scene":
+        srgb[0, 0] = number % 256  # equal pictures have equal noise
     pair = make_pair(srgb, replaced(settings(*overrides), {"seed": number}))
     if numbers:
         plan = plan_from_row(pair.row)
@@ -117,6 +145,33 @@ def test_untouched_pairs_raise_no_alarm(name: str, settings: Settings) -> None:
     pairs = [*checked(settings, LAWS[name], 0), *checked(settings, LAWS[name], 1)]
     assert any(scores for _, scores in pairs)
     assert [str(alarm) for alarm in alarms(pairs)] == []
+
+
+END_LAWS = (
+    *((), ("scene.exposure_ratio=200",), ("noise=canon_5d4", "scene=indoor"), ("noise=sony_a7s2", "scene=night")),
+    ("noise=nikon_d850", "scene=long_exposure", "effects.hot_pixels=on", "sensor=generic_14bit"),
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_black_and_white_sites_raise_no_alarm(kind: str, settings: Settings) -> None:
+    for overrides in END_LAWS:
+        pairs = [pair for n in range(4) for pair in checked(settings, overrides, n, kind=kind)]
+        assert [str(alarm) for alarm in alarms(pairs)] == []
+
+
+@pytest.mark.slow
+def test_many_black_and_white_sites_raise_no_alarm(settings: Settings, figure: Figure) -> None:
+    """Each combination counts as a dataset of 50 pairs, and all together as another one."""
+    everything: list[Checked] = []
+    found: list[str] = []
+    for kind, overrides in itertools.product(KINDS, END_LAWS):
+        pairs = [pair for n in range(50) for pair in checked(settings, overrides, n, 320, kind=kind)]
+        found += [f"{kind}, {' '.join(overrides)}: {alarm}" for alarm in alarms(pairs)]
+        everything += pairs
+    found += [str(alarm) for alarm in alarms(everything)]
+    figure("noise-check", f"{len(found)} alarms in {len(everything)} pairs with black bars, black, white or one colour")
+    assert found == []
 
 
 NOISES = (
@@ -183,11 +238,15 @@ def test_scores_of_untouched_pairs_have_unit_variance(settings: Settings) -> Non
 
 # Faults ---------------------------------------------------------------------------------------------------------------
 
+HOT = ("effects.hot_pixels=on", "scene.exposure_s=30", "scene.temperature_c=35", "sensor=generic_14bit")
+NO_HOT_PIXELS = {"hot pixels missing": with_numbers(hot_pixel_share=0.0)}
 COMBINATIONS = {
     "night, sony_a7s2": NIGHT_A7S2,
     "night, nikon_d850": NIGHT_D850,
     "night, nikon_d850, 14 bits": NIGHT_14_BITS,
     "video at night, canon_700d": ("noise=canon_700d", "scene=video_night", "effects.row=on"),
+    "default": (),
+    "long exposure, nikon_d850": ("noise=nikon_d850", "scene=long_exposure", *HOT),
 }
 EXPECTED = {
     "black level off by 20 DN": "mean",
@@ -195,6 +254,12 @@ EXPECTED = {
     "column stripes of a tenth of the read noise": "column differences",
     "uniform noise of equal variance": "variance",
     "5 % more signal": "mean against signal",
+    "correlation 0.05 of adjacent sites": "adjacent sites",
+    "correlation 0.05 of diagonal sites": "diagonal sites",
+    "correlation 0.05 of neighbours of a plane": "neighbours",
+    "correlation 0.05 of diagonal neighbours of a plane": "diagonal neighbours",
+    "a share of 1e-4 of white sites": "outliers",
+    "even DN only": "odd codes",
 }
 """Checks that must find a fault; swapped sites are found by one of several."""
 
@@ -213,20 +278,53 @@ def test_planted_faults_are_found_in_95_percent_of_runs(name: str, settings: Set
     runs, count, side = 20, 12, 512
     in_runs: Counter[str] = Counter()
     in_pairs: Counter[str] = Counter()
+    faults = {"default": SITE_FAULTS, "long exposure, nikon_d850": SITE_FAULTS | NO_HOT_PIXELS}.get(name, FAULTS)
     for run in range(runs):
         numbers = range(run * count, (run + 1) * count)
-        pairs = [checked(settings, COMBINATIONS[name], number, side, FAULTS.values()) for number in numbers]
-        for fault, of_fault in zip(FAULTS, zip(*pairs, strict=True), strict=True):
+        pairs = [checked(settings, COMBINATIONS[name], number, side, faults.values()) for number in numbers]
+        for fault, of_fault in zip(faults, zip(*pairs, strict=True), strict=True):
             in_runs[fault] += bool(alarms(of_fault))
             in_pairs[fault] += sum(bool(failed_checks("", scores, threshold(1))) for _, scores in of_fault)
-    fewest = min(in_runs[fault] for fault in FAULTS)
-    least = min(in_pairs[fault] for fault in FAULTS)
+    fewest = min(in_runs[fault] for fault in faults)
+    least = min(in_pairs[fault] for fault in faults)
     figure(
         "noise-check",
-        f"{name}: each of {len(FAULTS)} faults found in at least {fewest} of {runs} runs of {count} pairs, and in at "
+        f"{name}: each of {len(faults)} faults found in at least {fewest} of {runs} runs of {count} pairs, and in at "
         f"least {least / (runs * count):.0%} of single pairs",
     )
     assert fewest >= 0.95 * runs
+
+
+@pytest.mark.slow
+def test_missing_hot_pixels_are_found(settings: Settings) -> None:
+    hot = COMBINATIONS["long exposure, nikon_d850"]
+    pairs = [pair for n in range(6) for pair in checked(settings, hot, n, 512, NO_HOT_PIXELS.values())]
+    assert {alarm.check for alarm in alarms(pairs)} == {"defects"}
+
+
+def repetitions(pairs: Iterable[Sample], **numbers: int) -> list[Alarm]:
+    """Alarms about repeated noise, if the rows of the pairs have these numbers and one more from pair to pair."""
+    pairs = list(pairs)
+    checker = Checker(np.ones((len(pairs), 2), np.int64))
+    for n, (clean, noisy, row) in enumerate(pairs):
+        row = {**row, **{name: first + n for name, first in numbers.items()}}
+        checker.add(row, pair_sums(clean, noisy, row))
+    return [alarm for alarm in checker.alarms if alarm.check == "repetition"]
+
+
+def test_repeated_draws_and_noise_are_found(settings: Settings) -> None:
+    """Draws of a scene are equal byte by byte; frames of different scenes have the same deviates."""
+    scenes = [np.ascontiguousarray(synthetic.scene(name)[:64, :64]) for name in synthetic.NAMES[:3]]
+    pairs = [make_pair(srgb, settings()) for srgb in scenes]
+    assert repetitions([(pairs[0].clean, pairs[0].noisy, pairs[0].row)] * 2) == []  # patches of a frame at one place
+    assert repetitions([(pair.clean, pair.noisy, pair.row) for pair in pairs]) == []
+    assert repetitions([(pairs[0].clean, pairs[0].noisy, pairs[0].row)] * 2, draw=0)
+    draws = np.random.default_rng(0)
+    repeated = [
+        repeated_noise(srgb, pair.noisy, plan_from_row(pair.row), draws)
+        for srgb, pair in zip(scenes, pairs, strict=True)
+    ]
+    assert repetitions([(pair.clean, noisy, pair.row) for pair, noisy in zip(pairs, repeated, strict=True)])
 
 
 ROWS_DN = 15.0
@@ -305,7 +403,8 @@ def test_read_noise_agrees_with_the_table_of_draws(law: str, shape: float) -> No
         values.append(table[:, 0] + t * (table[:, 1] + t * table[:, 2]))
         weights.append(widths * weight)
     expected = [float((np.cos(frequency * np.array(values)) * np.array(weights)).sum()) for frequency in (0, 0.5, 1, 2)]
-    factors, largest = tukey_distribution(law, shape)
+    factors, quantiles, logarithms = tukey_distribution(law, shape)
+    largest = -float(np.interp(math.log(RARE), logarithms, quantiles))
     np.testing.assert_allclose(factors[[0, 50, 100, 200]], expected, atol=3e-4)
     assert np.sum(np.where(np.array(values) > largest, weights, 0)) / 2 == pytest.approx(RARE, rel=0.05)
 
@@ -321,7 +420,7 @@ def test_characteristic_function_agrees_with_drawn_noise(overrides: tuple[str, .
         signal = np.full(1, light)
         std = np.sqrt(noise.variance(signal))
         for k in (1.0, 2.0):
-            cosine = np.cos(k * drawn / std)
+            cosine = np.cos(k * drawn[np.isfinite(drawn)] / std)
             rounding = np.sinc(k / std / (2 * np.pi)) if "quantise" in plan.noise.effects else 1.0  # not rounded here
             expected = noise.characteristic(signal, k / std).real / rounding
             error = cosine.std() / 256 * math.sqrt(float(1 + (noise.row_variance / std[0] ** 2) ** 2 * 256))
@@ -362,7 +461,7 @@ def test_rounding_errors_of_a_curve_add_linearly() -> None:
 
 def test_threshold_keeps_the_probability_of_a_false_alarm(settings: Settings) -> None:
     assert 2 * TESTS * 101 * math.exp(-threshold(100)) == pytest.approx(FALSE_ALARM)
-    assert len(checked(settings, (), 0)[0][1]) == TESTS
+    assert len(checked(settings, (), 0)[0][1]) == TESTS - 1  # the pair before is compared in datasets
 
 
 # Datasets -------------------------------------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ def fit_sums(key: str, sums: Sums) -> NoiseFit | None:
     return NoiseFit(
         key=key,
         estimate=expected + influence @ points.difference,
-        error=np.sqrt(influence**2 @ points.noise + _row_variances(sums, planes, influence)),
+        error=np.sqrt(influence**2 @ (points.noise + points.unknown**2) + _row_variances(sums, planes, influence)),
         expected=expected,
         signal_dn=points.signal[drawn],
         variance_dn2=(points.difference + std**2 - rounding_dn2)[drawn],

@@ -11,7 +11,7 @@ import math
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,8 @@ from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.reports.noise_check.scores import LEAST_SITES, Score, Scores, scores_of
-from unprocess_gen.reports.noise_check.sums import Sums
+from unprocess_gen.reports.noise_check.scores import LEAST_SITES, Score, Scores, repetition_score, scores_of
+from unprocess_gen.reports.noise_check.sums import Sample, Sums
 from unprocess_gen.simulation.effects import BY_NAME
 
 FALSE_ALARM = 1e-6
@@ -51,6 +51,7 @@ class Check(NamedTuple):
 _OFFSET, _GAIN = "wrong black level or plane offset", "wrong exposure or gain, or swapped sites"
 _WEAK, _STRONG = "weaker noise than recorded, or another distribution", "stronger noise, or another distribution"
 _ROWS, _COLUMNS = ("row noise is missing", "row noise is too strong"), ("column offsets are missing", "column stripes")
+_CORRELATED, _CODES = ("0", "sharpened frames", "smoothed frames"), "codes are missing"
 CHECKS = {
     "mean": Check(0, "mean", "DN", "black_level_dn", _OFFSET, _OFFSET),
     "mean against signal": Check(0, "signal", "%", "that of the clean frame", _GAIN, _GAIN),
@@ -60,7 +61,15 @@ CHECKS = {
     "column differences": Check(1, "variance of differences of columns", "DN²", "the recorded one", *_COLUMNS),
     "variance": Check(2, "variance", "DN²", "the recorded one", _WEAK, _STRONG),
     "variance against signal": Check(2, "variance per signal", "DN", "a_dn", "smaller gain", "larger gain"),
-    "neighbours": Check(3, "correlation of neighbours", "%", "0", "sharpened frames", "smoothed frames"),
+    "adjacent sites": Check(3, "correlation of adjacent sites", "%", *_CORRELATED),
+    "diagonal sites": Check(3, "correlation of diagonal sites", "%", *_CORRELATED),
+    "neighbours": Check(3, "correlation of neighbours of a plane", "%", *_CORRELATED),
+    "diagonal neighbours": Check(3, "correlation of diagonal neighbours of a plane", "%", *_CORRELATED),
+    "repetition": Check(4, "correlation with the pair before", "%", "0", *2 * ("noise of another pair is repeated",)),
+    "odd codes": Check(5, "surplus of odd codes", "%", "0", *2 * (_CODES,)),
+    "pairs of codes": Check(5, "surplus of codes with the second lowest bit", "%", "0", *2 * (_CODES,)),
+    "outliers": Check(6, "share of outliers", "per million", "the expected one", "weaker tails", "unknown defects"),
+    "defects": Check(7, "share of hot and dead pixels", "%", "the recorded one", "defects are missing", "a bug"),
 }
 """Checks by name."""
 
@@ -131,6 +140,7 @@ class Checker:
         self._overlaps = overlaps
         self._limit = threshold(len(overlaps))
         self._pool, self.pair_alarms = Pool(), list[Alarm]()
+        self._before: tuple[list[Any], Sample] | None = None
         self.count = self.unchecked = self.wrong_pairs = 0
 
     def add(self, row: Row, sums: Sums | None) -> None:
@@ -140,7 +150,10 @@ class Checker:
             self.unchecked += 1
             return
         self.count += 1
-        scores = scores_of(sums)
+        scores, frame = scores_of(sums), [row[name] for name in ("stream_key", "frame", "level", "draw")]
+        if self._before is not None and self._before[0] != frame:  # patches of a frame share its noise
+            scores["repetition", ""] = repetition_score(sums.sample, self._before[1])
+        self._before = frame, sums.sample
         self._pool.add(scores, in_rows if sums.planes[0].noise.row_variance else in_sites, curve_group(sums.plan))
         failed = failed_checks(str(row["key"]), scores, self._limit)
         self.wrong_pairs += bool(failed)

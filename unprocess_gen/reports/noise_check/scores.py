@@ -13,10 +13,12 @@ import numpy as np
 
 from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, PlaneNoise
-from unprocess_gen.reports.noise_check.sums import Plane, Sums
+from unprocess_gen.reports.noise_check.sums import LARGEST_SAMPLE, NEIGHBOURS, Plane, Sample, Sums
 
 LEAST_SITES = 64
 """Fewest sites of a pair that is checked."""
+TAIL_ERROR = 0.05
+"""Relative error of expected numbers of outliers, because tails add to other noise."""
 
 
 class Score(NamedTuple):
@@ -36,8 +38,8 @@ class Score(NamedTuple):
         Standard deviation due to patterns that the frames of one body share.
     step : float
         Largest contribution of one site or line.
-    high : float
-        Largest expectation of the sum that the rounding of the clean frame can cause.
+    low, high : float
+        Smallest and largest expectation of the sum, which depends on values that the row does not state.
     """
 
     total: float
@@ -46,12 +48,13 @@ class Score(NamedTuple):
     rounding: float = 0.0
     fixed: float = 0.0
     step: float = 0.0
+    low: float = 0.0
     high: float = 0.0
 
     @property
     def excess(self) -> float:
         """Distance of the sum from the expectations that are possible."""
-        return self.total - min(max(self.total, 0.0), self.high)
+        return self.total - min(max(self.total, self.low), self.high)
 
     @property
     def std(self) -> float:
@@ -92,7 +95,16 @@ def scores_of(sums: Sums) -> Scores:
     scores |= {("variance against signal", name): points.score(points.signal) for name, points in variances.items()}
     scores["mean", ""], scores["mean against signal", ""] = mean.score(), mean.score(mean.signal)
     scores["variance", ""], scores["variance against signal", ""] = variance.score(), variance.score(variance.signal)
-    return scores | _line_scores(sums) | {("neighbours", ""): _neighbour_score(sums)}
+    has_rounding = not sums.plan.output.clean_normalised
+    rounding_dn2 = has_rounding * rounding_variance(mean, 1 / 12)
+    scores |= {(name, ""): _neighbour_score(sums, name, rounding_dn2) for name in NEIGHBOURS}
+    if min(abs(gain - 1) for gain in (sums.plan.camera.red_gain, sums.plan.camera.blue_gain)) > 0.1:
+        # rounding errors of values whose ratio is not 1 have a correlation of at most ½, that of the ratio 2
+        half_dn2 = has_rounding * rounding_variance(mean, 1 / 24)
+        scores["adjacent sites", ""] = _neighbour_score(sums, "adjacent sites", half_dn2)
+    scores["odd codes", ""], scores["pairs of codes", ""] = (_code_score(sums, bit) for bit in range(2))
+    scores["outliers", ""], scores["defects", ""] = _outlier_score(sums), _defect_score(sums)
+    return scores | _line_scores(sums, rounding_dn2)
 
 
 def plane_names(pattern: str) -> list[str]:
@@ -117,6 +129,8 @@ class Points(NamedTuple):
         Fraction of ``noise`` that frames of one body share.
     rounding : ndarray of float64, [N]
         Standard deviation of the differences due to the rounding of the clean frame.
+    unknown : ndarray of float64, [N]
+        Largest size of differences due to rounding where it has no known distribution.
     step : ndarray of float64, [N]
         Largest contribution of one site.
     """
@@ -127,16 +141,18 @@ class Points(NamedTuple):
     rows: Float
     fixed: Float
     rounding: Float
+    unknown: Float
     step: Float
 
     @property
     def weight(self) -> Float:
         """Weight of each bin: the inverse of its variance."""
-        return 1 / (self.noise + self.rounding**2)
+        return 1 / (self.noise + self.rounding**2 + self.unknown**2 / 3)
 
     def score(self, direction: Float | float = 1.0) -> Score:
         """Score of a quantity that changes the bins by ``direction``, with the weights of the least variance."""
         weight = direction * self.weight
+        unknown = float(weight @ self.unknown)
         return Score(
             total=float(weight @ self.difference),
             information=float((weight * direction).sum()),
@@ -144,6 +160,8 @@ class Points(NamedTuple):
             rounding=float(np.linalg.norm(weight * self.rounding)),
             fixed=math.sqrt(float(weight**2 @ (self.noise * self.fixed))),
             step=float(np.abs(weight * self.step).max()),
+            low=-unknown,
+            high=unknown,
         )
 
 
@@ -158,11 +176,12 @@ def mean_points(plane: Plane) -> Points:
     return Points(
         signal=expected.signal,
         difference=_mean_noise(plane) - expected.rounding_mean,
-        noise=expected.std**2 * expected.variance / count,
+        noise=expected.std**2 / count,
         # Cauchy's inequality: the sites of a row have a common offset, whatever their clean value
         rows=2 * plane.row_sites * offsets.variance * offsets.magnitudes / count,
         fixed=expected.fixed,
-        rounding=expected.rounding_std,
+        rounding=expected.rounding_std * (expected.unknown_dn == 0),
+        unknown=expected.unknown_dn,
         step=LARGEST_Z * expected.std / count,
     )
 
@@ -176,6 +195,7 @@ def variance_points(plane: Plane) -> Points:
     is_rounded, scale = not plane.noise.site.plan.output.clean_normalised, np.abs(expected.by_variance)
     position = _mean_noise(plane) if is_rounded else plane.means[2]
     noise = expected.cosine_variance + is_rounded * (expected.slope * expected.std) ** 2
+    bend = np.abs(expected.bend) / scale
     return Points(
         signal=expected.signal,
         difference=(expected.cosine + expected.slope * position - plane.means[1]) / scale,
@@ -183,14 +203,22 @@ def variance_points(plane: Plane) -> Points:
         # two cosines have a covariance of at most 4 (row variance / std²)²
         rows=8 * plane.row_sites * offsets.squares * (offsets.variance / expected.std**2 / scale) ** 2 / count,
         fixed=expected.fixed,
-        rounding=expected.unknown / scale,
+        rounding=bend / 3 * (expected.unknown_dn == 0),
+        unknown=bend * 2 / 3 * (expected.unknown_dn > 0),
         step=LARGEST_Z / count / scale,
     )
 
 
 def _mean_noise(plane: Plane) -> Float:
     """Mean of noisy minus clean and known offsets in each bin, without defects, DN."""
-    return np.asarray(plane.expected.std * (plane.means[0] - plane.expected.defect_mean))
+    return np.asarray(plane.expected.std * plane.means[0])
+
+
+def rounding_variance(mean: Points, least: float) -> float:
+    """Largest covariance of rounding errors of the clean frame, DN²: ``least``, or more in flat frames."""
+    sites = 1 / np.maximum(mean.noise, 1e-30)
+    square = float(sites @ (mean.difference**2 - mean.noise - mean.rows)) / float(sites.sum())
+    return min(max(square, least), 1 / 4)
 
 
 # -------------------------------------------------------------------------------------------------- rows and columns
@@ -229,14 +257,13 @@ def row_differences(noise: PlaneNoise) -> LineOffsets:
     return LineOffsets(noise.row_variance * (1 - r * r), magnitudes, 1 + r * r / (2 * (1 + r**4)))
 
 
-def _line_scores(sums: Sums) -> Scores:
+def _line_scores(sums: Sums, rounding_dn2: float) -> Scores:
     """Scores of the variances of row and column offsets.
 
     The rounding of a smooth clean frame can move complete lines by up to half a DN. Differences of lines n and n + 2,
     and products of distant parts of a line, are almost free of it, with a third of the information.
     """
     noise, columns = sums.planes[0].noise, LineOffsets(0.0)
-    rounding_dn2 = 0.0 if sums.plan.output.clean_normalised else 1 / 12
     lines = {
         "row means": (sums.rows, 0, row_offsets(noise), rounding_dn2),
         "column means": (sums.columns, 1, columns, rounding_dn2),
@@ -262,22 +289,22 @@ def _quadratic_score(lines: Float, apart: int, offsets: LineOffsets, rounding_dn
     """Score of the variance of line offsets: Σ aᵀMa - E[aᵀMa] for the sums a of the parts of each line.
 
     ``lines`` [3, 2, lines, parts] are the sums a, their weights j, and their variances u. The covariance of a line is
-    C = s²·diag(u) + σ²·jjᵀ with the variances s² of z and σ² of the offset. Then E[aᵀMa] = tr(MC), and its variance for
+    C = diag(u) + σ²·jjᵀ with the variance σ² of the offset. Then E[aᵀMa] = tr(MC), and its variance for
     normal values is 2·tr(MCMC). The mask M is 1 for parts that are at least ``apart``.
     """
     a, j, u = lines.reshape(3, -1, lines.shape[3])
-    part, noise, offset = np.arange(lines.shape[3]), sums.variance, offsets.variance
+    part, offset = np.arange(lines.shape[3]), offsets.variance
     mask = (np.abs(np.subtract.outer(part, part)) >= apart).astype(np.float64)
     weighted = j @ mask
     pairs = (weighted * j).sum(axis=1)
-    excess = ((a @ mask) * a).sum(axis=1) - noise * (u @ np.diag(mask)) - offset * pairs
-    own = noise**2 * ((u @ mask) * u).sum(axis=1)
-    cross = 2 * offset * noise * (weighted**2 * u).sum(axis=1)
+    excess = ((a @ mask) * a).sum(axis=1) - u @ np.diag(mask) - offset * pairs
+    own = ((u @ mask) * u).sum(axis=1)
+    cross = 2 * offset * (weighted**2 * u).sum(axis=1)
     predicted = 2 * float((own + cross + offsets.squares * (offset * pairs) ** 2).sum())
     # rounding errors of neighbouring sites can be equal in a smooth frame, which increases the variance
     variance = max(predicted, float(excess @ excess))
     norm = float(mask.sum(axis=1).max())  # at least the largest eigenvalue
-    largest = offsets.magnitudes * offset * pairs + norm * noise * u.max(axis=1)
+    largest = offsets.magnitudes * offset * pairs + norm * u.max(axis=1)
     return Score(
         total=float(excess.sum()),
         information=float(pairs.sum()),
@@ -290,18 +317,62 @@ def _quadratic_score(lines: Float, apart: int, offsets: LineOffsets, rounding_dn
     )
 
 
-# ---------------------------------------------------------------------------------------------------------- neighbours
+# ------------------------------------------------------------------------------------------------------ pairs of sites
 
 
-def _neighbour_score(sums: Sums) -> Score:
-    """Score of the correlation of horizontal and vertical neighbours of a plane."""
-    product, pairs, inverse = sums.neighbours.tolist()
-    return Score(
-        total=product,
-        information=pairs,
-        variance=pairs * sums.variance**2,
-        fixed=sums.fixed * math.sqrt(pairs),
-        step=LARGEST_Z**2,
-        # rounding errors of neighbours are equal in a smooth frame
-        high=0.0 if sums.plan.output.clean_normalised else inverse / 12,
-    )
+def _neighbour_score(sums: Sums, name: str, rounding_dn2: float) -> Score:
+    """Score of the correlation of z at pairs of neighbours.
+
+    Their rounding errors are equal in a smooth frame, or opposite if their colours differ. The numbers of pairs and the
+    sums of products of 1 / std are bounded by those of the sites (Cauchy's inequality).
+    """
+    pairs = len(NEIGHBOURS[name]) * sums.sites
+    inverse = sum(float((plane.count / plane.expected.std**2).sum()) for plane in sums.planes)
+    bound = rounding_dn2 * len(NEIGHBOURS[name]) * inverse
+    fixed = sums.fixed * math.sqrt(pairs)
+    return Score(sums.products[name], pairs, pairs, fixed=fixed, step=LARGEST_Z**2, low=-bound, high=bound)
+
+
+def repetition_score(here: Sample, there: Sample) -> Score:
+    """Score of the correlation of z at the same sites of two pairs; patterns of the body and rounding may cause it."""
+    common = np.s_[: min(len(here.z), len(there.z)), : min(here.z.shape[1], there.z.shape[1])]
+    product, inverse = here.z[common] * there.z[common], here.inverse[common] * there.inverse[common]
+    pairs, bound = int(np.count_nonzero(inverse)), float(inverse.sum(dtype=np.float64)) / 4
+    high = bound + pairs * math.sqrt(here.fixed * there.fixed)
+    # equal deviates have squares of variance 2
+    total, step = float(product.sum(dtype=np.float64)), LARGEST_SAMPLE**2
+    return Score(total, pairs, 2 * pairs, step=step, low=-bound, high=high)
+
+
+# -------------------------------------------------------------------------------------------------- codes and outliers
+
+UNFORESEEN = 1e-8
+"""Probability of a rare value, beyond that which the row states."""
+
+
+def _code_score(sums: Sums, bit: int) -> Score:
+    """Score of the difference of the numbers of noisy values with and without a bit."""
+    sites = 0 if sums.plan.output.normalised else sums.sites
+    bound = min(sum(float(plane.count @ plane.expected.codes[bit]) for plane in sums.planes), sites)
+    return Score(2 * float(sums.bits[bit]) - sites, sites, sites, step=1.0, low=-bound, high=bound)
+
+
+def _outlier_score(sums: Sums) -> Score:
+    """Score of the number of sites beyond `FAR_Z`, in the directions in which the sensor does not limit them."""
+    total = expected = possible = 0.0
+    for plane in sums.planes:
+        shares, is_free = plane.expected.far * plane.count, np.isfinite(plane.expected.far)
+        total, expected = total + float(plane.outliers[is_free].sum()), expected + float(shares[is_free].sum())
+        possible += float((is_free @ plane.count).sum()) / 2
+    bound, variance = TAIL_ERROR * expected, expected + UNFORESEEN * possible
+    return Score(total - expected, possible * 1e-6, variance, step=1.0, low=-bound, high=bound)
+
+
+def _defect_score(sums: Sums) -> Score:
+    """Score of the number of known defects that are no outliers.
+
+    None of N is expected: with the probability p of one, the probability of k is below (N·p)ᵏ, which is e⁻¹⁰ᵏ for
+    N = 4540 and p = `UNFORESEEN`.
+    """
+    certain, missing = (sum(numbers) for numbers in zip(*(plane.defects() for plane in sums.planes), strict=True))
+    return Score(-missing, certain, UNFORESEEN * certain, step=0.3)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
-from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, Expectation, PlaneNoise, bin_width
-from unprocess_gen.simulation.effects.expectation import Site
+from unprocess_gen.reports.noise_check.expectation import FAR_Z, LARGEST_Z, Expectation, PlaneNoise, bin_width
+from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, Site
 
 Single = NDArray[np.float32]
 
@@ -19,6 +19,17 @@ TILE = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 SEGMENTS = 8
 """Parts into which lines are divided."""
+NEIGHBOURS = {
+    "adjacent sites": ((0, 1), (1, 0)),
+    "diagonal sites": ((1, 1), (1, -1)),
+    "neighbours": ((0, 2), (2, 0)),
+    "diagonal neighbours": ((2, 2), (2, -2)),
+}
+"""Distances of the sites of pairs in rows and columns, by the name of the check of their correlation."""
+SAMPLED = 3
+"""Distance of the rows and of the columns that are compared with those of the pair before."""
+LARGEST_SAMPLE = 3.0
+"""Bound of z in these rows and columns."""
 
 
 class Plane:
@@ -28,6 +39,8 @@ class Plane:
     ----------
     noise : PlaneNoise
         The recorded noise.
+    row_sites : int
+        Sites of a row.
     bins, count : ndarray, [N]
         Numbers of the bins that are checked, and of their sites.
     expected : Expectation
@@ -36,6 +49,7 @@ class Plane:
 
     def __init__(self, noise: PlaneNoise, clean: Any, noisy: Any) -> None:
         self.noise, self._clean, self._noisy = noise, clean, noisy
+        self.row_sites = int(clean.shape[1])
         self._bin_dn = bin_dn = bin_width(noise)
         self._offset_dn = np.broadcast_to(np.nan_to_num(noise.offset_dn), clean.shape)
         self._gaps = np.isnan(noise.offset_dn) if np.isnan(noise.offset_dn).any() else None
@@ -46,18 +60,36 @@ class Plane:
         self.count = counts[self.bins].astype(np.float64)
         self.expected = Expectation(noise, np.float64(bin_dn) * self.bins, bin_dn)
         self._weight = self._table(1 / self.expected.std)
-        self._mean = self._table(self.expected.rounding_mean / self.expected.std + self.expected.defect_mean)
-        self._sums = np.zeros((3, self._unused + 1))
-
-    @property
-    def row_sites(self) -> int:
-        """Sites of a row."""
-        return int(self._clean.shape[1])
+        self._mean = self._table(self.expected.rounding_mean / self.expected.std)
+        self._sums = np.zeros((5, self._unused + 1))
 
     @property
     def means(self) -> Float:
         """Means of z, of cos z, and of the clean value minus the middle of its bin (DN), [3, N]."""
-        return np.asarray(self._sums[:, self.bins] / self.count)
+        return np.asarray(self._sums[:3, self.bins] / self.count)
+
+    @property
+    def outliers(self) -> Float:
+        """Numbers of sites below -`FAR_Z` and above `FAR_Z`, [2, N]."""
+        return np.asarray(self._sums[3:, self.bins])
+
+    def defects(self) -> tuple[int, int]:
+        """Numbers of defects that must be outliers, and of those that are none."""
+        certain = missing = 0
+        low, high = self.noise.limits
+        for defects in self.noise.defects:
+            place = defects.y, defects.x
+            clean_dn = self._clean[place].astype(np.float64)
+            signal = self.noise.signal(clean_dn)
+            variance, mean = self.noise.variance(signal), defects.level_dn - signal * defects.replaces
+            # Poisson counts, whose variance is at most their mean, must not hide it
+            spread = NORMAL_DISTANCE * np.sqrt(variance + self.noise.site.gain_dn * np.abs(mean))
+            far = FAR_Z * np.sqrt(variance)
+            is_certain = (np.abs(mean) > far + spread) & (clean_dn - far > low) & (clean_dn + far < high)
+            is_outlier = (self._noisy[place] - clean_dn) * np.sign(mean) > far
+            certain += int(is_certain.sum())
+            missing += int((is_certain & ~is_outlier).sum())
+        return certain, missing
 
     def row_sums(self, values: Float) -> Float:
         """Sum values of the checked bins, [K, N], over the sites of each row, [K, H/2]."""
@@ -69,12 +101,15 @@ class Plane:
         bins, clean = self._bins_of_sites(rows), self._clean[rows]
         weight = self._weight.take(bins)
         noise = np.subtract(self._noisy[rows], clean, dtype=np.float32) - self._offset_dn[rows]
-        z = np.clip(noise * weight, -LARGEST_Z, LARGEST_Z)
+        noise *= weight
+        z = np.clip(noise, -LARGEST_Z, LARGEST_Z)
         values = [z, np.cos(z)]
         if self.noise.site.plan.output.clean_normalised:
             values.append(clean - bins * self._bin_dn)
         for total, value in zip(self._sums, values, strict=False):
             total += np.bincount(bins.ravel(), value.ravel(), len(total))
+        for total, is_far in zip(self._sums[3:], (noise < -FAR_Z, noise > FAR_Z), strict=True):
+            total += np.bincount(bins[is_far], minlength=len(total))
         return z - self._mean.take(bins), weight
 
     def _table(self, values: Float) -> Single:
@@ -91,6 +126,14 @@ class Plane:
         if self._gaps is not None:
             bins[self._gaps[rows]] = self._unused
         return np.asarray(bins)
+
+
+class Sample(NamedTuple):
+    """Limited z without the means of rows, 1 / std, both in every third row and column; largest share of patterns."""
+
+    z: Single
+    inverse: Single
+    fixed: float
 
 
 class Sums:
@@ -111,16 +154,19 @@ class Sums:
         The four planes.
     sites : int
         Sites that are checked.
-    variance, fixed : float
-        Largest variance of z, and mean fraction of it that frames of one body share.
+    fixed : float
+        Mean fraction of the variance of z that frames of one body share.
     rows : ndarray of float64, [3, 2, H/2, segments]
         For each part of even and odd rows: sums of z / std and of 1 / std², and the variance of the former without the
         offset of the row.
     columns : ndarray of float64, [3, 2, W/2, segments]
         The same for columns, from z without the weighted mean of each row of a plane.
-    neighbours : ndarray of float64, [3]
-        For horizontal and vertical neighbours of a plane: sum of the products of z, without the weighted mean of each
-        row, number of products, and sum of the products of 1 / std.
+    products : dict of str to float
+        Sums of the products of z, without the weighted mean of each row of a plane, for `NEIGHBOURS`.
+    bits : ndarray of float64, [2]
+        Sites whose noisy value has the last bit, and the last but one; 0 in frames that are not rounded.
+    sample : Sample
+        Values that are compared with those of the next pair.
     """
 
     def __init__(self, plan: Plan, patch: Patch, clean: Any, noisy: Any, dark_pixels: DarkPixels | None) -> None:
@@ -136,21 +182,37 @@ class Sums:
         ]
         self.sites = int(sum(plane.count.sum() for plane in self.planes))
         self.fixed = sum(float(plane.count @ plane.expected.fixed) for plane in self.planes) / max(self.sites, 1)
-        self.variance = max(float(plane.expected.variance.max(initial=1.0)) for plane in self.planes)
+        self._noisy = None if plan.output.normalised else noisy
 
     def fill(self) -> None:
         """Add all sites."""
         row_starts, column_starts = (_segment_starts(length // 2) for length in (self.height, self.width))
         self.rows = np.zeros((3, 2, self.height // 2, len(column_starts)))
         self.columns = np.zeros((3, 2, self.width // 2, len(row_starts)))
-        self.neighbours = np.zeros(3)
+        self.products, self.bits, sample = dict.fromkeys(NEIGHBOURS, 0.0), np.zeros(2), []
         for part, (top, bottom) in enumerate(itertools.pairwise([*row_starts, self.height // 2])):
+            # columns of zeros keep products of sites in other rows out
+            sites = np.zeros((2, 2 * (bottom - top), self.width + 2), np.float32)
             for plane, (y, x) in zip(self.planes, TILE, strict=True):
                 z, weight = plane.add_strip(np.s_[top:bottom])
-                row_sums, column_sums, products = _line_sums(z, weight, plane.noise.row_variance, column_starts)
+                row_sums, column_sums, residual, removed = _line_sums(
+                    z, weight, plane.noise.row_variance, column_starts
+                )
                 self.rows[:, y, top:bottom] += row_sums
                 self.columns[:, x, :, part] += column_sums
-                self.neighbours += products
+                self.products["neighbours"] += removed
+                sites[:, y::2, x : self.width : 2] = residual, weight
+            residuals = sites[0].ravel()
+            for name, distances in NEIGHBOURS.items():
+                shifts = (y * (self.width + 2) + x for y, x in distances)
+                self.products[name] += sum(float(residuals[n:] @ residuals[:-n]) for n in shifts)
+            sample.append(sites[:, -2 * top % SAMPLED :: SAMPLED, : self.width : SAMPLED])
+            if self._noisy is not None:
+                codes, is_used = self._noisy[2 * top : 2 * bottom, : self.width], sites[1, :, : self.width] > 0
+                self.bits += [np.count_nonzero((codes & bit != 0) & is_used) for bit in (1, 2)]
+        fixed = max(float(plane.expected.fixed.max(initial=0.0)) for plane in self.planes)
+        z_sample, inverse = np.concatenate(sample, axis=1)
+        self.sample = Sample(np.clip(z_sample, -LARGEST_SAMPLE, LARGEST_SAMPLE), inverse, fixed)
 
 
 def _segment_starts(length: int) -> list[int]:
@@ -159,8 +221,11 @@ def _segment_starts(length: int) -> list[int]:
     return [number * length // count for number in range(count)]
 
 
-def _line_sums(z: Single, weight: Single, row_variance: float, starts: list[int]) -> tuple[Float, Float, Float]:
-    """Sums of a strip for `Sums.rows`, [3, H, segments], for `Sums.columns`, [3, W], and for `Sums.neighbours`, [3]."""
+def _line_sums(z: Single, weight: Single, row_variance: float, starts: list[int]) -> tuple[Float, Float, Single, float]:
+    """Sums of a strip for `Sums.rows`, [3, H, segments], for `Sums.columns`, [3, W]; z without the means of rows.
+
+    The last value is the sum of the products of horizontal neighbours that removing the means of rows takes away.
+    """
     square = weight * weight
     own = square - np.float32(row_variance) * square * square
     rows = np.stack([np.add.reduceat(values, starts, axis=1) for values in (z * weight, square, own)])
@@ -168,9 +233,5 @@ def _line_sums(z: Single, weight: Single, row_variance: float, starts: list[int]
     information = np.maximum(information, np.finfo(np.float32).tiny)
     residual = z - (score / information).astype(np.float32)[:, None] * weight
     columns = np.stack([values.sum(axis=0) for values in (residual * weight, square, own)])
-    across, down = (side[:, 1:] * side[:, :-1] for side in (weight, weight.T))
-    products = [(side[:, 1:] * side[:, :-1]).sum(dtype=np.float64) for side in (residual, residual.T)]
-    # removing the mean of a row makes its sites correlated
-    removed = spread / information @ (across.sum(axis=1) / information)
-    pairs = np.count_nonzero(across) + np.count_nonzero(down)
-    return rows, columns, np.array([sum(products) + removed, pairs, across.sum() + down.sum()])
+    across = (weight[:, 1:] * weight[:, :-1]).sum(axis=1)
+    return rows, columns, residual, float(spread / information @ (across / information))

@@ -46,6 +46,6 @@ class Column(Effect):
 
     def expected(self, site: Site) -> EffectNoise:
         """Offset of each column of the body, which the row determines."""
-        part = Part(site.plan, site.physics, (1, site.patch.width // 2 * 2), (0, site.patch.x))
+        part = Part(site.plan, site.physics, (1, site.shape[1]), (0, site.patch.x))
         offset_dn = self.column_offset_dn(part)[0, site.place[1] :: 2]
         return known_offset(site, offset_dn)

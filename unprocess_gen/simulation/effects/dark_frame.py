@@ -114,7 +114,6 @@ class DarkFrame(Effect):
     def expected(self, site: Site) -> EffectNoise:
         """Known pixels with a uniform dither; sites far from black, such as hot pixels, cannot be checked."""
         plan, (y, x) = site.plan, site.place
-        shape = site.patch.height // 2 * 2, site.patch.width // 2 * 2
-        offset_dn = dark_frame_offsets(plan, site.dark_pixels, shape, site.patch.origin)[y::2, x::2].copy()
+        offset_dn = dark_frame_offsets(plan, site.dark_pixels, site.shape, site.patch.origin)[y::2, x::2].copy()
         offset_dn[np.abs(offset_dn) > NORMAL_DISTANCE * math.sqrt(max(plan.noise.b_dn2, 0.0))] = np.nan
         return uniform(plan.noise.dark.scale)._replace(offset_dn=offset_dn)

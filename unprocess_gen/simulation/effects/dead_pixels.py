@@ -6,7 +6,7 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
+from unprocess_gen.simulation.effects.expectation import Defects, EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
@@ -49,13 +49,11 @@ class DeadPixels(Effect):
         return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share)}
 
     def expected(self, site: Site) -> EffectNoise:
-        """Few sites that read 0."""
+        """Sites of the body that read 0."""
         plan = site.plan
-        share = 0.0 if plan.noise.averaged else site.physics.dead_pixel_share
+        if plan.noise.averaged:
+            return EffectNoise()
+        y, x = site.defects("dead_pixels", site.physics.dead_pixel_share)
         black_dn = plan.sensor.black_level_dn
         value_dn = max(noisy_limits(plan.sensor.bits, black_dn, plan.noise.sensor_clip)[0], 0.0) - black_dn
-        return EffectNoise(
-            defects=share,
-            defect_mean=lambda signal, bound: share * np.clip(value_dn - signal, -bound, bound),
-            replacement=lambda signal, tau: np.exp(1j * tau * (value_dn - signal)),
-        )
+        return EffectNoise(defects=Defects(y, x, np.full(len(y), value_dn), replaces=True))

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.exact_distributions import LOGISTIC, tukey_std
+from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
+from unprocess_gen.simulation.reference.noise import is_among
 
 if TYPE_CHECKING:
     from unprocess_gen.simulation.effects import Physics
@@ -25,6 +27,8 @@ Complex = NDArray[np.inexact[Any]]
 
 NORMAL_DISTANCE = 6.0
 """Distance that sites keep from the limits of the sensor, in standard deviations of the noise."""
+ROWS_AT_ONCE = 256
+"""Rows whose random words are in memory at once."""
 RARE = 1e-5
 """Probability of a read-noise value beyond this distance."""
 
@@ -43,6 +47,17 @@ class Site(NamedTuple):
         return self.plan.physics
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Even height and width of the patch."""
+        return self.patch.height // 2 * 2, self.patch.width // 2 * 2
+
+    def defects(self, stream: str, share: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns in the plane of a ``share`` of the body's pixels."""
+        y, x = _rare_pixels(self.physics.body_key, stream, share, self.shape, self.patch.origin)
+        own = (y % 2 == self.place[0]) & (x % 2 == self.place[1])
+        return y[own] // 2, x[own] // 2
+
+    @property
     def gain_dn(self) -> float:
         """DN of one electron; 0 if electrons are not counted."""
         plan, (y, x) = self.plan, self.place
@@ -50,6 +65,38 @@ class Site(NamedTuple):
             return plan.noise.a_dn if plan.noise.counts_electrons else 0.0
         relative = plan.noise.physics.gain_by_colour if "gain_by_colour" in plan.noise.effects else (1.0, 1.0, 1.0)
         return plan.noise.physics.dn_per_e * relative["RGB".index(plan.sensor.pattern[2 * y + x])]
+
+
+@functools.lru_cache(maxsize=8)
+def _rare_pixels(
+    body_key: int, stream: str, share: float, shape: tuple[int, int], origin: tuple[int, int]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the pixels that `is_among` selects; frames of a body have the same ones."""
+    sites = []
+    for top in range(0, shape[0], ROWS_AT_ONCE):
+        strip, corner = (min(ROWS_AT_ONCE, shape[0] - top), shape[1]), (origin[0] + top, origin[1])
+        sites.append(np.argwhere(is_among(words(body_key, stream, strip, origin=corner), share)) + np.array((top, 0)))
+    y, x = np.concatenate(sites).T
+    return y, x
+
+
+class Defects(NamedTuple):
+    """Sites of a plane with a known defect.
+
+    Attributes
+    ----------
+    y, x : ndarray of int, [N]
+        Rows and columns in the plane.
+    level_dn : ndarray of float64, [N]
+        Mean that is added to the signal, or that replaces it, DN above black.
+    replaces : bool
+        Whether it replaces the signal.
+    """
+
+    y: NDArray[np.intp]
+    x: NDArray[np.intp]
+    level_dn: Float
+    replaces: bool
 
 
 class EffectNoise(NamedTuple):
@@ -65,6 +112,8 @@ class EffectNoise(NamedTuple):
         Whether the frames of one body share the values.
     tail_dn : float
         Distance beyond `NORMAL_DISTANCE` standard deviations that a fraction `RARE` of the values exceeds.
+    tail : callable
+        Fraction of values above a distance (DN).
     row_variance, row_correlation : float
         Variance of the common offset of a row (DN²), and its correlation with that of the next row.
     offset_dn : float or ndarray, broadcast to [H/2, W/2]
@@ -73,26 +122,21 @@ class EffectNoise(NamedTuple):
         Offset of the clean frame that is no light.
     largest_dn : float
         Signal at which the pixel is full.
-    defects : float
-        Fraction of sites with another value.
-    defect_mean : callable
-        Mean that these add to all sites, for signals and for the bound of the noise (DN).
-    replacement : callable or None
-        Characteristic function at defects whose value replaces all noise, for signals and frequencies.
+    defects : Defects or None
+        Sites with another value.
     """
 
     variance: Callable[[Float], Float] = np.zeros_like
     factor: Callable[[Float, Float], Complex] = lambda signal, tau: np.ones_like(signal)
     is_fixed: bool = False
     tail_dn: float = 0.0
+    tail: Callable[[Float], Float] = np.zeros_like
     row_variance: float = 0.0
     row_correlation: float = 0.0
     offset_dn: float | Float | NDArray[np.float32] = 0.0
     clean_offset_dn: float = 0.0
     largest_dn: float = math.inf
-    defects: float = 0.0
-    defect_mean: Callable[[Float, Float], Float] = lambda signal, bound: np.zeros_like(signal)
-    replacement: Callable[[Float, Float], Complex] | None = None
+    defects: Defects | None = None
 
 
 def gaussian(variance: Callable[[Float], Float]) -> EffectNoise:
@@ -138,25 +182,28 @@ def known_offset(site: Site, offset_dn: float | Float) -> EffectNoise:
 
 def tukey_noise(std_dn: float, law: str, shape: float) -> EffectNoise:
     """Read noise of Tukey's lambda distribution."""
-    values, largest = tukey_distribution(law, shape)
+    values, quantiles, logarithms = tukey_distribution(law, shape)
+
+    largest = -float(np.interp(math.log(RARE), logarithms, quantiles))
     return EffectNoise(
         constant(std_dn * std_dn),
         lambda signal, tau: np.interp(np.abs(std_dn * tau), _FREQUENCIES, values),
         tail_dn=std_dn * max(largest - NORMAL_DISTANCE, 0.0),
+        tail=lambda distance_dn: np.exp(np.interp(-distance_dn / std_dn, quantiles, logarithms, left=-math.inf)),
     )
 
 
 LEAST_TAIL = 2.0**-33
 """Least tail probability of a random word."""
-_FREQUENCIES = np.linspace(0.0, 2.0, 201)
-"""Radians per standard deviation; those of cos 2z, the highest that is computed, are at most 2."""
+_FREQUENCIES = np.linspace(0.0, 8.0, 801)
+"""Radians per standard deviation; those of cos 2z are at most 2, those of codes are larger."""
 
 
 @functools.lru_cache(maxsize=256)
-def tukey_distribution(law: str, shape: float) -> tuple[Float, float]:
-    """Characteristic function of Tukey's lambda distribution at `_FREQUENCIES`, and the quantile that `RARE` exceeds.
+def tukey_distribution(law: str, shape: float) -> tuple[Float, Float, Float]:
+    """Characteristic function of Tukey's lambda distribution at `_FREQUENCIES`, quantiles, and log probabilities.
 
-    Both are for standard deviation 1, as read noise is drawn. The draws of ``"tukey_lambda"`` have this standard
+    They are for standard deviation 1, as read noise is drawn. The draws of ``"tukey_lambda"`` have this standard
     deviation; for ``"tukey"`` (version 0.1) the distribution has, and its draws have less. The trapezoidal rule in the
     logit of the probability p converges quickly: its error is below 3e-6 for shapes from -0.4.
     """
@@ -167,4 +214,4 @@ def tukey_distribution(law: str, shape: float) -> tuple[Float, float]:
     tail = np.maximum(p, LEAST_TAIL)
     quantiles = np.log(tail / (1 - tail)) if abs(shape) < LOGISTIC else (tail**shape - (1 - tail) ** shape) / shape
     std = float(tukey_std(shape)) if law == "tukey" else math.sqrt(float(quantiles**2 @ weights))
-    return np.cos(np.outer(_FREQUENCIES, quantiles / std)) @ weights, -float(np.interp(RARE, p, quantiles)) / std
+    return np.cos(np.outer(_FREQUENCIES, quantiles / std)) @ weights, quantiles / std, np.log(p)

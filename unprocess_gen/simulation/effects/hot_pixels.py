@@ -11,7 +11,7 @@ import numpy as np
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
+from unprocess_gen.simulation.effects.expectation import Defects, EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import Numbers, number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
@@ -69,17 +69,16 @@ class HotPixels(Effect):
         return {"bright": BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)}
 
     def expected(self, site: Site) -> EffectNoise:
-        """Few sites with additional electrons, whose means are exponentially distributed."""
-        physics, gain = site.physics, site.gain_dn
-        share, mean_e = physics.hot_pixel_share, physics.hot_pixel_e
-        if site.plan.noise.averaged or not mean_e:
+        """Sites of the body with a known mean excess; frames with few of them need few rows of random words."""
+        if site.plan.noise.averaged:
             return EffectNoise()
-        mean_dn = mean_e * gain
-        return EffectNoise(
-            factor=lambda signal, tau: 1 - share + share / (1 - mean_e * np.expm1(1j * gain * tau)),
-            defects=share,
-            defect_mean=lambda signal, bound: share * mean_dn * -np.expm1(-bound / mean_dn),
-        )
+        width, (top, left) = site.shape[1], site.patch.origin
+        y, x = site.defects("hot_pixels", site.physics.hot_pixel_share)
+        mean_e = np.zeros(len(y))
+        for row in np.unique(y).tolist():
+            part = Part(site.plan, site.physics, (1, width), (top + 2 * row + site.place[0], left))
+            mean_e[y == row] = self.mean_electrons(part)[0, site.place[1] :: 2][x[y == row]]
+        return EffectNoise(defects=Defects(y, x, site.gain_dn * mean_e, replaces=False))
 
 
 @functools.lru_cache(maxsize=256)
