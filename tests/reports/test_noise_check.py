@@ -238,6 +238,7 @@ def test_scores_of_untouched_pairs_have_unit_variance(settings: Settings) -> Non
 
 # Faults ---------------------------------------------------------------------------------------------------------------
 
+LONG = "long exposure, nikon_d850"
 HOT = ("effects.hot_pixels=on", "scene.exposure_s=30", "scene.temperature_c=35", "sensor=generic_14bit")
 NO_HOT_PIXELS = {"hot pixels missing": with_numbers(hot_pixel_share=0.0)}
 COMBINATIONS = {
@@ -246,7 +247,7 @@ COMBINATIONS = {
     "night, nikon_d850, 14 bits": NIGHT_14_BITS,
     "video at night, canon_700d": ("noise=canon_700d", "scene=video_night", "effects.row=on"),
     "default": (),
-    "long exposure, nikon_d850": ("noise=nikon_d850", "scene=long_exposure", *HOT),
+    LONG: ("noise=nikon_d850", "scene=long_exposure", *HOT),
 }
 EXPECTED = {
     "black level off by 20 DN": "mean",
@@ -278,7 +279,7 @@ def test_planted_faults_are_found_in_95_percent_of_runs(name: str, settings: Set
     runs, count, side = 20, 12, 512
     in_runs: Counter[str] = Counter()
     in_pairs: Counter[str] = Counter()
-    faults = {"default": SITE_FAULTS, "long exposure, nikon_d850": SITE_FAULTS | NO_HOT_PIXELS}.get(name, FAULTS)
+    faults = {"default": SITE_FAULTS, LONG: SITE_FAULTS | NO_HOT_PIXELS}.get(name, FAULTS)
     for run in range(runs):
         numbers = range(run * count, (run + 1) * count)
         pairs = [checked(settings, COMBINATIONS[name], number, side, faults.values()) for number in numbers]
@@ -295,11 +296,14 @@ def test_planted_faults_are_found_in_95_percent_of_runs(name: str, settings: Set
     assert fewest >= 0.95 * runs
 
 
-@pytest.mark.slow
-def test_missing_hot_pixels_are_found(settings: Settings) -> None:
-    hot = COMBINATIONS["long exposure, nikon_d850"]
-    pairs = [pair for n in range(6) for pair in checked(settings, hot, n, 512, NO_HOT_PIXELS.values())]
-    assert {alarm.check for alarm in alarms(pairs)} == {"defects"}
+@pytest.mark.parametrize("missing", ["hot_pixel_share", "dead_pixel_share"])
+def test_missing_defects_are_found(missing: str, settings: Settings) -> None:
+    """Some pixels are hot and dead; the last effect decides."""
+    shares = "effects.dead_pixels=on", "noise.hot_pixel_share=0.01", "noise.dead_pixel_share=0.01"
+    faults: list[Fault] = [lambda srgb, noisy, plan, draws: noisy, with_numbers(**{missing: 0.0})]
+    untouched, faulty = checked(settings, (*COMBINATIONS[LONG], *shares), 0, faults=faults)
+    assert [str(alarm) for alarm in alarms([untouched])] == []
+    assert "defects" in {alarm.check for alarm in alarms([faulty])}
 
 
 def repetitions(pairs: Iterable[Sample], **numbers: int) -> list[Alarm]:

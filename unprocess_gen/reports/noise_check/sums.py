@@ -76,8 +76,8 @@ class Plane:
     def defects(self) -> tuple[int, int]:
         """Numbers of defects that must be outliers, and of those that are none."""
         certain = missing = 0
-        low, high = self.noise.limits
-        for defects in self.noise.defects:
+        (low, high), is_counted = self.noise.limits, np.zeros(self._clean.shape, bool)
+        for defects in reversed(self.noise.defects):  # the last effect decides, if a pixel has two defects
             place = defects.y, defects.x
             clean_dn = self._clean[place].astype(np.float64)
             signal = self.noise.signal(clean_dn)
@@ -87,6 +87,8 @@ class Plane:
             far = FAR_Z * np.sqrt(variance)
             is_certain = (np.abs(mean) > far + spread) & (clean_dn - far > low) & (clean_dn + far < high)
             is_outlier = (self._noisy[place] - clean_dn) * np.sign(mean) > far
+            is_certain &= ~is_counted[place]
+            is_counted[place] = True
             certain += int(is_certain.sum())
             missing += int((is_certain & ~is_outlier).sum())
         return certain, missing
