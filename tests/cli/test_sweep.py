@@ -61,8 +61,9 @@ def test_sweep_csv_has_the_columns_of_the_contract(run_main: RunMain, source: Pa
     run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
     content = (tmp_path / "sweep/sweep.csv").read_bytes()
     assert content.split(b"\n")[0].decode().split(",") == [
-        "folder", "overrides", "seed", "rows", "failed", "clean_clipped_low_share", "clean_clipped_high_share",
-        "noisy_clipped_low_share", "noisy_clipped_high_share", "saturated_share", "seconds", "bytes", "exit",
+        "folder", "overrides", "seed", "rows", "failed", "filtered", "clean_clipped_low_share",
+        "clean_clipped_high_share", "noisy_clipped_low_share", "noisy_clipped_high_share",
+        "saturated_share", "seconds", "bytes", "exit",
     ]  # fmt: skip
     assert b"\r" not in content
 

@@ -169,7 +169,7 @@ def _ok_rows(rows: Iterable[Row], failed: list[Row]) -> Iterator[Row]:
     for row in rows:
         if row["status"] == "ok":
             yield row
-        else:
+        elif row["status"] == "failed":
             failed.append(row)
 
 

@@ -33,7 +33,7 @@ SHARES = ("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy
 """Counts of CFA sites whose fractions are columns of ``sweep.csv``, with ``_share`` appended."""
 
 FIRST_COLUMNS = ("folder", "overrides")
-LAST_COLUMNS = ("rows", "failed", *(f"{name}_share" for name in SHARES), "seconds", "bytes", "exit")
+LAST_COLUMNS = ("rows", "failed", "filtered", *(f"{name}_share" for name in SHARES), "seconds", "bytes", "exit")
 """Columns of ``sweep.csv`` before and after those of the swept keys."""
 
 
@@ -70,6 +70,7 @@ class JobRow:
         cells |= {
             "rows": str(summary.rows),
             "failed": str(sum(summary.failed.values())),
+            "filtered": str(summary.filtered),
             "seconds": f"{summary.seconds:.3f}",
             "bytes": str(summary.bytes),
         }

@@ -65,6 +65,9 @@ class SourceConfig(Group):
         use only the first sources, in the order of their names
     max_pixels
         images with more pixels fail with reason too_large
+    min_side
+        shortest side of images, after downscaling; smaller images are left out: their rows have the status
+        filtered, and max_failed does not count them
     max_failed
         number of failed sources up to which a run exits with code 0; with more it exits with code 3
     icc
@@ -93,6 +96,7 @@ class SourceConfig(Group):
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
+    min_side: Optional[int] = key(None, Integers(1, 2**20), unit="pixels", null="images of any size", since="0.3")
     max_failed: int = key(0, Integers(0, 10**9), decides_data=False)
     icc: str = key("ignore", Choice("ignore", "refuse"))
     clips: bool = key(False, limits.BOOLEAN)

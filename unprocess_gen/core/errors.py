@@ -25,7 +25,8 @@ REASONS = {
     "truncated": "the end of the file is missing",
     "corrupt": "the content of the file contradicts itself or cannot be decoded",
     "too_large": "the image has more pixels than `source.max_pixels`, or is larger than the decoder reads",
-    "too_small": "no patch, square of `source.downscale` or 2 x 2 tile fits (`unsupported` up to version 0.2)",
+    "too_small": "no patch, square of `source.downscale` or 2 x 2 tile fits (`unsupported` up to version 0.2); with "
+    "status `filtered`, a side is shorter than `source.min_side`",
     "cmyk": "the pixels are printing inks",
     "alpha": "pixels are transparent, or could be",
     "animated": "the file contains several pictures",
@@ -80,7 +81,14 @@ class SourceError(UnprocessGenError):
         Explanation for the user.
     sha256 : str, optional
         SHA-256 of the file, if it could be read.
+
+    Attributes
+    ----------
+    status : str
+        Value of the manifest column ``status``.
     """
+
+    status = "failed"
 
     def __init__(self, reason: str, text: str, sha256: str | None = None) -> None:
         if reason not in REASONS:
@@ -92,3 +100,9 @@ class SourceError(UnprocessGenError):
 
     def __str__(self) -> str:
         return f"{self.reason}: {self.text}"
+
+
+class FilteredError(SourceError):
+    """Source that the settings leave out (``source.min_side``), which is no failure."""
+
+    status = "filtered"

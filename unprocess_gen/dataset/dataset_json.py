@@ -68,6 +68,7 @@ class DatasetFacts(msgspec.Struct, frozen=True):
     shards: list[ShardFacts]
     config: str
     self_test: str
+    filtered: Count = 0
     not_matched: Count | None = None
     skipped_links: Count | None = None
     run: RunFacts | None = None

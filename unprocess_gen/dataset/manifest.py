@@ -103,8 +103,10 @@ def pair_row(
     return _row(source, sha256, shard, plan.seed, values)
 
 
-def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason: str, detail: str = "") -> Row:
-    """Return the row of a source that could not be used.
+def failed_row(
+    source: Source, sha256: str | None, shard: int, seed: int, reason: str, detail: str = "", status: str = "failed"
+) -> Row:
+    """Return the row of a source that could not be used or was left out.
 
     Parameters
     ----------
@@ -120,6 +122,8 @@ def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason
         One of `errors.REASONS`.
     detail : str
         Explanation (`SourceError.text`); kept as one line of at most `MAX_DETAIL` characters.
+    status : str
+        ``"failed"`` or ``"filtered"``.
 
     Returns
     -------
@@ -127,7 +131,7 @@ def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason
         Value by column. Only frames of a video have values for ``frame`` and ``clip``, which identify them.
     """
     place: dict[str, Value] = {"frame": source.frame, "clip": source.clip} if source.is_video else {}
-    failure = {"status": "failed", "reason": reason, "detail": detail_text(detail)}
+    failure = {"status": status, "reason": reason, "detail": detail_text(detail)}
     return _row(source, sha256, shard, seed, {**failure, **place})
 
 
@@ -336,7 +340,7 @@ def check_row(row: Row) -> None:
 
 
 def _check_together(row: Row) -> None:
-    if row["status"] not in ("ok", "failed"):
+    if not row["status"]:
         raise ValueError("status is empty")
     if row["status"] != "ok":
         return

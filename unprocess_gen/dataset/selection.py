@@ -147,7 +147,7 @@ def select_rows(
         found |= named | ranges
         if named or (ranges and row["status"] == "ok"):
             yield row
-        elif ranges and skipped is not None:
+        elif ranges and skipped is not None and row["status"] == "failed":
             skipped.append(row)
     for name, written in {**selection.names, **dict.fromkeys(selection.ranges)}.items():
         if name not in found:
@@ -181,7 +181,7 @@ def select_pairs(manifest: AnyPath, keys: str) -> SelectedPairs:
     rows = {str(row["key"]): row for row in select_rows(manifest, None, keys, skipped)}
     for row in rows.values():
         if row["status"] != "ok":
-            raise ConfigError(f"--keys {row['key']}: failed ({row['reason']}), so it has no frames")
+            raise ConfigError(f"--keys {row['key']}: {row['status']} ({row['reason']}), so it has no frames")
     pairs = (str(row["key"]) for row in read_rows(manifest) if row["status"] == "ok")
     return SelectedPairs({number: rows[key] for number, key in enumerate(pairs) if key in rows}, len(skipped))
 

@@ -61,6 +61,8 @@ class Summary:
         Failed rows by reason.
     sites : dict of str to int
         Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`tasks.COUNTS`).
+    filtered : int
+        Rows of images that ``source.min_side`` leaves out.
     shards, bytes : int
         Number of shards and the sum of their sizes.
     seconds : float
@@ -83,6 +85,7 @@ class Summary:
     made: int = 0
     unmatched: dict[str, int] = field(default_factory=dict)
     times: StageTimes = field(default_factory=StageTimes)
+    filtered: int = 0
 
     @classmethod
     def of(cls, out: str, facts: dict[str, Any], started: float, **made: Any) -> Summary:
@@ -95,13 +98,14 @@ class Summary:
             shards=len(facts["shards"]),
             bytes=sum(entry["bytes"] for entry in facts["shards"]),
             seconds=time.monotonic() - started,
+            filtered=facts.get("filtered", 0),
             **made,
         )
 
     @property
     def rows(self) -> int:
-        """Pairs and failures together."""
-        return self.pairs + sum(self.failed.values())
+        """Pairs, failures and filtered images together."""
+        return self.pairs + sum(self.failed.values()) + self.filtered
 
     def sentence(self, max_failed: int) -> str:
         """Describe the outcome in one line, for the command line."""
@@ -111,6 +115,8 @@ class Summary:
         failures = f"{failed} failed" + (f" ({reasons}; see {self.out}/manifest.csv)" if failed else "")
         if failed > max_failed:
             failures += f", more than source.max_failed={max_failed}"
+        if self.filtered:
+            failures += f", {self.filtered} filtered (source.min_side)"
         if not self.made:
             return f"{self.out} is complete: {size}, {failures}; nothing to do"
         part = f" ({self.made} in this run)" if self.made < self.rows else ""

@@ -219,7 +219,7 @@ class _Repair:
         """Yield the rows of pairs in intact shards and of failures in readable lines of the manifest, in order."""
         failures: dict[Any, list[Row]] = defaultdict(list)
         for row in readable_rows(self._manifest_file):
-            if row["status"] == "failed":
+            if row["status"] != "ok":
                 failures[row["shard"]].append(row)
         for number, entry in enumerate(self._facts["shards"]):
             yield from sorted([*self._rows_inside(entry), *failures[number]], key=lambda row: int(image_key(row)))
@@ -258,7 +258,8 @@ class _Repair:
                 for source in task.sources:
                     rows = inside.get(key_text(source.index))
                     for row in rows or make_image(context, task.shard, source, writer, ShardLog()):
-                        yield {**row, "reason": "unsupported"} if row["reason"] in renamed else row
+                        was_renamed = row["status"] == "failed" and row["reason"] in renamed
+                        yield {**row, "reason": "unsupported"} if was_renamed else row
             unused.unlink()
 
     # ------------------------------------------------------------------------------------------------------ shards

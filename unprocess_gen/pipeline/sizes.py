@@ -69,12 +69,12 @@ def source_bytes(config: Config, name: str, height: int, width: int) -> int:
     -------
     int
         Bytes of all samples, tar headers and padding included; exact, because no other value decides sizes. 0 if no
-        patch or tile fits.
+        patch or tile fits, or the source is left out.
     """
     output, pairs = config.output, len(noise_levels(config.noise)) * config.noise.draws
     rule = patch_rule(config.source)
     smallest = rule.side if rule is not None else 2 if output.layout == PACKED else 1
-    if min(height, width) < smallest:
+    if min(height, width) < max(smallest, config.source.min_side or 1):
         return 0
     patches = list_patches(rule, 0, height, width, output.layout)
     json_bytes = json_size(name, pairs)

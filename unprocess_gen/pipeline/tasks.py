@@ -186,13 +186,12 @@ class ShardResult:
 
     def entry(self) -> dict[str, Any]:
         """Return the shard's entry in ``dataset.json``."""
-        pairs = sum(row["status"] == "ok" for row in self.rows)
         return {
             **({"provisional": True} if self.killer else {}),
             **({"self_test": self.log.self_test} if self.log.self_test else {}),
             "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
-            "pairs": pairs,
-            "failed": len(self.rows) - pairs,
+            "pairs": sum(row["status"] == "ok" for row in self.rows),
+            "failed": sum(row["status"] == "failed" for row in self.rows),
             "bytes": self.bytes,
             "sha256": self.sha256,
             **self._only_in_manifest(),
@@ -266,11 +265,14 @@ class Tally:
         Failed rows by reason.
     sites : dict of str to int
         Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
+    filtered : int
+        Rows with status ``filtered``; ``dataset.json`` omits 0.
     """
 
     pairs: int = 0
     failed: dict[str, int] = field(default_factory=dict)
     sites: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", *COUNTS), 0))
+    filtered: int = 0
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> Tally:
@@ -282,7 +284,10 @@ class Tally:
 
     def add_row(self, row: Row) -> None:
         """Count one row."""
-        if row["status"] != "ok":
+        if row["status"] == "filtered":
+            self.filtered += 1
+            return
+        if row["status"] == "failed":
             self.failed[str(row["reason"])] = self.failed.get(str(row["reason"]), 0) + 1
             return
         self.pairs += 1
@@ -293,10 +298,13 @@ class Tally:
     def add(self, other: Tally) -> None:
         """Add the counts of other rows."""
         self.pairs += other.pairs
+        self.filtered += other.filtered
         for mine, others in ((self.failed, other.failed), (self.sites, other.sites)):
             for name, count in others.items():
                 mine[name] = mine.get(name, 0) + count
 
     def facts(self) -> dict[str, Any]:
         """Counts as ``dataset.json`` holds them."""
-        return {"pairs": self.pairs, "failed": dict(sorted(self.failed.items())), "sites": dict(self.sites)}
+        filtered = {"filtered": self.filtered} if self.filtered else {}
+        failed = dict(sorted(self.failed.items()))
+        return {"pairs": self.pairs, "failed": failed, **filtered, "sites": dict(self.sites)}

@@ -128,7 +128,7 @@ def make_image(
             sha256, photograph = load_source(config.source, source, config.output.layout, read)
     except SourceError as error:
         _check_not_deleted(config, source, error)
-        return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text)]
+        return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
     with log.times.adding("simulate_s"):
         image = plan_pixels(context.settings, photograph.srgb, source, sha256)
         noise_dn = None if config.source.root is None else source_noise_dn(photograph.srgb, image.plans[0])

@@ -67,7 +67,7 @@ TRIAL_BYTES = 2**24
 
 @dataclass(frozen=True, slots=True)
 class SourceEstimate:
-    """The pairs of a source, or why it fails.
+    """The pairs of a source, or why it has none: ``status`` is ``ok``, ``failed`` or ``filtered``.
 
     ``bytes`` are those of its pairs in a shard, ``seconds`` the time it took to make them. ``levels`` and
     ``predictions`` have an item for each noise level. ``unused_pixels`` are in no patch. ``clean_levels`` counts the
@@ -79,6 +79,7 @@ class SourceEstimate:
     seconds: float
     bytes: int = 0
     levels: tuple[Plan, ...] = ()
+    status: str = "ok"
     reason: str | None = None
     detail: str = ""
     predictions: tuple[tuple[Prediction, ...], ...] = ()
@@ -197,7 +198,8 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     try:
         sha256, photograph = load_source(config.source, source, config.output.layout)
     except SourceError as error:
-        return SourceEstimate(source, time.perf_counter() - started, reason=error.reason, detail=error.text)
+        seconds = time.perf_counter() - started
+        return SourceEstimate(source, seconds, status=error.status, reason=error.reason, detail=error.text)
     image = plan_pixels(settings, photograph.srgb, source, sha256)
     planned = plan_levels(config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
     levels, predictions = zip(*planned, strict=True)

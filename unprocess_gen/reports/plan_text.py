@@ -89,10 +89,14 @@ def _patch_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[st
 
 
 def _failure_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
-    failed = [source for source in estimates if source.reason is not None]
+    failed = [source for source in estimates if source.status == "failed"]
     lines = [f"fails     {source.source.name}: {source.reason}\n          {source.detail}" for source in failed]
     if len(failed) > config.source.max_failed:
         lines.append(f"          more than source.max_failed={config.source.max_failed}: the run will exit with 3")
+    if filtered := sum(source.status == "filtered" for source in estimates):
+        lines.append(
+            f"filtered  {filtered} of {len(estimates)} sources read, by source.min_side={config.source.min_side}"
+        )
     return lines
 
 

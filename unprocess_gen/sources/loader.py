@@ -12,7 +12,7 @@ import numpy as np
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.errors import ConfigError, FilteredError, MachineError, SourceError
 from unprocess_gen.core.paths import local_path
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
 from unprocess_gen.sources import reading
@@ -66,11 +66,16 @@ def load_source(
     Raises
     ------
     SourceError
-        If the source cannot be used, or no patch or tile fits into it; ``sha256`` is set if the bytes could be read.
+        If the source cannot be used or is left out, or no patch or tile fits into it; ``sha256`` is set if the bytes
+        could be read.
     MachineError
         If the file is not the one that was listed.
     """
     digest, photograph = _decoded(config, source, read)
+    height, width = (side // config.downscale for side in photograph.srgb.shape[:2])
+    if config.min_side is not None and min(height, width) < config.min_side:
+        text = f"{width} x {height} pixels have a side shorter than source.min_side={config.min_side}"
+        raise FilteredError("too_small", text, digest)
     if config.downscale > 1:
         square = f"are less than one square of source.downscale={config.downscale}"
         _check_side(photograph.srgb, config.downscale, square, digest)

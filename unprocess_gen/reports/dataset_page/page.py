@@ -92,7 +92,8 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlace
     from jinja2 import TemplateError  # optional library, extra "figures"
 
     facts, config = _checked_facts(folder)
-    rows = with_bar(read_rows(folder / "manifest.csv"), "row", facts["pairs"] + sum(facts["failed"].values()))
+    count = facts["pairs"] + sum(facts["failed"].values()) + facts.get("filtered", 0)
+    rows = with_bar(read_rows(folder / "manifest.csv"), "row", count)
     statistics = read_statistics(rows, facts["pairs"])
     first, name = statistics.first_pair, folder_name(folder)
     settings = {key: functools.reduce(getattr, key.split("."), config) for key in SETTINGS_SHOWN}

@@ -110,7 +110,7 @@ class ManifestStatistics:
         for row in rows:
             self.images += image_key(row) != self._image
             self._image = image_key(row)
-        failed = [row for row in rows if row["status"] != "ok"]
+        failed = [row for row in rows if row["status"] == "failed"]
         self.failed += failed[: FAILURES_LISTED - len(self.failed)]
         if pairs := [row for row in rows if row["status"] == "ok"]:
             self.first_pair = self.first_pair or pairs[0]
