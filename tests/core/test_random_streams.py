@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import itertools
-import math
-from typing import Any
 
 import numpy as np
 import pytest
-from helpers.moments import FALSE_ALARM, bernstein
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -95,25 +91,6 @@ def test_a_tile_contains_the_words_of_its_pixels(key: int, y: int, x: int, heigh
         assert tile[row, column] == word_by_hand(key, y + row, x + column, 1 << 24, 0)
 
 
-@pytest.fixture(scope="module")
-def full() -> np.ndarray:
-    """Return the words of a complete frame."""
-    return words(KEY, "heteroscedastic", (48, 400))
-
-
-@given(st.data())
-def test_any_tile_is_a_crop_of_the_full_frame(full: np.ndarray, data: st.DataObject) -> None:
-    top, left = data.draw(st.integers(0, 47)), data.draw(st.integers(0, 399))
-    height, width = data.draw(st.integers(1, 48 - top)), data.draw(st.integers(1, 400 - left))
-    tile = words(KEY, "heteroscedastic", (height, width), origin=(top, left))
-    assert (tile == full[top : top + height, left : left + width]).all()
-
-
-def test_the_layout_does_not_depend_on_the_width(full: np.ndarray) -> None:
-    for width in (1, 15, 16, 63, 64, 65, 129):
-        assert (words(KEY, "heteroscedastic", (3, width)) == full[:3, :width]).all()
-
-
 def test_an_empty_tile_has_no_words() -> None:
     assert words(KEY, "heteroscedastic", (0, 5)).shape == (0, 5)
 
@@ -128,26 +105,6 @@ def test_stream_numbers_never_change() -> None:
 
 
 # Independence ---------------------------------------------------------------------------------------------------------
-
-OTHERS: dict[str, tuple[int, str, dict[str, Any]]] = {
-    "stream": (KEY, "parameters", {}),
-    "level": (KEY, "heteroscedastic", {"level": 1}),
-    "draw": (KEY, "heteroscedastic", {"draw": 1}),
-    "frame": (KEY, "heteroscedastic", {"frame": 1}),
-    "y": (KEY, "heteroscedastic", {"origin": (64, 0)}),
-    "x": (KEY, "heteroscedastic", {"origin": (0, 64)}),
-    "low key bit": (KEY ^ 1, "heteroscedastic", {}),
-    "high key bit": (KEY ^ 1 << 63, "heteroscedastic", {}),
-    "key halves swapped": (KEY >> 32 | (KEY & 0xFFFFFFFF) << 32, "heteroscedastic", {}),
-}
-
-
-@pytest.mark.parametrize("other", OTHERS)
-def test_another_purpose_or_key_gives_other_words(other: str) -> None:
-    """Of 4096 independent pairs, two or more are equal with a probability of 5e-13."""
-    key, stream, options = OTHERS[other]
-    equal = np.equal(words(KEY, "heteroscedastic", (64, 64)), words(key, stream, (64, 64), **options))
-    assert int(equal.sum()) <= 1
 
 
 def test_streams_levels_and_draws_have_distinct_purposes() -> None:
@@ -181,46 +138,11 @@ def test_body_keys_never_change() -> None:
     assert body_key(7, "sony_a7s2", "2") == int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "big")
 
 
-def test_a_bodys_key_depends_on_seed_profile_and_unit() -> None:
-    keys = {body_key(*one) for one in ((7, "a", "2"), (8, "a", "2"), (7, "b", "2"), (7, "a", "3"))}
-    assert len(keys) == 4
-
-
-@given(st.integers(0, 2**63 - 1), st.integers(0, 1000))
-def test_a_key_depends_on_seed_photograph_and_occurrence(seed: int, occurrence: int) -> None:
-    other_sha = hashlib.sha256(b"another").hexdigest()
-    found = {
-        stream_key(seed, SHA, occurrence),
-        stream_key(seed + 1, SHA, occurrence),
-        stream_key(seed, other_sha, occurrence),
-        stream_key(seed, SHA, occurrence + 1),
-    }
-    assert len(found) == 4
-    assert all(0 <= key < 2**64 for key in found)
-
-
-def test_distinct_seeds_and_occurrences_have_distinct_keys() -> None:
-    found = {stream_key(seed, SHA, occurrence) for seed in range(64) for occurrence in range(64)}
-    assert len(found) == 64 * 64
-
-
 def test_the_first_of_identical_files_is_number_0() -> None:
     assert stream_key(3, SHA) == stream_key(3, SHA, 0)
 
 
 # Parameters -----------------------------------------------------------------------------------------------------------
-
-
-@given(keys)
-def test_parameters_are_odd_multiples_of_2_to_minus_53(key: int) -> None:
-    for uniform in parameter_uniforms(key, 10):
-        assert 0 < uniform < 1
-        assert uniform * 2**53 % 2 == 1
-
-
-@given(keys, st.integers(0, 20))
-def test_appending_parameters_changes_none(key: int, count: int) -> None:
-    assert parameter_uniforms(key, count) == parameter_uniforms(key, 21)[:count]
 
 
 @given(keys, st.integers(0, 50))
@@ -241,78 +163,3 @@ def test_scatter_n_has_the_iso_in_two_words_of_its_counter(key: int, iso: float,
 def test_patch_n_uses_the_first_two_words_of_its_counter(key: int, number: int) -> None:
     first, second, _, _ = philox_by_hand((0, number, STREAMS["patch"] << 24, 0), key)
     assert patch_words(key, number + 1)[number] == (first, second)
-
-
-# Statistics -----------------------------------------------------------------------------------------------------------
-
-SIDE = 1024
-STREAMS_OF = {
-    "here": (KEY, {}),
-    "next frame": (KEY, {"frame": 1}),
-    "next level": (KEY, {"level": 1}),
-    "next draw": (KEY, {"draw": 1}),
-    "next key": (KEY + 1, {}),
-    "next seed": (stream_key(1, SHA), {}),
-    "seed": (stream_key(0, SHA), {}),
-}
-
-
-@functools.cache
-def centred(name: str) -> np.ndarray:
-    """Return the uniforms of a stream minus a half."""
-    key, options = STREAMS_OF[name]
-    return words(key, "heteroscedastic", (SIDE, SIDE), **options) / 2**32 - 0.5
-
-
-def chi_square_bounds(freedom: int) -> tuple[float, float]:
-    """Return bounds that a chi-square exceeds with probability `FALSE_ALARM` per side (Laurent and Massart 2000)."""
-    x = math.log(1 / FALSE_ALARM)
-    return freedom - 2 * math.sqrt(freedom * x), freedom + 2 * math.sqrt(freedom * x) + 2 * x
-
-
-@pytest.mark.parametrize("position", [0, 8, 16, 24])
-def test_byte_values_are_equally_frequent(position: int) -> None:
-    """Pearson's statistic, 4096 expected in each of 256 cells."""
-    byte = (words(KEY, "heteroscedastic", (SIDE, SIDE)) >> np.uint32(position)) & np.uint32(255)
-    expected = SIDE * SIDE / 256
-    statistic = float(((np.bincount(byte.ravel(), minlength=256) - expected) ** 2 / expected).sum())
-    low, high = chi_square_bounds(255)
-    assert low < statistic < high
-
-
-def hold_uncorrelated(a: np.ndarray, b: np.ndarray) -> None:
-    """Hold the mean product of disjoint pairs to 0: it is at most ¼, with variance (1/12)²."""
-    assert abs(float((a * b).mean())) <= bernstein(1 / 144, 1 / 4, a.size)
-
-
-@pytest.mark.parametrize("axis", [0, 1], ids=["y", "x"])
-@pytest.mark.parametrize("lag", [1, 2, 16, 32, 64, 512])
-def test_lagged_random_words_are_uncorrelated(axis: int, lag: int) -> None:
-    u = np.moveaxis(centred("here"), axis, 0)
-    for start in (0, lag):  # runs of `lag` rows, alternately first and second of a pair
-        blocks = u[start : SIDE - (SIDE - start) % (2 * lag)].reshape(-1, 2, lag, SIDE)
-        if len(blocks):
-            hold_uncorrelated(blocks[:, 0], blocks[:, 1])
-
-
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [("here", other) for other in ("next frame", "next level", "next draw", "next key")] + [("seed", "next seed")],
-)
-def test_streams_are_uncorrelated(one: str, other: str) -> None:
-    hold_uncorrelated(centred(one), centred(other))
-
-
-def test_a_correlation_of_a_hundredth_is_detected() -> None:
-    """The bound detects (u + 0.01 v)·v, whose mean product is 0.01 / 12."""
-    leaning = centred("here") + 0.01 * centred("next key")
-    assert abs(float((leaning * centred("next key")).mean())) > bernstein(1 / 144, 1 / 4, SIDE * SIDE)
-
-
-def test_parameters_of_many_images_are_uniform() -> None:
-    """Each of the ten parameters over 2000 images, 16 cells."""
-    uniforms = np.array([parameter_uniforms(stream_key(0, f"{image:064x}"), 10) for image in range(2000)])
-    low, high = chi_square_bounds(15)
-    for parameter in uniforms.T:
-        counts = np.bincount((parameter * 16).astype(int), minlength=16)
-        assert low < float(((counts - 125) ** 2 / 125).sum()) < high

@@ -17,7 +17,6 @@ from unprocess_gen.simulation.kernels.normal import (
     fill_values_by_lines,
 )
 from unprocess_gen.simulation.kernels.normal import exact_values as kernel_exact_values
-from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.poisson import (
     CountTables,
     count_tables,
@@ -40,22 +39,6 @@ from unprocess_gen.simulation.kernels.strips import (
 )
 
 _WIDTH = np.uint64(VECTOR_WIDTH)
-
-
-# Words ----------------------------------------------------------------------------------------------------------------
-
-
-@kernel
-def fill_words(key: PhiloxKey, purpose_word: np.uint64, origin: tuple[int, int], scratch: Scratch, out: Words) -> None:
-    """Fill ``out`` with the words of a stream, strip by strip."""
-    height, width = out.shape
-    workspace, target = workspace_in(scratch), pointer_to(out, 0)
-    for y in range(height):
-        for x in range(0, width, STRIP):
-            strip = locate(origin, y, x, min(STRIP, width - x))
-            fill_word_blocks(key, strip, purpose_word, workspace.words)
-            for n in range(strip.length):
-                target[y * width + x + n] = workspace.words[strip.first + n]
 
 
 # Deviates -------------------------------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ def estimate(settings: Settings, root: Path | None, *overrides: str) -> sizes.Si
         ("source.patch=8",),
         ("source.patch=[random,10,3]",),
         ("output.layout=packed", "output.dtype=float32"),
+        ("output.clean_dtype=float32",),
         ("source.downscale=2",),
     ],
     ids=lambda overrides: overrides[0],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import algorithm1
+from helpers.datasets import text_rows
 from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs
@@ -63,8 +63,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def assert_clean_frames_agree(root: Path, dataset: Path) -> int:
-    with (dataset / "manifest.csv").open(newline="") as stream:
-        rows = {row["key"]: row for row in csv.DictReader(stream)}
+    rows = {row["key"]: row for row in text_rows(dataset)}
     pairs = RawPairs(dataset)
     for clean, noisy, facts in pairs:
         row = rows[str(facts["key"])]

@@ -15,7 +15,6 @@ from helpers.flats import (
     SHA256,
     SILENT,
     SPAN,
-    assert_same,
     bounds_off,
     dead,
     flat,
@@ -61,12 +60,6 @@ def test_shot_noise_is_poisson_count_of_electrons(code: int) -> None:
     counts = noisy_dn(plan_with("shot"), code) / 8
     assert (counts == np.rint(counts)).all()
     assert_poisson(counts, signal_dn(code) / 8)
-
-
-def test_poisson_check_rejects_another_rate() -> None:
-    counts = noisy_dn(plan_with("shot"), 600) / 8
-    with pytest.raises(AssertionError):
-        assert_poisson(counts, signal_dn(600) / 8 * 1.01)
 
 
 def test_no_light_gives_no_shot_noise() -> None:
@@ -123,12 +116,6 @@ def test_correlated_rows_are_an_autoregressive_process(correlation: float) -> No
     repeated = (1 + correlation**2) / (1 - correlation**2)  # squares of neighbours have the correlation r²
     bound = bernstein(2 * 300.0**4, (REACH * 300) ** 2, int(rows.size / repeated))
     assert abs(float((rows**2).mean()) - 300.0**2) <= bound
-
-
-def test_crop_has_the_correlated_offsets_of_its_rows() -> None:
-    plan = plan_with("row", row_std_dn=300.0, row_correlation=0.9)
-    complete, crop = make_pair(flat(0, 200, 4), plan), make_pair(flat(0, 60, 2), plan, (140, 2))
-    assert (crop.noisy == complete.noisy[140:, 2:]).all()
 
 
 def test_temporal_column_offsets_are_new_in_every_frame() -> None:
@@ -212,29 +199,6 @@ def test_image_outside_the_frame_of_the_shading_is_refused() -> None:
     plan = plan_with("lens_shading", lens_shading=(-0.3, 0.0, 0.0), frame_size=(40, 60))
     with pytest.raises(ValueError, match=r"exceeds the frame \[40, 60\] of the lens shading at \[30, 0\]"):
         make_pair(flat(0, 11, 60), plan, (30, 0))
-
-
-def test_crop_has_the_shading_of_its_place() -> None:
-    plan = plan_with("shot", "lens_shading", lens_shading=(-0.5, 0.0, 0.0), frame_size=(200, 300))
-    complete, crop = make_pair(flat(9000, 200, 300), plan), make_pair(flat(9000, 60, 100), plan, (100, 150))
-    assert (crop.clean == complete.clean[100:160, 150:250]).all()
-    assert (crop.noisy == complete.noisy[100:160, 150:250]).all()
-
-
-def test_average_has_the_product_of_shading_and_pixel_gains() -> None:
-    numbers = {"lens_shading": (-0.5, 0.1, 0.0), "frame_size": (200, 300), "prnu_std": 0.05}
-    plan = plan_with("prnu", "lens_shading", fixed_pattern_in_clean=True, **numbers)
-    image = flat(9000, 60, 100)
-    for _ in range(2):  # the second pair finds the patterns of the first
-        assert_same(image, plan, (100, 153))
-
-
-@pytest.mark.parametrize("origin", [(3, 1000), (1, 2047), (0, 1024), (2, 990)])
-def test_columns_of_a_crop_are_those_of_the_body(origin: tuple[int, int]) -> None:
-    """Normals of columns are computed 1024 at a time."""
-    plan, image = plan_with("column", column_std_dn=3.0), flat(9000, 5, 1100)
-    assert_same(image, plan, origin)
-    assert len(np.unique(make_pair(image, plan, origin).noisy[0])) > 10
 
 
 # Dark current ---------------------------------------------------------------------------------------------------------
@@ -330,24 +294,11 @@ def test_hot_and_dead_pixels_differ_between_sensor_units(hot: np.ndarray) -> Non
     assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
 
 
-def test_hot_and_dead_pixels_are_independent(hot: np.ndarray) -> None:
-    is_dead = dead(replace(SILENT, dead_pixel_share=SHARE), (1024, 1024))
-    assert bounds_off(is_dead & (hot > 0), SHARE**2, SHARE**2, 1) <= 1
-
-
 def test_dead_pixels_read_0_and_have_given_fraction() -> None:
     plan = plan_with("read", "dead_pixels", dead_pixel_share=SHARE, read_std_dn=30.0)
     frame = make_pair(flat(40000), plan).noisy
     assert bounds_off(frame == 0, SHARE, SHARE * (1 - SHARE), 1) <= 1
     assert frame[frame > 0].min() > 30000
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_none_or_all_pixels_can_be_dead_or_hot(share: float) -> None:
-    assert ((noisy_dn(plan_with("dead_pixels", dead_pixel_share=share), 500, 64, 64) == -BLACK) == (share == 1)).all()
-    means = hot_pixel_means(replace(SILENT, hot_pixel_share=share, hot_pixel_e=9.0), (64, 64))
-    assert ((means > 0) == (share == 1)).all()
-    assert_same(flat(500, 64, 64), plan_with("hot_pixels", hot_pixel_share=share, hot_pixel_e=9.0))
 
 
 # Fixed patterns -------------------------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -117,14 +116,6 @@ def misfits(plan: Plan, found: np.ndarray, law: Law = promised) -> list[str]:
 # The helper -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("std", [0.0, 0.05, 0.3, 1.0, 20.0])
-@pytest.mark.parametrize("mean", [0.0, 0.3, 10.49, 99.7])
-def test_exact_probabilities_sum_to_1(mean: float, std: float) -> None:
-    _, probability = shares(mean, std, 0, 100)
-    assert abs(probability.sum() - 1) <= len(probability) * 2.0**-52
-    assert (probability >= 0).all()
-
-
 def test_exact_moments_of_wide_gaussian_include_rounding() -> None:
     """Sheppard's corrections: variance + 1/12, fourth moment 3s⁴ + s²/2 + 1/80; their error is e^(-2pi²s²)."""
     found = moments(500.3, 2.0, 0, 1000)
@@ -142,11 +133,6 @@ def test_exact_moments_at_a_clip_are_half_normal() -> None:
     assert abs(found.variance / 1e6 - (1 / 2 - 1 / (2 * math.pi))) <= 1e-6
 
 
-def test_exact_moments_without_noise_have_no_variance() -> None:
-    assert moments(10.4, 0.0, 0, 100) == Moments(10.0, 0.0, 0.0, 0.0, 0.0)
-    assert moments(300.0, 0.0, 0, 255).mean == 255
-
-
 # Mean and variance ----------------------------------------------------------------------------------------------------
 
 
@@ -160,12 +146,6 @@ def test_mean_and_variance_of_flats_follow_the_distribution(
     found = histograms(plan, repeats)
     assert misfits(plan, found) == []
     figure("noise-moments", f"{len(CODES)} levels of {found[0].sum()} sites: mean and variance within their bounds")
-
-
-@pytest.mark.parametrize("image", [1, 2, 3, 4])
-def test_mean_and_variance_of_flats_hold_at_random_levels(settings: Settings, image: int) -> None:
-    plan = plan_of(settings, "brooks2019", image=image)
-    assert misfits(plan, histograms(plan, 1)) == []
 
 
 @pytest.mark.parametrize("sensor", ["generic_10bit", "generic_12bit", "generic_14bit", "generic_16bit"])
@@ -220,61 +200,11 @@ def test_wrong_noise_parameters_are_detected(settings: Settings, wrong: str) -> 
     assert misfits(plan, histograms(plan, 1), WRONG[wrong]) != []
 
 
-@pytest.mark.parametrize(("simulated", "assumed"), [("sensor", "black"), ("black", "sensor")])
-def test_wrong_clip_is_detected(settings: Settings, simulated: str, assumed: str) -> None:
-    plan = plan_of(settings, "imx385_iso3200", f"sensor.clip={simulated}")
-    assert misfits(plan.replace(sensor_clip=assumed), histograms(plan, 1)) != []
-
-
-def test_mirrored_negative_variance_is_detected(settings: Settings) -> None:
-    plan = plan_of(settings, "imx385_iso3200_rvdd")
-
-    def mirrored(plan: Plan, x: float) -> tuple[float, float]:
-        return x, math.sqrt(abs(plan.noise.a_dn * (x - plan.sensor.black_level_dn) + plan.noise.b_dn2))
-
-    assert misfits(plan, histograms(plan, 1), mirrored) != []
-
-
 # Tails and frequencies ------------------------------------------------------------------------------------------------
-
-DEEP_CODE = 65535 // 2
-DEEP = 2**22
-
-
-@pytest.fixture(scope="module")
-def deep(settings: Settings) -> tuple[Plan, np.ndarray]:
-    """Return a plan, and how many of 2**22 pixels in the middle of the range have each DN."""
-    plan = plan_of(settings, "imx385_iso3200")
-    noisy = make_pair(np.full((2048, 2048, 3), DEEP_CODE, dtype=np.uint16), plan).noisy
-    return plan, np.bincount(noisy.ravel(), minlength=2**plan.sensor.bits)
-
-
-def test_third_and_fourth_moments_follow_the_distribution(deep: tuple[Plan, np.ndarray]) -> None:
-    plan, histogram = deep
-    x, std = promised(plan, clean_value(plan, DEEP_CODE))
-    exact = exact_moments(plan, x, promised)
-    deviation = np.arange(len(histogram)) - exact.mean
-    for order, moment in ((3, exact.third), (4, exact.fourth)):
-        # E z⁶ is 15, E z⁸ is 105; rounding adds to a deviation of 115 what (1 + 1/12/115²)⁴ does, less than 1e-4.
-        variance = (15 if order == 3 else 105 - 9) * std ** (2 * order) * 1.0001
-        table = order * 1.6 * SAMPLER_ERROR * std**order  # E z² is 1, E |z|³ below 1.6
-        bound = bernstein(variance, exact.reach**order + abs(moment), DEEP) + table
-        assert abs(float(histogram @ deviation**order) / DEEP - moment) <= bound
-
-
-def test_tails_have_the_expected_number_of_pixels(deep: tuple[Plan, np.ndarray]) -> None:
-    plan, histogram = deep
-    x, std = promised(plan, clean_value(plan, DEEP_CODE))
-    levels, probability = shares(x, std, 0, 4095)
-    for side, multiple in itertools.product([-1, 1], [1, 2, 3, 4, 5]):
-        share = float(probability[side * (levels - x) > multiple * std].sum())
-        found = int(histogram[side * (np.arange(4096) - x) > multiple * std].sum()) / DEEP
-        bound = bernstein(share * (1 - share), 1, DEEP) + SAMPLER_ERROR
-        assert abs(found - share) <= bound, (side, multiple)
 
 
 @pytest.mark.parametrize(
-    ("noise", "code"), [("imx385_iso3200", DEEP_CODE), ("imx385_iso1600", 100), ("imx385_iso25600", 65000)]
+    ("noise", "code"), [("imx385_iso3200", 65535 // 2), ("imx385_iso1600", 100), ("imx385_iso25600", 65000)]
 )
 def test_every_dn_has_its_expected_frequency(settings: Settings, noise: str, code: int) -> None:
     """Near black and near white too, including the DN at which values are clipped."""
@@ -287,12 +217,6 @@ def test_every_dn_has_its_expected_frequency(settings: Settings, noise: str, cod
     expected[levels] = probability
     bounds = np.array([bernstein(p * (1 - p), 1, noisy.size) for p in expected])
     assert (np.abs(found - expected) <= bounds + SAMPLER_ERROR).all()
-
-
-def test_no_pixel_exceeds_the_range_of_the_sampler(deep: tuple[Plan, np.ndarray]) -> None:
-    plan, histogram = deep
-    x, std = promised(plan, clean_value(plan, DEEP_CODE))
-    assert np.abs(np.flatnonzero(histogram) - x).max() <= REACH * std + 0.5
 
 
 # No variance ----------------------------------------------------------------------------------------------------------

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.kernels import counts, exact_values, exact_values_by_vectors, fill_words, normalised_values
+from helpers.kernels import normalised_values
 from helpers.noise_fits import dataset_fits, fit_pair
 from helpers.promise_report import Figure
 from hypothesis import given
@@ -26,22 +23,14 @@ from unprocess_gen import RawPairs
 from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.schema import AccuracyConfig, replaced
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core import random_streams as streams
-from unprocess_gen.core.lookup_tables import tukey_table
 from unprocess_gen.core.types import REFERENCE_METHOD, Frame, Plan
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.planning.effect_selection import facts_for
-from unprocess_gen.planning.plan import plan_image, plan_pairs
-from unprocess_gen.reports.estimate import estimate_run
+from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation import self_test as selftest
-from unprocess_gen.simulation.kernels.normal import build_quantiles
-from unprocess_gen.simulation.kernels.philox import philox_key
-from unprocess_gen.simulation.kernels.strips import scratch_of_thread
-from unprocess_gen.simulation.pair import make_pair, make_pairs
+from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import cfa as bayer
-from unprocess_gen.simulation.reference import noise as effects
-from unprocess_gen.simulation.reference import poisson as reference_poisson
 from unprocess_gen.simulation.reference.sensor import in_dn
 
 FLOATS = ("output.dtype=float32", "output.layout=packed", "sensor.clip=none")
@@ -69,44 +58,7 @@ def dn(frame: Frame, plan: Plan) -> np.ndarray:
     return in_dn(frame, (plan.sensor.black_level_dn, plan.sensor.white_level_dn))
 
 
-# Draws ----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 63), (2, 65), (1, 1024), (2, 2100)])
-@pytest.mark.parametrize("origin", [(0, 0), (7, 1), (300, 63), (1, 5000)])
-def test_compiled_words_equal_the_streams(shape: tuple[int, int], origin: tuple[int, int]) -> None:
-    key = 0xFEDCBA9876543210
-    found, purpose = np.empty(shape, dtype=np.uint32), np.uint64(streams.purpose("read"))
-    fill_words(philox_key(key, level=2, draw=1, frame=3), purpose, origin, scratch_of_thread(), found)
-    assert np.array_equal(found, streams.words(key, "read", shape, origin=origin, frame=3, level=2, draw=1))
-
-
-WORDS = np.concatenate(
-    [
-        np.arange(2000, dtype=np.uint32),
-        np.uint32(2**31) + np.arange(2000, dtype=np.uint32),
-        np.uint32(2**32 - 1) - np.arange(2000, dtype=np.uint32),
-        np.random.default_rng(0).integers(0, 2**32, 200_000, dtype=np.uint32),
-    ]
-).reshape(8, -1)
-
-
-@pytest.mark.parametrize(
-    "make_table",
-    [effects.normal_table, partial(tukey_table, -0.2), partial(tukey_table, 0.0)],
-    ids=["normal", "Tukey", "logistic"],
-)
-def test_compiled_quantiles_equal_the_reference_bit_for_bit(make_table: Callable[[], np.ndarray]) -> None:
-    table = make_table()
-    expected = effects.by_inverse_cdf(WORDS, table).tobytes()
-    assert exact_values(WORDS.ravel(), build_quantiles(table)).tobytes() == expected
-    assert exact_values_by_vectors(WORDS.ravel(), build_quantiles(table)).tobytes() == expected
-
-
-def test_compiled_counts_equal_the_reference() -> None:
-    rate = np.geomspace(1e-3, 1e6, WORDS.size).reshape(WORDS.shape)
-    rate[:, ::7] = 0.0
-    assert np.array_equal(counts(WORDS.ravel(), rate.ravel()), reference_poisson.poisson(WORDS, rate).ravel())
+# Values ---------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("span_dn", [1.0, 959.0, 1024.0, 3840.0, 15871.0, 65535.0])
@@ -196,29 +148,6 @@ def test_unclipped_noise_has_mean_zero_in_black() -> None:
     assert abs(clipped.mean(dtype=np.float64) - std / np.sqrt(2 * np.pi)) < 5 * 0.6 * std / 512
 
 
-@pytest.mark.parametrize("name", ["per_channel", "physical"])
-def test_a_crop_is_the_crop_of_the_full_pair(name: str) -> None:
-    plan, picture = normalised(PLANS[name]), selftest.golden_image()
-    whole, part = make_pair(picture, plan), make_pair(picture[3:12, 5:70], plan, (3, 5))
-    assert np.array_equal(part.clean, whole.clean[3:12, 5:70])
-    assert np.array_equal(part.noisy, whole.noisy[3:12, 5:70])
-
-
-@pytest.mark.parametrize("overrides", [FLOATS, FLOATS[1:2]], ids=["both", "packed"])
-@pytest.mark.parametrize("noise", ["imx385_iso3200", "imx385"])
-def test_levels_and_draws_equal_separate_pairs(noise: str, overrides: tuple[str, ...], settings: Settings) -> None:
-    levels = "noise.levels=[1600,6400]" if noise == "imx385" else "noise.levels=[{a: 2, b: 3},{a: 4, b: 5}]"
-    config = settings(f"noise={noise}", levels, "noise.draws=2", *overrides)
-    picture = selftest.golden_image()[:18, :82]
-    plans = plan_pairs(config, "0" * 64, facts=facts_for(config, picture))
-    assert len(plans) == 4
-    for plan, pair in zip(plans, make_pairs(picture, plans), strict=True):
-        alone = make_pair(picture, plan)
-        assert pair.clean.tobytes() == alone.clean.tobytes()
-        assert pair.noisy.tobytes() == alone.noisy.tobytes()
-        assert (pair.noisy.shape, pair.counts) == (alone.noisy.shape, alone.counts)
-
-
 def test_numpys_instruction_sets_change_no_byte() -> None:
     """A new process simulates the golden float32 pairs, whose parameters NumPy computes."""
     code = (
@@ -262,16 +191,6 @@ def test_an_odd_side_cannot_be_packed(shape: tuple[int, int]) -> None:
         bayer.pack(np.zeros(shape, dtype=np.uint16), "RGGB")
     with pytest.raises(ValueError, match="even"):
         make_pair(np.zeros((*shape, 3), dtype=np.uint8), PLANS["silent"].replace(layout="packed"))
-
-
-@pytest.mark.parametrize("name", PLANS)
-def test_packed_frames_contain_the_values_of_mosaics(name: str) -> None:
-    picture = selftest.golden_image()[:18, :82]
-    for plan in (PLANS[name], normalised(PLANS[name])):
-        mosaics, planes = make_pair(picture, plan, ORIGIN), make_pair(picture, plan.replace(layout="packed"), ORIGIN)
-        assert planes.noisy.shape == (4, 9, 41)
-        assert np.array_equal(bayer.unpack(planes.noisy, plan.sensor.pattern, ORIGIN), mosaics.noisy)
-        assert np.array_equal(bayer.unpack(planes.clean, plan.sensor.pattern, ORIGIN), mosaics.clean)
 
 
 # Plans ----------------------------------------------------------------------------------------------------------------
@@ -370,30 +289,6 @@ def test_every_byte_is_verified_and_every_pair_regenerated(packed: Path, photos:
     assert not any(one.complaint for one in again)
 
 
-def test_a_flipped_bit_is_found_and_repaired(packed: Path, photos: Path, run_main: RunMain, tmp_path: Path) -> None:
-    shutil.copytree(packed, tmp_path / "ds")
-    shard = tmp_path / "ds/shards/shard-00000.tar"
-    content = bytearray(shard.read_bytes())
-    content[700] ^= 1  # in the first array
-    shard.write_bytes(content)
-    done = run_main("verify", "ds", "--repair", f"source.root={photos}")
-    assert done.code == 0
-    assert "clean.npy: the XXH3-128 of its data is" in done.err
-    assert shard.read_bytes() == (packed / "shards/shard-00000.tar").read_bytes()
-
-
-@pytest.mark.parametrize("overrides", [FLOATS, FLOATS[:1], FLOATS[1:2]], ids=["both", "float32", "packed"])
-def test_the_estimated_bytes_are_exact(
-    overrides: tuple[str, ...], photos: Path, make: Make, settings: Settings, tmp_path: Path
-) -> None:
-    """Unpatched images of 13 photographs; some have odd sides and one fails."""
-    config = settings(*overrides, "noise.draws=2")
-    config = replaced(config, {"source.root": str(photos)})
-    summary = make(photos, tmp_path / "ds", *overrides, "noise.draws=2")
-    told = estimate_run(config, 1, read_all=True)
-    assert told.bytes == summary.bytes == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
-
-
 def test_plan_reports_the_loss_of_odd_sides(photos: Path, run_main: RunMain) -> None:
     done = run_main("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
     assert done.code == 0
@@ -421,31 +316,6 @@ def test_rerun_does_nothing_and_another_dtype_is_refused(
     assert tree_hash(packed) == before
 
 
-@pytest.mark.slow
-def test_the_bytes_do_not_depend_on_the_number_of_workers(
-    packed: Path, photos: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
-) -> None:
-    make(photos, tmp_path / "ds", "output.pairs_per_shard=5", "noise=brooks2019", *FLOATS, n_jobs=2)
-    assert tree_hash(tmp_path / "ds") == tree_hash(packed)
-
-
-def test_a_dataset_is_regenerated_from_its_config(packed: Path, photos: Path, run_main: RunMain) -> None:
-    done = run_main("again", packed, f"source.root={photos}", "out=again", "n_jobs=1", "source.max_failed=1")
-    assert done.code == 0
-    assert "the same as" in done.out
-
-
-def test_bytes_are_little_endian_and_match_the_digests(packed: Path) -> None:
-    import xxhash
-
-    clean, noisy, row = RawPairs(packed)[0]
-    assert xxhash.xxh3_128_hexdigest(clean.astype("<f4").tobytes()) == row["clean_xxh3"]
-    assert xxhash.xxh3_128_hexdigest(noisy.astype("<f4").tobytes()) == row["noisy_xxh3"]
-    assert hashlib.sha256((packed / "shards/shard-00000.tar").read_bytes()).hexdigest() in (
-        packed / "dataset.json"
-    ).read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -465,24 +335,6 @@ def test_the_noise_of_the_arrays_fits_the_rows(overrides: tuple[str, ...], make:
     lying = fit_pair(clean, noisy, row | {gain: row[gain] * 1.1})
     assert lying is not None
     assert lying.deviation > 6
-
-
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (
-            ("sensor.clip=none",),
-            "output.dtype=uint16 holds no values beyond the sensor's range; set output.dtype=float32",
-        ),
-        (("output.dtype=float32", "effects.quantise=on"), "effects.quantise=on: output.dtype=float32 is not rounded"),
-    ],
-)
-def test_contradictory_output_settings_give_one_line(
-    arguments: tuple[str, ...], complaint: str, run_main: RunMain, tmp_path: Path
-) -> None:
-    done = run_main(*arguments)
-    assert (done.code, len(done.err.splitlines()), list(tmp_path.iterdir())) == (2, 1, [])
-    assert complaint in done.err
 
 
 def test_accuracy_requires_integer_frames(run_main: RunMain, tmp_path: Path) -> None:

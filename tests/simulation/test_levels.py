@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import shutil
 import tarfile
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make, Settings
+from helpers.datasets import Make, Settings, text_rows
 from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
 from PIL import Image
@@ -41,11 +40,6 @@ def many(photographs: Path, make: Make) -> Path:
     return out
 
 
-def rows(out: Path) -> list[dict[str, str]]:
-    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
 def residuals(out: Path, source: str) -> dict[str, np.ndarray]:
     return {
         row["key"]: (noisy.astype(float) - clean).ravel()
@@ -56,7 +50,7 @@ def residuals(out: Path, source: str) -> dict[str, np.ndarray]:
 
 
 def test_there_is_one_row_per_pair_and_per_failure(many: Path) -> None:
-    keys = [row["key"] for row in rows(many)]
+    keys = [row["key"] for row in text_rows(many)]
     pairs = [f"-l{level:02d}d{draw:02d}" for level, draw in itertools.product(range(3), range(2))]
     assert keys == [
         *(f"0000000{index}{pair}" for index in range(3) for pair in pairs),
@@ -86,7 +80,7 @@ def test_the_pairs_of_an_image_differ_in_noise_only(many: Path) -> None:
         "noisy_clipped_low",
         "noisy_clipped_high",
     }
-    for _, some in itertools.groupby(rows(many), key=lambda row: row["key"][:8]):
+    for _, some in itertools.groupby(text_rows(many), key=lambda row: row["key"][:8]):
         shared = [{name: value for name, value in row.items() if name not in own} for row in some]
         assert all(one == shared[0] for one in shared)
 
@@ -99,7 +93,7 @@ def test_the_end_of_a_run_counts_pairs(run_main: RunMain, tmp_path: Path) -> Non
 
 
 def test_levels_draw_their_own_profile_and_draws_share_it(many: Path) -> None:
-    levels = {(row["level"], row["a_dn"], row["b_dn2"]) for row in rows(many) if row["source"] == "large.png"}
+    levels = {(row["level"], row["a_dn"], row["b_dn2"]) for row in text_rows(many) if row["source"] == "large.png"}
     assert len(levels) == 3
     assert len({a for _, a, _ in levels}) == 3
 
@@ -116,8 +110,8 @@ def test_the_first_level_and_draw_equals_a_single_pair(
     many: Path, photographs: Path, make: Make, tmp_path: Path
 ) -> None:
     make(photographs, tmp_path / "one", "noise=brooks2019")
-    first = {row["source"]: row["noisy_xxh3"] for row in rows(many) if row["key"].endswith(("l00d00", "3"))}
-    assert {row["source"]: row["noisy_xxh3"] for row in rows(tmp_path / "one")} == first
+    first = {row["source"]: row["noisy_xxh3"] for row in text_rows(many) if row["key"].endswith(("l00d00", "3"))}
+    assert {row["source"]: row["noisy_xxh3"] for row in text_rows(tmp_path / "one")} == first
 
 
 def test_every_pair_is_regenerated_from_its_row(many: Path, photographs: Path, figure: Figure) -> None:
@@ -156,7 +150,7 @@ def test_an_images_key_selects_all_of_its_pairs(many: Path, photographs: Path, r
 
 def test_levels_can_be_isos_of_a_physical_profile(photographs: Path, make: Make, tmp_path: Path) -> None:
     make(photographs, tmp_path / "ds", "noise=nikon_d850", "noise.levels=[100,800,6400]")
-    found = [(row["iso"], row["dn_per_e"]) for row in rows(tmp_path / "ds") if row["source"] == "large.png"]
+    found = [(row["iso"], row["dn_per_e"]) for row in text_rows(tmp_path / "ds") if row["source"] == "large.png"]
     gains = [float(gain) for _, gain in found]
     assert [iso for iso, _ in found] == ["100.0", "800.0", "6400.0"]
     np.testing.assert_allclose(np.array(gains) / gains[0], [1, 8, 64], rtol=1e-12)
@@ -164,7 +158,7 @@ def test_levels_can_be_isos_of_a_physical_profile(photographs: Path, make: Make,
 
 def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path: Path) -> None:
     make(photographs, tmp_path / "ds", "noise=heteroscedastic", "noise.levels=[{a:1,b:4},{a:3,b:0}]")
-    assert {(row["a_dn"], row["b_dn2"]) for row in rows(tmp_path / "ds") if row["status"] == "ok"} == {
+    assert {(row["a_dn"], row["b_dn2"]) for row in text_rows(tmp_path / "ds") if row["status"] == "ok"} == {
         *(("1.0", "4.0"), ("3.0", "0.0"))
     }
 
@@ -231,7 +225,7 @@ def filmed(clips: Path, make: Make) -> Path:
 
 
 def test_each_folder_is_a_clip_whose_frames_are_in_order(filmed: Path) -> None:
-    assert [(row["source"], row["clip"], row["frame"]) for row in rows(filmed)] == [
+    assert [(row["source"], row["clip"], row["frame"]) for row in text_rows(filmed)] == [
         ("alone.png", ".", "0"),
         *((f"one/{frame}.png", "one", str(frame)) for frame in range(4)),
         *((f"two/deep/{frame}.png", "two/deep", str(frame)) for frame in range(4)),
@@ -250,7 +244,7 @@ def test_frames_of_a_clip_share_drawn_parameters(filmed: Path) -> None:
 
 def by_clip(out: Path) -> dict[str, list[dict[str, str]]]:
     found: dict[str, list[dict[str, str]]] = {}
-    for row in rows(out):
+    for row in text_rows(out):
         found.setdefault(row["clip"], []).append(row)
     return found
 
@@ -266,8 +260,8 @@ def test_another_clip_changes_nothing(clips: Path, filmed: Path, make: Make, tmp
     copy = Path(shutil.copytree(clips, tmp_path / "clips"))
     shutil.rmtree(copy / "one")
     make(copy, tmp_path / "ds", *PHYSICAL)
-    kept = {row["source"]: row["noisy_xxh3"] for row in rows(filmed) if row["clip"] != "one"}
-    assert {row["source"]: row["noisy_xxh3"] for row in rows(tmp_path / "ds")} == kept
+    kept = {row["source"]: row["noisy_xxh3"] for row in text_rows(filmed) if row["clip"] != "one"}
+    assert {row["source"]: row["noisy_xxh3"] for row in text_rows(tmp_path / "ds")} == kept
 
 
 def test_a_copied_clip_has_its_own_parameters(clips: Path, make: Make, tmp_path: Path) -> None:
@@ -275,7 +269,7 @@ def test_a_copied_clip_has_its_own_parameters(clips: Path, make: Make, tmp_path:
     shutil.copytree(clips / "one", copy / "a")
     shutil.copytree(clips / "one", copy / "b")
     make(copy, tmp_path / "ds", *PHYSICAL)
-    assert len({row["stream_key"] for row in rows(tmp_path / "ds")}) == 2
+    assert len({row["stream_key"] for row in text_rows(tmp_path / "ds")}) == 2
 
 
 def test_frames_are_regenerated_from_their_rows(filmed: Path, clips: Path) -> None:

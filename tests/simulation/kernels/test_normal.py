@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from helpers.kernels import coarse_normals, exact_values, values_by_lines
+from helpers.kernels import coarse_normals, exact_values, exact_values_by_vectors, values_by_lines
 from helpers.promise_report import Figure
 
 from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL
@@ -64,8 +64,9 @@ def test_approximate_values_are_within_their_error_bound(law: str, random_bits: 
 @pytest.mark.parametrize("random_bits", RANDOM_BITS)
 @pytest.mark.parametrize("law", LAWS)
 def test_the_exact_value_of_a_word_equals_the_reference(law: str, random_bits: int) -> None:
-    found = exact_values(telling_words(random_bits), build_quantiles(LAWS[law]()))
-    assert (found == reference(law, random_bits)).all()
+    for compiled in (exact_values, exact_values_by_vectors):
+        found = compiled(telling_words(random_bits), build_quantiles(LAWS[law]()))
+        assert (found == reference(law, random_bits)).all()
 
 
 def test_approximate_normals_are_within_1e_5() -> None:

@@ -108,52 +108,19 @@ def test_counts_follow_the_distribution_to_one_word(rate: float, figure: Figure)
     figure("poisson", f"at most {error:.2f} of 2^32 words off")
 
 
-@pytest.mark.parametrize("rate", [0.3, 12.5, LIMIT, 12345.678, 1e9])
-def test_reference_counts_follow_the_distribution(rate: float) -> None:
-    assert np.abs(error_in_words(rate, poisson, most=60)).max() <= LEAST_ERROR + COMPUTED_ERROR
-
-
-def test_the_distribution_holds_at_random_rates() -> None:
-    for rate in random_rates(180, seed=1):
-        assert np.abs(error_in_words(min(float(rate), 1e7), most=120)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
-
-
 def test_the_distribution_holds_at_the_ends_of_every_cell() -> None:
     for cell, inside in itertools.product(range(80), (1e-9, 1 - 1e-9)):
         rate = ((cell + inside) / 10) ** 2
         assert np.abs(error_in_words(rate, most=150)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
 
 
-@pytest.mark.slow
-def test_the_distribution_holds_at_thousands_of_rates(figure: Figure) -> None:
+@pytest.mark.parametrize("count", [180, pytest.param(6000, marks=pytest.mark.slow)])
+def test_the_distribution_holds_at_random_rates(count: int, figure: Figure) -> None:
     errors = []
-    for rate in random_rates(6000, seed=2):
+    for rate in random_rates(count, seed=2):
         errors.append(np.abs(error_in_words(min(float(rate), 1e7), most=150)).max())
         assert errors[-1] <= LEAST_ERROR + COMPUTED_ERROR, rate
     figure("poisson", f"{len(errors)} random rates: at most {max(errors):.2f} of 2^32 words off")
-
-
-@pytest.mark.parametrize(("coefficients", "factor"), [("A", 1.001), ("B", 1.001), ("C", 1.001), ("D", 1.1), ("E", 2)])
-def test_a_wrong_coefficient_breaks_the_distribution(
-    coefficients: str, factor: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first coefficient of each polynomial is changed; the last two need larger changes to matter."""
-    first, *others = getattr(poissons, coefficients)
-    monkeypatch.setattr(poissons, coefficients, (first * factor, *others))
-    assert np.abs(error_in_words(LIMIT, poisson)).max() > LEAST_ERROR + COMPUTED_ERROR
-
-
-@pytest.mark.parametrize("n", range(8))
-def test_a_wrong_table_entry_breaks_the_distribution(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Coefficient n of the middle row of a cell is changed; higher coefficients need larger changes to matter."""
-    right = poisson_tables()
-    cell = 55
-    wrong = right.cdf.copy()
-    row = right.first[cell] + int(right.middle[cell])
-    wrong[row, n] *= 1 + 10.0 ** (n - 5)
-    monkeypatch.setattr(poissons, "poisson_tables", lambda: right._replace(cdf=wrong))
-    rate = ((cell + 1 - 1e-9) / 10) ** 2
-    assert np.abs(error_in_words(rate, poisson)).max() > LEAST_ERROR + COMPUTED_ERROR
 
 
 # Order and coupling ---------------------------------------------------------------------------------------------------
@@ -172,17 +139,6 @@ def test_counts_increase_with_the_words_normal(rate: float) -> None:
         assert (np.diff(drawn(word(rank), np.full(rank.shape, rate))) >= 0).all()
 
 
-@pytest.mark.parametrize("rate", [1e3, 1e5, 1e7, 1e9])
-def test_a_count_follows_the_normal_of_its_word(rate: float) -> None:
-    """The count is within 1 below rate + √rate·z + (z² + 2) / 6, whose next term is -(z + z³/2) / (36 √rate)."""
-    words = np.random.default_rng(4).integers(0, WORDS, 100_000, dtype=np.uint32)
-    z = normals(words)
-    below = rate + math.sqrt(rate) * z + (z * z + 2) / 6 - fast(words, np.full(words.shape, rate))
-    slack = (6.4 + 6.4**3 / 2) / (36 * math.sqrt(rate)) * 1.1 + 2e-7 * math.sqrt(rate)
-    assert below.min() >= -slack
-    assert below.max() <= 1 + slack
-
-
 def test_a_larger_rate_never_gives_a_smaller_count() -> None:
     words = np.repeat(np.random.default_rng(5).integers(0, WORDS, 300, dtype=np.uint32), 400)
     rates = np.tile(np.sort(random_rates(400 // 3 * 3 + 3, seed=6)[:400]), 300)
@@ -193,8 +149,6 @@ def test_a_larger_rate_never_gives_a_smaller_count() -> None:
 
 EDGE_WORDS = [0, 1, 2, SIGN // 2, SIGN - 2, SIGN - 1, SIGN, SIGN + 1, SIGN + 2, 3 * (SIGN // 2), WORDS - 2, WORDS - 1]
 NO_RATES = [0.0, -0.0, -5e-324]
-NEGATIVE_RATES = [-1.0, -1e300, math.nan]
-"""Rates that `fill_counts` never gets: it gets those of light, which is not negative."""
 TINY_RATES = [5e-324, 2.0**-1050, 2.3e-308, 1e-300, 1e-100, 1e-20, 2.0**-53, 2.0**-34]
 
 
@@ -383,38 +337,18 @@ def test_counts_by_thresholds_equal_the_reference_for_every_word(rate: float) ->
     assert (np.diff(ranks.astype(np.int64)) > 0).all() or rate < 1e-9
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 7])
-def test_rows_of_any_length(count: int) -> None:
-    words, rates = word(np.arange(count) * 10**9), np.linspace(50, 80, count)
-    assert fast(words, rates).tolist() == poisson(words, rates).tolist()
-
-
 # No light and hardly any ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("drawn", [fast, exact_counts, poisson])
-def test_no_light_gives_no_count(drawn: Draw) -> None:
-    words, rates = pairs(EDGE_WORDS, NO_RATES)
-    assert (drawn(words, rates) == 0).all()
-
-
 @pytest.mark.parametrize("drawn", [exact_counts, poisson])
-def test_negative_rates_give_no_count(drawn: Draw) -> None:
-    words, rates = pairs(EDGE_WORDS, NEGATIVE_RATES)
-    assert (drawn(words, rates) == 0).all()
-
-
-@pytest.mark.parametrize("drawn", [fast, poisson])
-def test_a_rate_below_what_words_resolve_gives_no_count(drawn: Draw) -> None:
-    words, rates = pairs(EDGE_WORDS, [rate for rate in TINY_RATES if rate < 1e-11])
+def test_no_light_hardly_any_and_negative_rates_give_no_count(drawn: Draw) -> None:
+    """Words resolve rates down to 2**-33."""
+    tiny = [rate for rate in TINY_RATES if rate < 1e-11]
+    words, rates = pairs(EDGE_WORDS, [*NO_RATES, *tiny, -1.0, -1e300, math.nan])
     assert (drawn(words, rates) == 0).all()
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------
-
-
-def test_the_tables_have_the_published_hash() -> None:
-    assert poissons.digest(poisson_tables()) == poissons.TABLES_SHA256
 
 
 def test_tables_with_another_hash_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

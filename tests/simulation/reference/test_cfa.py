@@ -55,13 +55,6 @@ def test_an_unknown_pattern_is_refused_with_the_known_ones(pattern: str) -> None
         tile(pattern)
 
 
-@pytest.mark.parametrize("pattern", TILES)
-def test_a_mosaic_by_hand(pattern: str) -> None:
-    colours = np.array([[[1, 2, 3], [4, 5, 6]], [[7, 8, 9], [10, 11, 12]]], dtype=np.float64)
-    (a, b), (c, d) = TILES[pattern]
-    assert mosaic(colours, pattern).tolist() == [[(1, 2, 3)[a], (4, 5, 6)[b]], [(7, 8, 9)[c], (10, 11, 12)[d]]]
-
-
 @given(st.sampled_from(PATTERNS), st.integers(1, 9), st.integers(1, 9))
 def test_every_site_records_its_filters_channel_at_any_size(pattern: str, height: int, width: int) -> None:
     raw = mosaic(coloured(height, width), pattern)
@@ -69,11 +62,6 @@ def test_every_site_records_its_filters_channel_at_any_size(pattern: str, height
     for y in range(height):
         for x in range(width):
             assert raw[y, x] == TILES[pattern][y % 2][x % 2] * 10**6 + y * 10**3 + x
-
-
-@pytest.mark.parametrize(("pattern", "channel"), [("RGGB", R), ("BGGR", B), ("GRBG", G), ("GBRG", G)])
-def test_a_single_pixel_is_the_first_site(pattern: str, channel: int) -> None:
-    assert mosaic(coloured(1, 1), pattern).tolist() == [[channel * 10**6]]
 
 
 @given(st.sampled_from(PATTERNS), st.data())

@@ -67,16 +67,6 @@ def test_limits_are_those_of_the_caller() -> None:
     assert quantise(np.array([-5.0, 239.6, 240.4, 4095.6]), 240, 4095).tolist() == [240, 240, 240, 4095]
 
 
-def test_rounding_comes_before_the_clip() -> None:
-    """For integer limits, rounding first and clipping first give the same value, so counts can use rounded values."""
-    assert quantise(np.array([239.5, 4095.5]), 240, 4095).tolist() == [240, 4095]
-
-
-@given(st.integers(0, 65535))
-def test_integers_are_unchanged(dn: int) -> None:
-    assert quantise(np.array([float(dn)]), 0, 65535).tolist() == [dn]
-
-
 def test_quantised_frames_are_uint16() -> None:
     assert quantise(np.zeros((2, 3)), 0, 1).dtype == np.uint16
 
@@ -109,14 +99,6 @@ def test_an_included_black_level_is_subtracted() -> None:
     assert abs(Fraction(b) - exact) <= slack
 
 
-def test_subtracting_black_preserves_the_variance_at_every_level() -> None:
-    """Zero at 255.33 DN, as its author's line is: 2043.51144 / 8.0034."""
-    a, b = convert(8.0034, -2043.51144, black="included")
-    for raw in (240, 255.33, 300, 4095):
-        published = Fraction("8.0034") * Fraction(str(raw)) - Fraction("2043.51144")
-        assert abs(Fraction(a) * (Fraction(str(raw)) - 240) + Fraction(b) - published) <= Fraction(1, 10**11)
-
-
 def test_a_profile_is_scaled_by_the_ratio_of_level_ranges() -> None:
     """s = 15359 / 3855: slope times s, intercept times s²."""
     s = Fraction(16383 - 1024, 4095 - 240)
@@ -136,12 +118,3 @@ def test_normalized_units_use_the_sensors_range() -> None:
     a, b = convert(0.01, 0.001, units="normalized", profile_levels_dn=(0, 0))
     hold_close(a, Fraction(0.01) * 3855, 1)
     hold_close(b, Fraction(0.001) * 3855**2, 2)
-
-
-@given(st.floats(1e-4, 50), st.floats(0, 2000), st.floats(0, 1))
-def test_the_noise_to_signal_ratio_does_not_depend_on_bits(a: float, b: float, light: float) -> None:
-    """The variance over the range squared is the same on both sensors, to the rounding of four operations."""
-    other_a, other_b = convert(a, b, sensor_levels_dn=GENERIC_14)
-    here = (Fraction(a) * Fraction(light) * 3855 + Fraction(b)) / 3855**2
-    there = (Fraction(other_a) * Fraction(light) * 15359 + Fraction(other_b)) / 15359**2
-    assert abs(here - there) <= 4 * here / 2**53 * (1 + Fraction(1, 10**6)) + Fraction(1, 2**1000)
