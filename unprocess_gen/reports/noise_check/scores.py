@@ -361,9 +361,10 @@ def _outlier_score(sums: Sums) -> Score:
     """Score of the number of sites beyond `FAR_Z`, in the directions in which the sensor does not limit them."""
     total = expected = possible = 0.0
     for plane in sums.planes:
-        shares, is_free = plane.expected.far * plane.count, np.isfinite(plane.expected.far)
-        total, expected = total + float(plane.outliers[is_free].sum()), expected + float(shares[is_free].sum())
-        possible += float((is_free @ plane.count).sum()) / 2
+        sites = np.isfinite(plane.expected.far) * plane.count
+        total += float((plane.means[3:] * sites).sum())
+        expected += float((np.nan_to_num(plane.expected.far) * sites).sum())
+        possible += float(sites.sum()) / 2
     bound, variance = TAIL_ERROR * expected, expected + UNFORESEEN * possible
     return Score(total - expected, possible * 1e-6, variance, step=1.0, low=-bound, high=bound)
 

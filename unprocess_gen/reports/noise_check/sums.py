@@ -65,13 +65,11 @@ class Plane:
 
     @property
     def means(self) -> Float:
-        """Means of z, of cos z, and of the clean value minus the middle of its bin (DN), [3, N]."""
-        return np.asarray(self._sums[:3, self.bins] / self.count)
+        """Means of z, of cos z, of the clean value minus the middle of its bin (DN), and shares beyond `FAR_Z`, [5, N].
 
-    @property
-    def outliers(self) -> Float:
-        """Numbers of sites below -`FAR_Z` and above `FAR_Z`, [2, N]."""
-        return np.asarray(self._sums[3:, self.bins])
+        The shares are those below -`FAR_Z` and above `FAR_Z`.
+        """
+        return np.asarray(self._sums[:, self.bins] / self.count)
 
     def defects(self) -> tuple[int, int]:
         """Numbers of defects that must be outliers, and of those that are none."""
