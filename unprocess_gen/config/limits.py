@@ -238,7 +238,7 @@ def _are_shares(value: Any) -> bool:
         return False
     has_names = all(isinstance(name, str) and re.fullmatch(r"[\w-]{1,32}", name, re.ASCII) for name in value)
     has_shares = all(is_number(share) and share > 0 for share in value.values())
-    return has_names and has_shares and abs(math.fsum(value.values()) - 1) <= 1e-9
+    return has_names and has_shares and abs(sum(value.values()) - 1) <= 1e-9
 
 
 SPLIT = Limit(
