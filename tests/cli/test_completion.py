@@ -20,7 +20,7 @@ from unprocess_gen.cli.verbs import VERBS
 
 CANDIDATES = [
     ("gen-dataset ver", ["verify"]),
-    ("gen-dataset s", ["scene.", "scene=", "seed=", "self_test=", "sensor.", "sensor=", "source.", "status"]),
+    ("gen-dataset s", ["scene.", "scene=", "seed=", "self_test=", "sensor.", "sensor=", "source.", "split=", "status"]),
     ("gen-dataset camera=sony", ["camera=sony_a7r", "camera=sony_rx100"]),
     ("gen-dataset plan isp=", ["isp=gamma22", "isp=linear", "isp=smoothstep_gamma22", "isp=srgb"]),
     ("gen-dataset plan gains.r", ["gains.red="]),
