@@ -116,12 +116,6 @@ def test_place_without_permission_gives_one_line_and_exit_code_5(
     assert run_main(*arguments) == (5, "", f"gen-dataset: {job}{message}\n")
 
 
-def test_process_reports_a_mistake_in_one_line(cli: Cli, tmp_path: Path) -> None:
-    done = cli("camera=nope", "out=there")
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_error_is_one_line_with_hydra_full_error_set(cli: Cli) -> None:
     assert cli("seed=abc", HYDRA_FULL_ERROR="1").stderr.count("\n") == 1
 
@@ -141,24 +135,6 @@ def test_out_below_a_file_is_refused(run_main: RunMain, tmp_path: Path, photos: 
     assert (done.code, done.err) == (2, f"gen-dataset: {message}\n")
     assert run_main("out=file").err == "gen-dataset: out=file: is a file; expected a folder; choose another out\n"
     assert os.listdir(tmp_path) == ["file"]
-
-
-def test_profile_without_units_is_refused(run_main: RunMain, tmp_path: Path) -> None:
-    (tmp_path / "mine/noise").mkdir(parents=True)
-    (tmp_path / "mine/noise/bare.yaml").write_text("name: bare\nunits: null\na: 1\nb: 1\n")
-    done = run_main("--config-dir=mine", "noise=bare", "noise.black=subtracted")
-    assert (done.code, done.err) == (2, "gen-dataset: noise.units=null: expected one of dn, normalized\n")
-
-
-def test_own_options_are_used(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
-    (tmp_path / "mine/noise").mkdir(parents=True)
-    (tmp_path / "mine/noise/quiet.yaml").write_text(
-        "name: quiet\nunits: normalized\nblack: subtracted\na: 0.001\nb: 0\n"
-    )
-    done = run_main(
-        "--config-dir", "mine", "noise=quiet", "noise.bits=null", f"source.root={photos}", "n_jobs=1", "--cfg", "job"
-    )
-    assert (done.code, yaml.safe_load(done.out)["noise"]["name"]) == (0, "quiet")
 
 
 # Help and printed settings --------------------------------------------------------------------------------------------
@@ -317,43 +293,6 @@ def test_plan_writes_nothing(run_main: RunMain, tmp_path: Path, photos: Path) ->
     assert done.code == 0
     assert messages(done.err) == []
     assert list(tmp_path.iterdir()) == []
-
-
-def bytes_in(text: str) -> int:
-    return int(re.search(r"^bytes +([\d,]+) in shards, [\d.]+ MB$", text, re.MULTILINE)[1].replace(",", ""))  # type: ignore[index]
-
-
-@pytest.mark.parametrize("shard", [1, 5, 8])
-def test_plan_all_reports_exact_bytes_of_shards(
-    shard: int, run_main: RunMain, make: Make, photos: Path, tmp_path: Path
-) -> None:
-    done = run_main("plan", "--all", f"source.root={photos}", f"output.pairs_per_shard={shard}")
-    make(photos, tmp_path / "ds", f"output.pairs_per_shard={shard}")
-    assert bytes_in(done.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
-
-
-def test_plan_all_reports_exact_bytes_with_failing_photographs(run_main: RunMain, make: Make, tmp_path: Path) -> None:
-    source = fill(tmp_path / "p", 5)
-    for name in ("000.png", "002.png", "003.png"):
-        (source / name).write_bytes(b"")
-    done = run_main("plan", "--all", "source.root=p", "output.pairs_per_shard=2")
-    make(source, tmp_path / "ds", "output.pairs_per_shard=2")
-    assert bytes_in(done.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
-
-
-def test_plan_estimates_bytes_from_a_sample(run_main: RunMain, make: Make, tmp_path: Path) -> None:
-    source = fill(tmp_path / "p", 40)
-    done = run_main("plan", "source.root=p")
-    make(source, tmp_path / "ds")
-    about = re.search(r"^bytes +about ([\d,]+)", done.out, re.MULTILINE)
-    assert about is not None, done.out
-    real = sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
-    assert int(about[1].replace(",", "")) == real
-
-
-def test_plan_names_failing_photographs_and_reasons(run_main: RunMain, tmp_path: Path) -> None:
-    (fill(tmp_path / "p", 1) / "empty.png").touch()
-    assert re.search(r"^fails +empty.png: empty$", run_main("plan", "source.root=p").out, re.MULTILINE)
 
 
 def test_plan_prints_converted_noise_parameters(run_main: RunMain, photos: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from helpers.commands import RunMain, environment, messages
-from helpers.datasets import Make, TreeHash
+from helpers.datasets import Make, TreeHash, sweep_rows
 from helpers.photographs import fill
 from helpers.processes import WAIT_S
 
@@ -29,11 +28,6 @@ COMBINATIONS = [
 FOLDERS = [f"camera={camera},noise={noise}" for camera, noise in COMBINATIONS]
 
 
-def table(folder: Path) -> list[dict[str, str]]:
-    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     return fill(tmp_path / "p", 3)
@@ -47,7 +41,7 @@ def test_every_combination_has_its_own_dataset_and_row(
     assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*FOLDERS, "sweep.csv"])
     assert sorted(os.listdir(tmp_path)) == ["p", "sweep"]
 
-    rows = table(tmp_path / "sweep")
+    rows = sweep_rows(tmp_path / "sweep")
     assert [row["folder"] for row in rows] == [row["overrides"] for row in rows] == FOLDERS
     assert [(row["camera"], row["noise"]) for row in rows] == COMBINATIONS
     assert [(row["rows"], row["failed"], row["exit"]) for row in rows] == [("3", "0", "0")] * 4
@@ -70,7 +64,7 @@ def test_sweep_csv_has_the_columns_of_the_contract(run_main: RunMain, source: Pa
 
 def test_sweep_csv_agrees_with_the_datasets(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     run_main("-m", "gains=paper_max,fig6_bottom", "source.root=p", "out=sweep", "n_jobs=1")
-    for row in table(tmp_path / "sweep"):
+    for row in sweep_rows(tmp_path / "sweep"):
         folder = tmp_path / "sweep" / row["folder"]
         sites = json.loads((folder / "dataset.json").read_text())["sites"]
 
@@ -86,7 +80,7 @@ def test_sweep_csv_of_version_0_1_keeps_its_rows(run_main: RunMain, source: Path
     (tmp_path / "sweep/sweep.csv").write_text(old)
     run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
 
-    rows = table(tmp_path / "sweep")
+    rows = sweep_rows(tmp_path / "sweep")
     assert [(row["folder"], row["rows"], row["seed"], row["exit"]) for row in rows] == [
         ("seed=7", "3", "", "0"), ("seed=1", "3", "1", "0"), ("seed=2", "3", "2", "0"),
     ]  # fmt: skip
@@ -95,14 +89,14 @@ def test_sweep_csv_of_version_0_1_keeps_its_rows(run_main: RunMain, source: Path
 def test_sweeps_over_other_keys_share_one_table(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     for swept in ("seed=1,2", "isp=linear,srgb"):
         run_main("-m", swept, "source.root=p", "out=sweep", "n_jobs=1")
-    rows = table(tmp_path / "sweep")
+    rows = sweep_rows(tmp_path / "sweep")
     assert sorted((row["seed"], row["isp"]) for row in rows) == [("", "linear"), ("", "srgb"), ("1", ""), ("2", "")]
 
 
 def test_failing_job_gives_one_line_and_decides_exit_code(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     done = run_main("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
     assert done.code == 2
-    assert [(row["folder"], row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [
+    assert [(row["folder"], row["rows"], row["failed"], row["exit"]) for row in sweep_rows(tmp_path / "sweep")] == [
         ("gains.red=0", "", "", "2"), ("gains.red=2", "3", "0", "0"),
     ]  # fmt: skip
     assert (tmp_path / "sweep/gains.red=2/dataset.json").exists()
@@ -114,7 +108,7 @@ def test_unknown_option_in_a_job_does_not_stop_others(run_main: RunMain, source:
     done = run_main("source.root=p", "-m", "camera=sony_a7r,nosuch,nexus_6p,leica", "out=sweep", "n_jobs=1")
     assert done.code == 2
     assert "gen-dataset: camera=nosuch: camera=nosuch: no such option; expected one of choice, " in done.err
-    assert [(row["folder"], row["exit"]) for row in table(tmp_path / "sweep")] == [
+    assert [(row["folder"], row["exit"]) for row in sweep_rows(tmp_path / "sweep")] == [
         ("camera=sony_a7r", "0"), ("camera=nosuch", "2"), ("camera=nexus_6p", "0"), ("camera=leica", "2"),
     ]  # fmt: skip
 
@@ -142,7 +136,8 @@ def test_sweep_of_refused_jobs_writes_nothing(run_main: RunMain, source: Path, t
 def test_failed_images_are_counted_and_exit_code_is_the_worst(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     (source / "001.png").write_bytes(b"")
     assert run_main("-m", "gains.red=1,2", "source.root=p", "out=sweep", "n_jobs=1").code == 3
-    assert [(row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [("3", "1", "3")] * 2
+    rows = sweep_rows(tmp_path / "sweep")
+    assert [(row["rows"], row["failed"], row["exit"]) for row in rows] == [("3", "1", "3")] * 2
     assert run_main("-m", "gains.red=2,0", "source.root=p", "out=sweep", "n_jobs=1").code == 2
 
 
@@ -158,18 +153,6 @@ def test_repeated_sweep_and_its_plan_change_nothing(run_main: RunMain, source: P
 
     run_main("plan", *sweep)
     assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
-
-
-def test_rows_of_a_second_sweep_follow_earlier_rows(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    for seeds in ("seed=2,1", "seed=3,1"):
-        run_main("-m", seeds, "source.root=p", "out=sweep", "n_jobs=1")
-    assert [row["folder"] for row in table(tmp_path / "sweep")] == ["seed=2", "seed=1", "seed=3"]
-
-
-def test_folder_names_omit_keys_that_do_not_decide_data(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    excluded = ("n_jobs=1", "out=sweep", "source.root=p", "check_disk=false", "self_test=go_on", "hydra.mode=MULTIRUN")
-    run_main("-m", "seed=1", *excluded)
-    assert sorted(os.listdir(tmp_path / "sweep")) == ["seed=1", "sweep.csv"]
 
 
 def test_sweep_without_values_has_one_folder(run_main: RunMain, source: Path, tmp_path: Path) -> None:
@@ -241,7 +224,7 @@ def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash:
     done = run_main(*arguments)
     assert (done.code, done.out.count("nothing to do") >= 1) == (0, True)
     assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*folders, "sweep.csv"])
-    assert [row["exit"] for row in table(tmp_path / "sweep")] == ["0"] * 4
+    assert [row["exit"] for row in sweep_rows(tmp_path / "sweep")] == ["0"] * 4
     for (camera, noise), folder in zip(COMBINATIONS, folders, strict=True):
         make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}", "output.pairs_per_shard=1")
         assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
@@ -251,12 +234,6 @@ def test_too_many_jobs_are_refused_at_once(run_main: RunMain, tmp_path: Path) ->
     done = run_main("-m", "seed=range(0,1000000000)", "out=sweep")
     assert (done.code, done.err) == (2, "gen-dataset: a sweep of more than 100000 jobs; expected fewer values\n")
     assert os.listdir(tmp_path) == []
-
-
-def test_interval_is_refused_in_one_line(run_main: RunMain) -> None:
-    done = run_main("-m", "gains.red=interval(1,2)")
-    assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "gains.red=interval(1,2): an interval has no list of values; expected choice or range" in done.err
 
 
 def test_processes_that_share_a_folder_keep_each_others_rows(tmp_path: Path) -> None:
@@ -272,7 +249,8 @@ def test_processes_that_share_a_folder_keep_each_others_rows(tmp_path: Path) -> 
         for name in "ab"
     ]
     assert [process.wait(WAIT_S) for process in running] == [0, 0]
-    assert sorted(row["folder"] for row in table(tmp_path)) == sorted(f"{name}{i}" for name in "ab" for i in range(60))
+    names = sorted(f"{name}{i}" for name in "ab" for i in range(60))
+    assert sorted(row["folder"] for row in sweep_rows(tmp_path)) == names
     assert os.listdir(tmp_path) == ["sweep.csv"]
 
 
@@ -288,8 +266,9 @@ def test_unreadable_sweep_csv_ends_in_one_line(
     assert "sweep/sweep.csv: " in done.err
 
 
-def test_names_omit_keys_of_the_executor() -> None:
+def test_names_omit_keys_that_do_not_decide_data() -> None:
     overrides = ["seed=1", "executor=dask", "executor.address=x", "append=true", "+experiment=e", "output.dtype=uint16"]
+    overrides += ["n_jobs=1", "out=sweep", "source.root=p", "check_disk=false", "self_test=go_on"]
     assert named_overrides(overrides) == ["+experiment=e", "output.dtype=uint16", "seed=1"]
 
 
@@ -302,7 +281,7 @@ def test_shortened_name_begins_with_the_swept_keys(run_main: RunMain, source: Pa
     globs = ",".join(f"*{number:020d}" for number in range(9))
     run = ("-m", "source.limit=1,2", f"source.include=['*.png',{globs}]", "source.root=p", "out=sweep", "n_jobs=1")
     assert run_main(*run).code == 0
-    row, other = table(tmp_path / "sweep")
+    row, other = sweep_rows(tmp_path / "sweep")
     assert [row["folder"].partition(",")[0] for row in (row, other)] == ["source.limit=1", "source.limit=2"]
     assert max(len(row["folder"]) for row in (row, other)) <= 200
 

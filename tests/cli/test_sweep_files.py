@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import pytest
 import yaml
 from helpers.cases import slow_except
 from helpers.commands import RunMain
-from helpers.datasets import TreeHash
+from helpers.datasets import TreeHash, sweep_rows
 from helpers.photographs import fill
 
 from unprocess_gen.config.composition import OptionFolders
@@ -38,11 +36,6 @@ def mine(tmp_path: Path) -> Path:
 def write(path: Path, content: dict[str, Any], header: str = "# @package _global_\n") -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(header + yaml.safe_dump(content, sort_keys=False))
-
-
-def table(folder: Path) -> list[dict[str, str]]:
-    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def jobs(*overrides: str, own: Path | None = None, multirun: bool = False) -> list[str]:
@@ -81,22 +74,10 @@ def test_sweep_in_a_file_equals_the_command_line(
     done = run_main(*arguments, *REST)
     assert done.code == 0, done.err
     assert sorted(os.listdir(tmp_path / "sweep")) == sorted(os.listdir(swept)) == sorted([*NAMED, "sweep.csv"])
-    rows, expected = table(tmp_path / "sweep"), table(swept)
+    rows, expected = sweep_rows(tmp_path / "sweep"), sweep_rows(swept)
     assert [row | {"seconds": ""} for row in rows] == [row | {"seconds": ""} for row in expected]
     for name in NAMED:
         assert tree_hash(tmp_path / "sweep" / name) == tree_hash(swept / name)
-
-
-def test_repeating_a_sweep_in_a_file_changes_nothing(
-    mine: Path, swept: Path, run_main: RunMain, tmp_path: Path
-) -> None:
-    write(mine / "sweep/two.yaml", SWEEP)
-    shutil.copytree(swept, tmp_path / "sweep")
-    before = (tmp_path / "sweep/sweep.csv").read_bytes()
-
-    done = run_main("+sweep=two", *REST)
-    assert (done.code, done.out.count("nothing to do")) == (0, 4)
-    assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
 
 
 def test_settings_next_to_the_params_hold_for_every_job(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
@@ -277,15 +258,8 @@ def test_shipped_sweep_runs_and_shows_its_places(
 ) -> None:
     done = run_main(f"+sweep={name}", "source.root=p", "out=sweep", "n_jobs=1")
     assert done.code == 0, done.err
-    assert [row["exit"] for row in table(tmp_path / "sweep")] == ["0"] * SHIPPED[name]
+    assert [row["exit"] for row in sweep_rows(tmp_path / "sweep")] == ["0"] * SHIPPED[name]
     assert place in done.err
-
-
-def test_plan_of_a_sweep_in_a_file_prints_totals(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("plan", "+sweep=cameras", "source.root=p", "n_jobs=1")
-    assert done.code == 0, done.err
-    assert "totals    4 jobs: 4 pairs in 4 shards, " in done.out
-    assert sorted(os.listdir(tmp_path)) == ["mine", "p"]
 
 
 def test_cfg_job_prints_every_job_of_a_sweep(mine: Path, run_main: RunMain) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from helpers.commands import Cli, RunMain
-from helpers.datasets import TreeHash
+from helpers.datasets import TreeHash, sweep_rows
 from helpers.photographs import fill
 
 needs_joblib_launcher = pytest.mark.skipif(
@@ -52,11 +51,6 @@ ConfigStore.instance().store(
 '''
 
 
-def table(folder: Path) -> list[dict[str, str]]:
-    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
 @pytest.mark.slow
 @needs_joblib_launcher
 @pytest.mark.parametrize("n_jobs", [1, 2])
@@ -71,7 +65,7 @@ def test_joblib_launcher_generates_the_datasets_of_a_sweep(
 
     folders = ["camera=sony_a7r", "camera=nexus_6p"]
     assert sorted(os.listdir(tmp_path / "launched")) == sorted([".hydra", *folders, "sweep.csv"])
-    launched, own = table(tmp_path / "launched"), table(tmp_path / "own")
+    launched, own = sweep_rows(tmp_path / "launched"), sweep_rows(tmp_path / "own")
     assert [row | {"seconds": ""} for row in launched] == [row | {"seconds": ""} for row in own]
     for folder in folders:
         assert tree_hash(tmp_path / "launched" / folder) == tree_hash(tmp_path / "own" / folder)
@@ -83,7 +77,7 @@ def test_failing_job_of_a_launcher_decides_the_exit_code(run_main: RunMain, tmp_
     done = run_main("-m", "gains.red=0,2", "source.root=p", "n_jobs=1", "out=sweep", *IN_PROCESS)
     assert done.code == 2
     assert done.err.count("gains.red=0: expected a gain above 0") == 1
-    assert [(row["folder"], row["exit"]) for row in table(tmp_path / "sweep")] == [
+    assert [(row["folder"], row["exit"]) for row in sweep_rows(tmp_path / "sweep")] == [
         ("gains.red=0", "2"), ("gains.red=2", "0"),
     ]  # fmt: skip
 
@@ -98,7 +92,7 @@ def test_launcher_runs_a_sweep_in_a_file(run_main: RunMain, tmp_path: Path) -> N
     )
     done = run_main("+sweep=seeds", "--config-dir", "mine", "source.root=p", "n_jobs=1", "out=sweep")
     assert done.code == 0, done.err
-    assert [(row["folder"], row["seed"], row["exit"]) for row in table(tmp_path / "sweep")] == [
+    assert [(row["folder"], row["seed"], row["exit"]) for row in sweep_rows(tmp_path / "sweep")] == [
         ("seed=1", "1", "0"), ("seed=2", "2", "0"),
     ]  # fmt: skip
 
@@ -113,7 +107,7 @@ def test_sweeper_plugin_chooses_the_jobs(cli: Cli, tmp_path: Path) -> None:
         PYTHONPATH=path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert [(row["folder"], row["seed"], row["rows"]) for row in table(tmp_path / "sweep")] == [
+    assert [(row["folder"], row["seed"], row["rows"]) for row in sweep_rows(tmp_path / "sweep")] == [
         ("seed=3", "3", "1"), ("seed=4", "4", "1"),
     ]  # fmt: skip
 

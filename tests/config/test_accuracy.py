@@ -134,19 +134,6 @@ def test_plan_contains_the_methods_of_its_tier(settings: Settings, noise: str, s
     assert plan.accuracy.methods == choose_methods(config.accuracy, noise == "noise=nikon_d850")
 
 
-@pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=sony_a7s2"])
-def test_reference_and_exact_give_equal_pairs(settings: Settings, noise: str, scene: np.ndarray) -> None:
-    plans = {}
-    for tier in ("reference", "exact"):
-        config = settings(noise, f"accuracy={tier}")
-        plans[tier] = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
-    readable, fused = (make_pair(scene[:24, :31], plan) for plan in plans.values())
-
-    assert np.array_equal(readable.clean, fused.clean)
-    assert np.array_equal(readable.noisy, fused.noisy)
-    assert readable.counts == fused.counts
-
-
 def test_reference_tier_uses_the_exact_table_of_the_curve(
     settings: Settings, scene: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -84,13 +84,6 @@ def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(
     assert "the same as ds" in run_main("again", "ds", "out=again", *source).out
 
 
-@pytest.mark.slow
-def test_experiments_can_be_swept(clip: Path, run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("-m", f"+{RECIPE}=ipol_demo,eld_low_light", f"source.root={clip}", "out=sweep", "n_jobs=1")
-    assert done.code == 0
-    assert (tmp_path / f"sweep/+{RECIPE}=eld_low_light/manifest.csv").exists()
-
-
 @pytest.mark.parametrize(
     ("argument", "complaint"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,11 +11,14 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.pipeline import generate as runner
 
 
-def text_rows(out: Path) -> list[dict[str, str]]:
-    """Return the rows of a manifest as Python's csv module reads them."""
-    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
+def text_rows(out: Path, name: str = "manifest.csv") -> list[dict[str, str]]:
+    """Return the rows of a manifest, or of another table, as Python's csv module reads them."""
+    with (out / name).open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream, strict=True))
 
+
+sweep_rows = functools.partial(text_rows, name="sweep.csv")
+"""Return the rows of the table of a sweep."""
 
 Settings = Callable[..., Config]
 """Type of the fixture `settings`."""

@@ -20,7 +20,6 @@ import unprocess_gen as ug
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.pipeline.replay import PairRegenerator
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_pairs
@@ -150,15 +149,6 @@ def test_dither_keeps_the_mean_of_fractions(tmp_path: Path) -> None:
         assert pair.noisy[site].mean() == pytest.approx(mean_dn, abs=5 * 0.6 / 128)
 
 
-def test_variance_is_that_of_shot_noise_and_dark_frames(tmp_path: Path) -> None:
-    save_frames(tmp_path, 6, shape=(512, 512), std=20.0)
-    config = ug.load_config([*NOISE, f"noise.dark_frames={tmp_path}", "effects.prnu=off", "effects.dead_pixels=off"])
-    pair = ug.make_pair(np.full((512, 512, 3), 60, np.uint8), config)
-    residual = pair.noisy.astype(float) - pair.clean
-    expected = pair.plan.noise.a_dn * (float(pair.clean.mean()) - 1024) + pair.plan.noise.b_dn2 + 1 / 6
-    assert residual.var() == pytest.approx(expected, rel=0.05)
-
-
 def test_jobs_and_file_names_change_no_byte(
     made: Path, pictures: Path, darks: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
@@ -203,18 +193,6 @@ def test_other_frames_are_refused_by_again(made: Path, run_main: RunMain, tmp_pa
     assert not (tmp_path / "again").exists()
 
 
-def test_damaged_pair_is_repaired(made: Path, run_main: RunMain, tmp_path: Path, tree_hash: TreeHash) -> None:
-    copy = Path(shutil.copytree(made, tmp_path / "ds"))
-    shard = copy / "shards/shard-00000.tar"
-    content = bytearray(shard.read_bytes())
-    content[content.index(b".noisy") + 1200] ^= 1
-    shard.write_bytes(content)
-    done = run_main("verify", copy, "--repair")
-    assert done.code == 0, done.err
-    assert tree_hash(copy) == tree_hash(made)
-    assert run_main("verify", copy, "--regenerate", "2").code == 0
-
-
 def test_resume_refuses_changed_frames(pictures: Path, make: Make, tmp_path: Path) -> None:
     save_frames(tmp_path / "d", 2)
     make(pictures, tmp_path / "ds", *NOISE, f"noise.dark_frames={tmp_path}/d")
@@ -239,15 +217,6 @@ def test_dataset_json_describes_the_frames(made: Path, darks: Path) -> None:
     assert facts["root"] == str(darks)
     assert (facts["count"], facts["sizes"], facts["black_dn"]) == (3, ["90x70"], 512)
     assert facts["std_dn"] == pytest.approx(SCALE * 3 * (1 + 1 / 4 + 1 / 9) ** 0.5, rel=0.1)
-
-
-def test_pairs_of_patches_are_crops(pictures: Path, darks: Path, make: Make, made: Path, tmp_path: Path) -> None:
-    make(pictures, tmp_path / "ds", *NOISE, f"noise.dark_frames={darks}", "source.patch=[grid, 32]")
-    full = {str(row["source"]): pair for pair in RawPairs(made) for row in [pair.row] if row["draw"] == 0}
-    for sample in RawPairs(tmp_path / "ds"):
-        y, x = int(sample.row["patch_y"] or 0), int(sample.row["patch_x"] or 0)
-        complete = full[str(sample.row["source"])].noisy
-        np.testing.assert_array_equal(sample.noisy, complete[y : y + 32, x : x + 32])
 
 
 def test_plan_describes_frames_and_what_they_contain(run_main: RunMain, darks: Path, pictures: Path) -> None:

@@ -22,8 +22,6 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import DarkFrames
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
-from unprocess_gen.reports.noise_check.checks import failed_checks, pair_sums, threshold
-from unprocess_gen.reports.noise_check.scores import scores_of
 from unprocess_gen.sources.dark_frames import open_dark_frames
 
 NOISE = ("noise=sony_a7s2", "noise.iso=1600", "camera=identity", "gains=unity", "sensor.bits=14",
@@ -167,24 +165,6 @@ def test_map_is_scaled_like_its_frame(darks: Path, ramp: Path) -> None:
     y, x = scaled.plan.noise.dark.shift
     expected = (frame.astype(int) - RAMP - BLACK_DN)[y:, x:] * (16383 - 1024) / (16300 - 512)
     assert np.abs(scaled.noisy[: SHAPE[0] - y, : SHAPE[1] - x] - 1024.0 - expected).max() <= 1
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_kernels_and_reference_agree_on_a_map(seed: int, darks: Path, ramp: Path) -> None:
-    noisy = [
-        ug.make_pair(pixels(seed, 101, 213), with_map(darks, ramp, f"seed={seed}", f"accuracy={tier}", *NARROW)).noisy
-        for tier in ("exact", "reference")
-    ]
-    np.testing.assert_array_equal(*noisy)
-
-
-@pytest.mark.parametrize("overrides", [(), (*NARROW, "accuracy=fast"), ("effects.all=on",)])
-def test_noise_check_raises_no_alarm(overrides: tuple[str, ...], darks: Path, ramp: Path) -> None:
-    config, _, access = open_dark_frames(with_map(darks, ramp, *overrides))
-    pair = ug.make_pair(pixels(3, 200, 300), config)
-    sums = pair_sums(pair.clean, pair.noisy, pair.row, access)
-    assert sums is not None and sums.sites > 0.3 * pair.clean.size
-    assert failed_checks("", scores_of(sums), threshold(1)) == []
 
 
 # Files and choice -----------------------------------------------------------------------------------------------------

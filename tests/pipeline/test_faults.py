@@ -484,12 +484,6 @@ def test_disk_that_becomes_read_only_ends_the_run_with_5(
 # Deleted folders ------------------------------------------------------------------------------------------------------
 
 
-def test_out_below_a_file_is_refused_with_2(six: Path, run_main: RunMain, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    done = run_main(f"source.root={six}", "out=file/ds", "n_jobs=1")
-    assert done == (2, "", "gen-dataset: out=file/ds: cannot be written (Not a directory); choose another out\n")
-
-
 @pytest.mark.parametrize("number", range(1, FULL_COUNT + 1))
 def test_out_deleted_after_any_shard_ends_the_run_with_5(
     number: int, six: Path, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

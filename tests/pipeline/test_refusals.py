@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.commands import COMMAND, RunMain, environment, messages
+from helpers.commands import RunMain, environment, messages
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 from helpers.processes import ONE
@@ -202,12 +202,6 @@ def test_lost_01_manifest_is_regenerated_from_the_sources(copy: Path) -> None:
         (copy / "ds" / name).unlink()
     assert {step.exit_code for step in repair(copy / "ds", str(copy / "p"))} == {0}
     assert {name: (copy / "ds" / name).read_bytes() for name in before} == before
-
-
-def test_01_dataset_is_replayed(copy: Path) -> None:
-    as_version_01(copy / "ds")
-    results = list(replay(read_rows(copy / "ds/manifest.csv"), str(copy / "p")))
-    assert [result.exit_code for result in results] == [0, 0, 0]
 
 
 def test_finished_01_dataset_is_complete(copy: Path, make: Make) -> None:
@@ -409,10 +403,3 @@ def test_generate_restores_the_threads_of_opencv(settings: Settings, tmp_path: P
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
-
-
-def test_run_into_a_full_stderr_completes(tmp_path: Path) -> None:
-    with Path("/dev/full").open("w") as full:
-        command = [str(COMMAND), "source.limit=1", "n_jobs=1"]
-        done = subprocess.run(command, cwd=tmp_path, env=environment(), stderr=full, timeout=60, check=False)
-    assert done.returncode == 0 and verify(tmp_path / "ds") == []

@@ -88,19 +88,13 @@ def assert_flips_repaired(intact: Path, copy: Path, run_main: RunMain, name: str
     return repaired
 
 
+@pytest.mark.parametrize("count", [4, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FILES)
-def test_flipped_bit_is_repaired(name: str, intact: Path, copy: Path, run_main: RunMain, figure: Figure) -> None:
-    repaired = assert_flips_repaired(intact, copy, run_main, name, 4, seed=1)
-    figure("repair", f"{repaired} of 4 flipped bits repaired")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FILES)
-def test_hundred_flipped_bits_in_every_file_are_repaired(
-    name: str, intact: Path, copy: Path, run_main: RunMain, figure: Figure
+def test_flipped_bit_is_repaired(
+    name: str, count: int, intact: Path, copy: Path, run_main: RunMain, figure: Figure
 ) -> None:
-    repaired = assert_flips_repaired(intact, copy, run_main, name, 100, seed=2)
-    figure("repair", f"{repaired} of 100 flipped bits repaired")
+    repaired = assert_flips_repaired(intact, copy, run_main, name, count, seed=count)
+    figure("repair", f"{repaired} of {count} flipped bits repaired")
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name != "dataset.json"])

@@ -350,14 +350,6 @@ def test_damage_of_a_finished_dataset_is_reported(
         make(finished / "p", finished / "ds", TWO)
 
 
-def test_records_of_many_shards_are_deleted(begun: Path, make: Make) -> None:
-    """More files than one thread deletes at a time."""
-    for number in range(100, 300):
-        (begun / f"ds/.work/rows/{number:05d}.json").write_text("{}")
-    make(begun / "p", begun / "ds", TWO)
-    assert_complete(begun / "ds")
-
-
 # Lock and foreign files -----------------------------------------------------------------------------------------------
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -302,18 +301,6 @@ def test_arrays_are_the_same_in_every_tier(accuracy: str, packed: Path, photos: 
     make(photos, out, f"accuracy={accuracy}", "noise=brooks2019", *FLOATS)
     digests = [[(row["clean_xxh3"], row["noisy_xxh3"]) for *_, row in RawPairs(ds)] for ds in (packed, out)]
     assert digests[0] == digests[1]
-
-
-def test_rerun_does_nothing_and_another_dtype_is_refused(
-    packed: Path, photos: Path, run_main: RunMain, tree_hash: Callable[[Path], str]
-) -> None:
-    before = tree_hash(packed)
-    same = ("output.pairs_per_shard=5", "noise=brooks2019", f"source.root={photos}", f"out={packed}", *FLOATS)
-    assert "nothing to do" in run_main(*same).out
-    done = run_main(*same, "sensor.clip=sensor", "output.dtype=uint16")
-    assert done.code == 2
-    assert "output.dtype=uint16 (there: float32)" in done.err
-    assert tree_hash(packed) == before
 
 
 @pytest.mark.parametrize(

@@ -415,16 +415,6 @@ RATES_E = [(0, 0.3), (0, 6), (5.9, 9), (9, 66), (60, 65535)]
 """Ranges of rates with and between the limits of the methods for counts."""
 
 
-@pytest.mark.parametrize("read_std_dn", [0.0, 2**-6], ids=["shot", "shot and read"])
-@pytest.mark.parametrize(("low_e", "high_e"), RATES_E)
-def test_counts_equal_the_reference_at_every_rate(low_e: float, high_e: float, read_std_dn: float) -> None:
-    ramp = sweep(low_e, high_e, read_std_dn, 16)
-    two_numbers = ramp.plan.replace(physics=None, law="poisson", effects=TWO)
-    for plan in (ramp.plan, ramp.plan.replace(dtype=FLOAT32), two_numbers):
-        one = replace(ramp, plan=plan)
-        assert differences(simulate(one), simulate_reference(one)) == ""
-
-
 @functools.lru_cache(maxsize=1)
 def words_of_counts(key: int, height: int, width: int) -> np.ndarray:
     return words(key, "shot", (height, width))
