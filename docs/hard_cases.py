@@ -30,6 +30,7 @@ from unprocess_gen.simulation.reference import colour, isp
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.unprocess import apply_ccm, inverse_smoothstep, invert_gains_per_channel
+from unprocess_gen.sources.dark_shading import median_of, trimmed_mean
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.video import colours as video
 
@@ -389,6 +390,33 @@ def clip_bias() -> Figures:
     return float(biases[0]), float(biases[1])
 
 
+@case(
+    "rounding",
+    "variance that rounding adds to noisy − clean, DN²",
+    "x between integers",
+    "x an integer",
+)
+def rounding_variance() -> Figures:
+    """Return the variance that rounding adds to noisy minus clean, for many fractions of x, then for an integer."""
+    noise = 6.18 * by_inverse_cdf(words(2**20), normal_table())
+    added = [(np.rint(x + noise) - np.rint(x)).var() - noise.var() for x in (random(10).random(2**20), 0.0)]
+    return float(added[0]), float(added[1])
+
+
+@case("rounding", "mean of x − clean at sites of a black bar, DN", "x uniform within 0 to ½", "exact values")
+def black_bars() -> Figures:
+    """Return the mean that a check expects at clean values of black: of a dark area, and of exactly black sites."""
+    light = linear_table("smoothstep", 2.2, 256)[0] * 0.8
+    return 0.25, float(light * 15359 - np.rint(light * 15359))
+
+
+@case("rounding", "clipped sites that are counted at an exposure ratio of 10, %", "after the ratio", "before the ratio")
+def clipping_before_ratio() -> Figures:
+    """Return how much light from 0 to 1.12 is counted as clipped at white: divided by the ratio first, then ours."""
+    light = random(11).random(2**20) * 1.12
+    return float((light / 10 > 1).mean() * 100), float((light > 1).mean() * 100)
+
+
 # ---------------------------------------------------------------------------------------------------------------- noise
 
 
@@ -569,6 +597,35 @@ def full_well_mean() -> Figures:
     """Return the mean of frames at a full well of 10,000 e⁻ with shot noise, electrons from it: clipped each, mean."""
     drawn = poisson(words(2**18), np.full(2**18, 10_000.0))
     return float(np.minimum(drawn, 10_000).mean() - 10_000), float(np.minimum(10_000.0, 10_000) - 10_000)
+
+
+@case("noise", "standard deviation at a full well, read noise of 4.7 DN", "limit of the DN", "limit of the electrons")
+def noise_behind_full_well() -> Figures:
+    """Return the deviation at a full well of 14,387 DN in twice as much light: the well limits DN, then electrons."""
+    read_dn = 4.7 * by_inverse_cdf(words(2**18), normal_table())
+    limit_dn, light_dn = 14387.0, 28774.0
+    return float(np.minimum(light_dn + read_dn, limit_dn).std()), float((min(light_dn, limit_dn) + read_dn).std())
+
+
+@case("noise", "share of sites beyond 10 standard deviations, shape −0.2429", "normal", "Tukey's lambda")
+def heavy_tails() -> Figures:
+    """Return the probability of more than ten standard deviations: of a normal, then of Tukey's distribution."""
+    values = by_inverse_cdf(words(2**20), tukey_table(-0.2429))
+    return math.erfc(10 / math.sqrt(2)), float((np.abs(values) > 10).mean())
+
+
+@case(
+    "noise",
+    "black level of dark frames with a mean of 14.76 DN, DN from it",
+    "median",
+    "trimmed mean",
+)
+def fractional_black() -> Figures:
+    """Return the error of the black level of frames with a fractional mean: median, then mean."""
+    frame = np.rint(14.76 + 3.09 * by_inverse_cdf(words(2**20), normal_table())).clip(0).astype(np.int64)
+    frame[:: 2**14] = 4000  # hot pixels
+    counts = np.bincount(frame)
+    return median_of(counts) - 14.76, trimmed_mean(counts) - 14.76
 
 
 # --------------------------------------------------------------------------------------------------------------- others

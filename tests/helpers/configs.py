@@ -79,7 +79,8 @@ def _option(group: str, name: str) -> Any:
     file = conf_dir() / group / f"{name}.yaml"
     if "${" in file.read_text(encoding="utf-8"):
         return None
-    return _object(OmegaConf.merge(writable_node(type(getattr(Config(), group))), OmegaConf.load(file)))
+    top = OmegaConf.load(conf_dir() / "config.yaml").get(group, {})
+    return _object(OmegaConf.merge(writable_node(type(getattr(Config(), group))), OmegaConf.load(file), top))
 
 
 def _object(node: Container) -> Any:

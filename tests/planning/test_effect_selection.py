@@ -456,11 +456,18 @@ def test_dead_pixels_are_simulated_from_a_tenth_of_an_outlier(
 
 def test_dead_pixels_of_black_images_differ_by_the_black_level(base: tuple[Config, Physics]) -> None:
     config, physics = base
-    physics = replace(physics, dead_pixel_share=1e-4)
+    physics = replace(physics, dead_pixel_share=1e-4, dead_pixel_level=0.0)
     dark = SignalRange(0.0, 0.0)
     assert "dead_pixels" in chosen(config, physics, FACTS, dark)
     config = replace(config, sensor=replace(config.sensor, black_level_dn=0))
     assert "dead_pixels" not in chosen(config, physics, FACTS, dark)
+
+
+def test_dead_pixels_that_read_black_are_invisible_in_black_images_only(base: tuple[Config, Physics]) -> None:
+    config, physics = base
+    physics = replace(physics, dead_pixel_share=1e-4, dead_pixel_level=1.0)
+    assert "dead_pixels" not in chosen(config, physics, FACTS, SignalRange(0.0, 0.0))
+    assert "dead_pixels" in chosen(config, physics, FACTS, LIGHT)
 
 
 @given(rate=st.floats(0, 1e6))

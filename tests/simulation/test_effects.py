@@ -294,11 +294,13 @@ def test_hot_and_dead_pixels_differ_between_sensor_units(hot: np.ndarray) -> Non
     assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
 
 
-def test_dead_pixels_read_0_and_have_given_fraction() -> None:
-    plan = plan_with("read", "dead_pixels", dead_pixel_share=SHARE, read_std_dn=30.0)
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
+def test_dead_pixels_read_a_fraction_of_black_and_have_given_fraction(level: float) -> None:
+    plan = plan_with("read", "dead_pixels", dead_pixel_share=SHARE, dead_pixel_level=level, read_std_dn=30.0)
     frame = make_pair(flat(40000), plan).noisy
-    assert bounds_off(frame == 0, SHARE, SHARE * (1 - SHARE), 1) <= 1
-    assert frame[frame > 0].min() > 30000
+    dead_dn = level * BLACK
+    assert bounds_off(frame == dead_dn, SHARE, SHARE * (1 - SHARE), 1) <= 1
+    assert frame[frame != dead_dn].min() > 30000
 
 
 # Fixed patterns -------------------------------------------------------------------------------------------------------

@@ -484,7 +484,9 @@ def test_pixels_at_the_limit_of_a_share_equal_the_reference(effect: str) -> None
     found = []
     for word in words(KEY, effect, (3, 70))[:, ::23].ravel().tolist():
         for share in (word / 2**32, (word + 1) / 2**32):
-            shares = {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0} | {f"{effect.removesuffix('s')}_share": share}
+            shares = {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0, "dead_pixel_level": 0.3} | {
+                f"{effect.removesuffix('s')}_share": share
+            }
             physics = replace(plan.noise.physics, **numbers, **shares, hot_pixel_e=2e4, full_well_e=1e6, body_key=KEY)
             one = Case(srgb, plan.replace(physics=physics), (0, 0))
             found.append(simulate(one).noisy)

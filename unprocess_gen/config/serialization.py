@@ -19,6 +19,7 @@ from unprocess_gen.config.interpretation import (
     saturated_as,
     shading_place,
     uses_assumed,
+    uses_dark_frames,
     uses_physics,
 )
 from unprocess_gen.config.option_files import conf_dir
@@ -75,6 +76,8 @@ def dataset_yaml(config: Config) -> str:
         settings["noise"].pop("dark_shading", None)  # dark_shading_sha256 identifies the map
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
+    if not uses_dark_frames(config.noise):
+        settings["noise"].pop("dark_frames_level", None)  # decides nothing
     if not is_physical(config.noise):
         settings["effects"].pop("scope", None)  # decides nothing
     if not (config.accuracy.law_distance and uses_physics(config.noise)):

@@ -50,11 +50,12 @@ class BrightPixels(NamedTuple):
 
 
 class DeadPixels(NamedTuple):
-    """Share of the pixels of a body that read 0, chosen by words of ``stream``."""
+    """Share of the pixels of a body that read ``value_dn``, chosen by words of ``stream``."""
 
     body_key: int
     stream: str
     share: float
+    value_dn: float = 0.0
 
 
 class Patterns(NamedTuple):
@@ -69,7 +70,7 @@ class Patterns(NamedTuple):
     sites_dn : NormalPattern or None
         Offsets by site, DN; the clean frame can contain them.
     bright, dead : BrightPixels or None, DeadPixels or None
-        Defects: pixels with additional electrons, and pixels that read 0.
+        Defects: pixels with additional electrons, and pixels of one value.
     """
 
     light: RadialFactor | None = None

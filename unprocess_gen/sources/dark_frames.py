@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -205,7 +205,8 @@ def _described(
     median_dn = dark_shading.median_of(counts)
     stated_dn = noise.dark_frames_black_dn
     stated_dn = _black_level(folder, blacks) if stated_dn is None else stated_dn
-    black_dn = float(median_dn) if stated_dn is None else stated_dn
+    level = dark_shading.BLACK_LEVELS[noise.dark_frames_level]
+    black_dn = float(level(counts)) if stated_dn is None else stated_dn
     if abs(median_dn - black_dn) > BRIGHTEST_MEDIAN * span_dn:
         raise ConfigError(
             f"noise.dark_frames={folder.folder}: the median of the frames is {median_dn} DN, and black is {black_dn:g} "
@@ -220,19 +221,24 @@ def _described(
         _, variance_dn2 = dark_shading.differences(folder.shading(folder.sha256), 0.0, folder.frames())
         shading = DarkShading(folder.sha256)
     elif shading_map is not None:
-        variance_dn2, shading = _around_map(folder, frames, shading_map, black_dn, stated_dn is not None)
+        derived = None if stated_dn is not None else level
+        variance_dn2, shading = _around_map(folder, frames, shading_map, black_dn, derived)
         black_dn = shading.black_dn or black_dn
     scale, dither_dn2 = (sensor.white_level_dn - sensor.black_level_dn) / span_dn, 1 / 12
     return DarkFrames(tuple(frames), folder.sha256, black_dn, scale, scale**2 * (variance_dn2 + dither_dn2), shading)
 
 
 def _around_map(
-    folder: DarkFolder, frames: Sequence[DarkFrame], shading_map: tuple[Path, str], black_dn: float, is_stated: bool
+    folder: DarkFolder,
+    frames: Sequence[DarkFrame],
+    shading_map: tuple[Path, str],
+    black_dn: float,
+    level: Callable[[NDArray[np.int64]], float] | None,
 ) -> tuple[float, DarkShading]:
     """Measure the variance of the frames around a map; ConfigError if the map does not fit the frames.
 
-    The median of the frames, ``black_dn`` without a stated black level, contains the median of the shading. For a map
-    above black, the black level is then the median of the frames minus the map.
+    ``level`` is the statistic that gives the black level, None if the level is stated. That of the frames contains the
+    shading. For a map above black, the black level is therefore that of the frames minus the map.
     """
     path, sha256 = shading_map
     values = folder.shading(sha256)
@@ -244,9 +250,11 @@ def _around_map(
             )
     is_above_black = dark_shading.is_above_black(values, black_dn)
     subtracted_dn = black_dn if is_above_black else 0.0
+    if is_above_black and level is not None:
+        level_dn, variance_dn2 = dark_shading.differences(values, subtracted_dn, folder.frames(), level)
+        if subtracted_dn + level_dn > 0:
+            return variance_dn2, DarkShading(sha256, subtracted_dn + level_dn, path.name)
     median_dn, variance_dn2 = dark_shading.differences(values, subtracted_dn, folder.frames())
-    if is_above_black and not is_stated and subtracted_dn + median_dn > 0:
-        return variance_dn2, DarkShading(sha256, subtracted_dn + median_dn, path.name)
     dark_shading.check_residual(path, median_dn, variance_dn2)
     return variance_dn2, DarkShading(sha256, subtracted_dn, path.name, median_dn)
 

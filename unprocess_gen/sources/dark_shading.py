@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -143,20 +143,37 @@ def median_of(counts: Counts) -> int:
     return int(np.searchsorted(np.cumsum(counts), (int(counts.sum()) + 1) // 2))
 
 
+def trimmed_mean(counts: Counts) -> float:
+    """Return the mean of counted integers, without the `FARTHEST` at both ends; exact."""
+    count, first, _ = _trimmed_sums(counts)
+    return float(Fraction(first, count))
+
+
 def trimmed_variance(counts: Counts, steps: int) -> float:
     """Return the variance of counted integers, without the `FARTHEST` at both ends; exact."""
+    count, first, second = _trimmed_sums(counts)
+    return float(Fraction(count * second - first * first, count * count * steps * steps))
+
+
+def _trimmed_sums(counts: Counts) -> tuple[int, int, int]:
+    """Return the number, the sum and the sum of squares of counted integers, without the `FARTHEST` at both ends."""
     cut = int(int(counts.sum()) * FARTHEST)
     ascending = np.cumsum(counts)
     kept = np.diff(np.clip(ascending, cut, int(ascending[-1]) - cut), prepend=cut)
     pairs = [(int(value), int(kept[value])) for value in np.flatnonzero(kept)]
     count = sum(times for _, times in pairs)
     first = sum(value * times for value, times in pairs)
-    second = sum(value * value * times for value, times in pairs)
-    return float(Fraction(count * second - first * first, count * count * steps * steps))
+    return count, first, sum(value * value * times for value, times in pairs)
 
 
-def differences(values: Map, black_dn: float, frames: Iterable[NDArray[Any]]) -> tuple[float, float]:
-    """Median and variance of dark frames minus a map and ``black_dn``, in steps of 1/16 DN; DN and DN² of the frames.
+BLACK_LEVELS: dict[str, Callable[[Counts], float]] = {"median": median_of, "mean": trimmed_mean}
+"""Statistic of counted pixels that is the black level, by the value of ``noise.dark_frames_level``."""
+
+
+def differences(
+    values: Map, black_dn: float, frames: Iterable[NDArray[Any]], level: Callable[[Counts], float] = median_of
+) -> tuple[float, float]:
+    """Level and variance of dark frames minus a map and ``black_dn``, in steps of 1/16 DN; DN and DN² of the frames.
 
     The variance is without the `FARTHEST` at both ends.
     """
@@ -167,7 +184,7 @@ def differences(values: Map, black_dn: float, frames: Iterable[NDArray[Any]]) ->
             steps = np.rint(difference * np.float32(STEPS_PER_DN)).astype(np.int64)
             places = np.clip(steps, -FARTHEST_STEPS, FARTHEST_STEPS) + FARTHEST_STEPS
             counts += np.bincount(places.reshape(-1), minlength=counts.size)
-    return (median_of(counts) - FARTHEST_STEPS) / STEPS_PER_DN, trimmed_variance(counts, STEPS_PER_DN)
+    return (level(counts) - FARTHEST_STEPS) / STEPS_PER_DN, trimmed_variance(counts, STEPS_PER_DN)
 
 
 def is_above_black(values: Map, black_dn: float) -> bool:

@@ -1,6 +1,8 @@
-"""Dead pixels: few pixels that read 0, a fixed pattern of the camera body."""
+"""Dead pixels: few pixels that do not respond to light, a fixed pattern of the camera body."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,47 +15,70 @@ from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 from unprocess_gen.simulation.slots import DeadPixels as DeadSlot
 
+if TYPE_CHECKING:
+    from unprocess_gen.simulation.effects import Physics
+
 
 class DeadPixelNumbers(Numbers):
-    """Fraction of pixels that read 0."""
+    """Fraction of dead pixels, and the value that they read."""
 
-    dead_pixel_share: float = number(0.0, "fraction of dead pixels, which read 0", high=1.0, highest=1.0)
+    dead_pixel_share: float = number(0.0, "fraction of dead pixels", high=1.0, highest=1.0)
+    dead_pixel_level: float = number(
+        0.0,
+        "value of dead pixels as a fraction of the black level; part of the effect dead_pixels",
+        high=1.0,
+        optional="0 DN",
+        highest=1.0,
+        since="0.3",
+    )
 
 
 class DeadPixels(Effect):
-    """Pixels that read 0 DN, which is below black."""
+    """Pixels that read the black level, or a lower value.
+
+    A pixel without light and without noise reads the black level, which the readout adds; version 0.2 set it to 0.
+    """
 
     name = "dead_pixels"
-    meaning = "few pixels that read 0; fixed pattern"
+    meaning = "few pixels that record no light; fixed pattern"
     cost_ns = 1.1
     numbers = DeadPixelNumbers
     is_fixed = has_outliers = True
 
     def output_dn(self, noisy_dn: Float, part: Part) -> Float:
-        """Set dead pixels to 0."""
-        return np.where(is_among(part.body_words("dead_pixels"), part.physics.dead_pixel_share), 0.0, noisy_dn)
+        """Set dead pixels to their value."""
+        physics = part.physics
+        dead_dn = dead_pixel_dn(physics, part.plan.sensor.black_level_dn)
+        return np.where(is_among(part.body_words("dead_pixels"), physics.dead_pixel_share), dead_dn, noisy_dn)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict pixels that lose their signal."""
-        depth_dn = frame.black_level_dn + level_dn
+        depth_dn = frame.black_level_dn + level_dn - dead_pixel_dn(frame.physics, frame.black_level_dn)
         return rare_pixels(frame, frame.physics.dead_pixel_share, depth_dn, depth_dn * depth_dn, masking)
 
     def outliers(self, frame: FrameFacts, level_dn: float, masking: float) -> float:
-        """Predict all dead pixels if 0 is farther from the signal than one standard deviation."""
-        depth_dn = frame.black_level_dn + level_dn
+        """Predict all dead pixels if their value is farther from the signal than one standard deviation."""
+        depth_dn = frame.black_level_dn + level_dn - dead_pixel_dn(frame.physics, frame.black_level_dn)
         return frame.physics.dead_pixel_share if depth_dn * depth_dn > masking else 0.0
 
     def slots(self, plan: Plan) -> SlotValues:
-        """Fill the pixels that read 0."""
+        """Fill the dead pixels."""
         physics = plan.physics
-        return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share)}
+        dead_dn = dead_pixel_dn(physics, plan.sensor.black_level_dn)
+        return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share, dead_dn)}
 
     def expected(self, site: Site) -> EffectNoise:
-        """Sites of the body that read 0."""
+        """Sites of the body with one value."""
         plan = site.plan
         if plan.noise.averaged:
             return EffectNoise()
         y, x = site.defects("dead_pixels", site.physics.dead_pixel_share)
         black_dn = plan.sensor.black_level_dn
-        value_dn = max(noisy_limits(plan.sensor.bits, black_dn, plan.noise.sensor_clip)[0], 0.0) - black_dn
+        lowest_dn = noisy_limits(plan.sensor.bits, black_dn, plan.noise.sensor_clip)[0]
+        value_dn = max(lowest_dn, dead_pixel_dn(site.physics, black_dn)) - black_dn
         return EffectNoise(defects=Defects(y, x, np.full(len(y), value_dn), replaces=True))
+
+
+def dead_pixel_dn(physics: Physics, black_dn: float) -> float:
+    """Return the value of dead pixels for a black level, DN."""
+    return float(physics.dead_pixel_level * black_dn)

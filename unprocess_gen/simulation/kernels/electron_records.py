@@ -79,6 +79,7 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, 
         padded_width=columns,
         black_dn=first.black_dn,
         full_dn=first.full_well_e * first.dn_per_e + first.black_dn,
+        dead_dn=first.patterns.dead.value_dn if first.patterns.dead else 0.0,
         body=WITHOUT_PATTERNS,
         tables=count_tables(),
     )

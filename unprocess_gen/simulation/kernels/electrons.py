@@ -8,7 +8,7 @@ The way of a strip of a noisy frame. Left, the function; right, the buffers of t
         _fill_rates               rates           mean electrons of light
         fill_counts               light_e         counts of light       + light_error_e   0: the count is certain
         _count_dark               dark_e          counts of one rate    + dark_error_e
-        _fill_defects             defects_e       counts of bright defects; negative: the pixel reads 0
+        _fill_defects             defects_e       counts of bright defects; negative: a dead pixel
               |                   row_dn          the offset of the strip's row
               |
               +--------------------------------------------+
@@ -82,6 +82,7 @@ class Electrons(NamedTuple):
     padded_width: int  # P
     black_dn: float
     full_dn: float  # DN of the full well in a clean frame with fixed patterns
+    dead_dn: float  # value of dead pixels
     body: Body
     tables: CountTables
 
@@ -299,7 +300,7 @@ def exact_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace
 def exact_electrons_site(noise: Electrons, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
     """Return the noisy DN of one site."""
     if workspace.defects_e[x] < 0.0:
-        return 0.0
+        return float(noise.dead_dn)
     frame, site = load_frame(noise, n), _first_site(n, strip) + (x & 1)
     dn_per_e, full_e = noise.dn_per_e[site], noise.full_well_e[site]
     electrons = _exact_light(noise, frame, dn_per_e, x, strip, workspace)
@@ -345,4 +346,4 @@ def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> N
         dn = simd.minimum((clean_dn[x] + defects_e[x] * gain) + kept_e * gain, noise.full_dn)
         offset_dn = 0.0 + noise.fixed_columns_dn[_first_column(strip) + x]
         dn = (dn + (offset_dn + noise.planes_dn[site])) + np.float64(sites_dn[x])
-        clean_dn[x] = dn if defects_e[x] >= 0.0 else 0.0
+        clean_dn[x] = dn if defects_e[x] >= 0.0 else noise.dead_dn
