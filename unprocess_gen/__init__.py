@@ -1,7 +1,7 @@
 """Generate clean and noisy raw pairs from sRGB photographs.
 
 ``load_config`` composes a config, ``make_pair`` makes a pair from an array, ``generate`` a dataset from files, and
-``RawPairs`` reads datasets. The command line is ``gen-dataset``.
+``RawPairs`` reads datasets, and ``LivePairs`` makes pairs while a training runs. The command line is ``gen-dataset``.
 
 Names are imported on first access. ``RawPairs`` needs only NumPy and xxhash.
 """
@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     )
     from unprocess_gen.core.types import Plan
     from unprocess_gen.dataset.reader import RawPairs, Sample
+    from unprocess_gen.dataset.sampler import EpochSampler
     from unprocess_gen.dataset.training import noise_std, pack, random_crop, to_light
+    from unprocess_gen.pipeline.live import LivePairs, LiveSample
 
 __version__ = "0.2.0"
 
@@ -35,6 +37,9 @@ __all__ = [
     "Config",
     "ConfigError",
     "DamageError",
+    "EpochSampler",
+    "LivePairs",
+    "LiveSample",
     "LockedError",
     "MachineError",
     "Plan",
@@ -66,7 +71,9 @@ _MODULES = {
     ),
     "core.types": ("Plan",),
     "dataset.reader": ("RawPairs", "Sample"),
+    "dataset.sampler": ("EpochSampler",),
     "dataset.training": ("noise_std", "pack", "random_crop", "to_light"),
+    "pipeline.live": ("LivePairs", "LiveSample"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -1,7 +1,8 @@
 """Random numbers as pure functions of their purpose: counter-based streams with Philox4x32-10.
 
-A noise value depends only on (seed, image, effect, frame, draw, level, y, x). A fixed pattern depends only on (seed,
-profile, sensor unit, effect, y, x). Therefore no worker, order, crop, tile or omitted effect can change another value.
+A noise value depends only on (seed, image, effect, epoch, frame, draw, level, y, x). A fixed pattern depends only on
+(seed, profile, sensor unit, effect, y, x). Therefore no worker, order, crop, tile or omitted effect can change another
+value.
 
 Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) scrambles a 128-bit counter with a
 64-bit key. The key is a hash of the seed and the image, or of the camera body. The four words of the counter are:
@@ -9,10 +10,11 @@ Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 
     word 0   x // 64 * 16 + x % 16      one counter serves the pixels x, x + 16, x + 32, x + 48 of a block of 64
     word 1   y
     word 2   effect * 2**24 + level * 2**12 + draw
-    word 3   frame
+    word 3   epoch * 2**18 + frame
 
 Pixel x takes output word x % 64 // 16. The layout does not depend on the image width, and 16 neighbouring pixels use 16
-consecutive counters, which vectorises. Alternatives: ``docs/design/random_numbers.md``.
+consecutive counters, which vectorises. The epoch
+is 0 in every stored dataset; live pairs have others. Alternatives: ``docs/design/random_numbers.md``.
 
 This module is the NumPy reference; `simulation.kernels.philox` contains the compiled form.
 """
@@ -146,6 +148,38 @@ def purpose(stream: str, level: int = 0, draw: int = 0) -> int:
     return STREAMS[stream] << 24 | level << 12 | draw
 
 
+EPOCHS, CLIP_FRAMES = 2**14, 2**18
+"""Epochs, and frames of a clip that have epochs."""
+
+
+def frame_word(frame: int, epoch: int = 0) -> int:
+    """Return word 3 of the counter.
+
+    Parameters
+    ----------
+    frame : int
+        Number of the frame in its clip; in epochs after the first, less than `CLIP_FRAMES`.
+    epoch : int
+        Number of the epoch, less than `EPOCHS`.
+
+    Returns
+    -------
+    int
+        32-bit word; the frame itself in epoch 0.
+
+    Raises
+    ------
+    ValueError
+        If ``epoch`` or ``frame`` is out of range.
+    """
+    if not 0 <= epoch < EPOCHS or (epoch and frame >= CLIP_FRAMES):
+        raise ValueError(
+            f"epoch={epoch}, frame={frame}: out of range; expected epochs 0 to {EPOCHS - 1}, and after epoch 0 frames "
+            f"0 to {CLIP_FRAMES - 1}"
+        )
+    return epoch << 18 | frame
+
+
 def philox4x32(counter: tuple[NDArray[np.uint64], ...], key: int) -> tuple[Words, Words, Words, Words]:
     """Compute Philox4x32-10, as in Random123 (known answers: its ``kat_vectors``).
 
@@ -213,7 +247,7 @@ def words(
     return np.asarray(np.choose(chosen, outputs), dtype=np.uint32)
 
 
-def patch_words(key: int, count: int) -> list[tuple[int, int]]:
+def patch_words(key: int, count: int, epoch: int = 0) -> list[tuple[int, int]]:
     """Return two random words for each of the first ``count`` patches of an image.
 
     Patch n uses counter (0, n) of the stream ``patch``, so that a larger ``count`` does not move the first patches.
@@ -224,14 +258,64 @@ def patch_words(key: int, count: int) -> list[tuple[int, int]]:
         Key from `stream_key`.
     count : int
         Number of patches.
+    epoch : int
+        Number of the epoch.
 
     Returns
     -------
     list of (int, int)
         Two 32-bit words for each patch.
     """
-    first, second = _outputs(key, count, 0, purpose("patch"))[:2]
+    first, second = _outputs(key, count, 0, purpose("patch"), frame_word(0, epoch))[:2]
     return list(zip(first.tolist(), second.tolist(), strict=True))
+
+
+def crop_words(key: int, patch: int, level: int, draw: int, word_3: int) -> tuple[int, int]:
+    """Return two random words for the place of a live crop in a patch.
+
+    They are the output of counter (0, patch, word 2, word 3) of the stream ``patch``, where word 2 has draw + 1, so
+    that no place of a recorded patch has the same words.
+
+    Parameters
+    ----------
+    key : int
+        Key from `stream_key`.
+    patch, level, draw : int
+        Numbers of the patch, of the noise level and of the draw.
+    word_3 : int
+        Frame and epoch (`frame_word`).
+
+    Returns
+    -------
+    tuple of int
+        Two 32-bit words.
+    """
+    counter = (0, patch, purpose("patch", level, draw + 1), word_3)
+    first, second, _, _ = philox4x32(tuple(np.array([word], dtype=np.uint64) for word in counter), key)
+    return int(first[0]), int(second[0])
+
+
+def shuffled(length: int, seed: int, epoch: int) -> NDArray[np.int64]:
+    """Return the numbers from 0 to ``length`` - 1 in a random order, the same on every machine.
+
+    Parameters
+    ----------
+    length : int
+        Number of items, less than 2**32.
+    seed : int
+        Seed of the order.
+    epoch : int
+        Number of the epoch, less than 2**32.
+
+    Returns
+    -------
+    ndarray of int64, [length]
+        A permutation: the order of 64-bit words, one for each item.
+    """
+    name = f"unprocess_gen order 1\0{seed}"
+    key = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+    high, low, _, _ = _outputs(key, length, 0, 0, epoch)
+    return np.argsort(high.astype(np.uint64) << np.uint64(32) | low, kind="stable")
 
 
 def dark_frame_words(key: int) -> tuple[int, int, int]:
@@ -251,7 +335,7 @@ def dark_frame_words(key: int) -> tuple[int, int, int]:
     return int(chosen[0]), int(row[0]), int(column[0])
 
 
-def parameter_uniforms(key: int, count: int, level: int = 0) -> list[float]:
+def parameter_uniforms(key: int, count: int, level: int = 0, epoch: int = 0) -> list[float]:
     """Return uniform deviates for the drawn parameters of an image.
 
     Parameter n uses counter (0, n) of the stream ``parameters``: add new parameters at the end, never renumber.
@@ -264,13 +348,15 @@ def parameter_uniforms(key: int, count: int, level: int = 0) -> list[float]:
         Number of parameters.
     level : int
         Number of the noise level.
+    epoch : int
+        Number of the epoch.
 
     Returns
     -------
     list of float
         (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
-    return _uniforms(key, count, 0, purpose("parameters", level))
+    return _uniforms(key, count, 0, purpose("parameters", level), frame_word(0, epoch))
 
 
 def scatter_uniforms(key: int, iso: float, count: int) -> list[float]:

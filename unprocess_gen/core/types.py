@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.random_streams import frame_word
+
 if TYPE_CHECKING:
     from unprocess_gen.simulation.effects import Physics
 
@@ -369,6 +371,8 @@ class NoisePlan:
         Assumed numbers of the noise profile that the simulated effects use; empty with ``effects.assumed=off``.
     dark : DarkFramePlan
         Dark frame whose noise replaces that of the read-out.
+    epoch : int
+        Number of the epoch of live pairs, each with other random values; 0 in datasets.
     """
 
     name: str
@@ -385,6 +389,12 @@ class NoisePlan:
     frame: int = 0
     assumed: tuple[str, ...] = ()
     dark: DarkFramePlan = DarkFramePlan()
+    epoch: int = 0
+
+    @property
+    def frame_word(self) -> int:
+        """Word of the random counter that holds frame and epoch."""
+        return frame_word(self.frame, self.epoch)
 
     @property
     def counts_electrons(self) -> bool:
@@ -523,7 +533,7 @@ class Plan:
 
     def __hash__(self) -> int:
         """Hash a few numbers: those of all fields take ten times as long, and patches look up their plan's records."""
-        return hash((self.stream_key, self.noise.level, self.noise.draw, self.noise.frame))
+        return hash((self.stream_key, self.noise.level, self.noise.draw, self.noise.frame, self.noise.epoch))
 
     def replace(self, **values: Any) -> Plan:
         """Return a copy with other values in fields of the plan or of its parts.

@@ -191,16 +191,9 @@ class PairRegenerator:
         Raises SourceChangedError if the source was changed or deleted, DamageError if the row has no valid plan,
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
         """
-        if self._root is None and row["source_bytes"] != 0:
-            raise ConfigError(
-                f"source.root is missing: row {row['key']} was generated from the file {row['source']}; "
-                "expected its folder; give source.root=…"
-            )
         plan = plan_from_row(row)
         self_test.check(self_test.kernels(plan))
-        sha256, photograph = self._load_unchanged(row)
-        if sha256 != row["source_sha256"]:
-            raise SourceChangedError(_changed(sha256, row))
+        photograph = self.photograph(row)
         patch = patch_from_row(row)
         height, width = photograph.srgb.shape[:2]
         if patch.y + patch.height > height or patch.x + patch.width > width:
@@ -211,6 +204,18 @@ class PairRegenerator:
         image = PlannedImage(photograph.srgb, (plan,), (patch,), dark_folder=self._dark_pixels(plan))
         _, _, pair = next(image.pairs())
         return pair
+
+    def photograph(self, row: Row) -> Photograph:
+        """Return the decoded source of a row; raise as `regenerate`."""
+        if self._root is None and row["source_bytes"] != 0:
+            raise ConfigError(
+                f"source.root is missing: row {row['key']} was generated from the file {row['source']}; "
+                "expected its folder; give source.root=…"
+            )
+        sha256, photograph = self._load_unchanged(row)
+        if sha256 != row["source_sha256"]:
+            raise SourceChangedError(_changed(sha256, row))
+        return photograph
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
         """Return access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""

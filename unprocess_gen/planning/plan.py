@@ -74,6 +74,21 @@ def plan_pairs(
     return tuple(plans)
 
 
+def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int) -> Plan:
+    """Draw the parameters of a pair anew for an epoch; its level, draw, frame, split and dark frame stay."""
+    levels = _planner(config).levels_of_key(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
+    noise = plan.noise
+    redrawn, _ = next(itertools.islice(levels, noise.level, None))
+    return redrawn.replace(draw=noise.draw, frame=noise.frame, dark=noise.dark)
+
+
+def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
+    """Replace the dark frame of a pair by another one in each epoch, at the same place: the body does not move."""
+    digests = [frame.sha256 for frame in dark_frames.frames]
+    number = (digests.index(plan.noise.dark.sha256) + epoch) % len(digests)
+    return plan.replace(dark=replace(plan.noise.dark, sha256=digests[number]))
+
+
 def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int) -> Plan:
     """Choose the dark frame of one pair."""
     chosen, row, column = dark_frame_words(plan.stream_key)
@@ -169,23 +184,29 @@ class Planner:
         dark_frames: DarkFrames | None = None,
     ) -> Iterator[tuple[Plan, Selection | None]]:
         """Yield the plan of one image at each noise level, and the selection of effects of a physical profile."""
+        key, split = stream_key(seed, source_sha256, occurrence), self._draw_split(seed, source_sha256)
+        return self.levels_of_key(seed, key, split, facts, dark_frames)
+
+    def levels_of_key(
+        self, seed: int, key: int, split: str, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int = 0
+    ) -> Iterator[tuple[Plan, Selection | None]]:
+        """Yield what `levels` does for the key of an image, in an epoch."""
         if self._needs_dark_frames and dark_frames is None:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
-        key = stream_key(seed, source_sha256, occurrence)
-        uniforms = parameter_uniforms(key, COUNT)
+        uniforms = parameter_uniforms(key, COUNT, epoch=epoch)
         scene = types.ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         camera = self._draw_camera(uniforms)
         steep = self._steep_accuracy != self._accuracy and is_steep(camera, scene.exposure)
         accuracy = self._steep_accuracy if steep else self._accuracy
-        signals, split = None, self._draw_split(seed, source_sha256)
+        signals = None
         if self._is_physical and facts is not None:
             signals = signal_range(facts, self._isp, camera, scene.exposure, float(self._sensor.span_dn))
         image = Image(seed, key, facts, signals, dark_frames)
         for number, level in enumerate(self._levels):
             if number:
-                drawn_again = parameter_uniforms(key, COUNT, number)
+                drawn_again = parameter_uniforms(key, COUNT, number, epoch)
                 for counter in NOISE_COUNTERS:
                     uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)

@@ -20,13 +20,13 @@ from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchRule, Srgb
 
 
 def list_patches(
-    rule: PatchRule | None, stream_key: int, height: int, width: int, layout: str = MOSAIC
+    rule: PatchRule | None, stream_key: int, height: int, width: int, layout: str = MOSAIC, epoch: int = 0
 ) -> tuple[Patch, ...]:
-    """List the patches of an image in order."""
+    """List the patches of an image in order; random ones are elsewhere in each epoch."""
     if rule is None:
         side = 2 if layout == PACKED else 1
         return (Patch(0, 0, 0, height // side * side, width // side * side),)
-    corners = _grid(rule, height, width) if rule.kind == "grid" else _random(rule, stream_key, height, width)
+    corners = _grid(rule, height, width) if rule.kind == "grid" else _random(rule, stream_key, height, width, epoch)
     return tuple(Patch(number, y, x, rule.side, rule.side) for number, (y, x) in enumerate(corners))
 
 
@@ -35,10 +35,15 @@ def _grid(rule: PatchRule, height: int, width: int) -> Iterator[tuple[int, int]]
     return itertools.product(rows, columns)
 
 
-def _random(rule: PatchRule, stream_key: int, height: int, width: int) -> Iterator[tuple[int, int]]:
-    rows, columns = ((length - rule.side) // 2 + 1 for length in (height, width))
-    for first, second in patch_words(stream_key, rule.count):
-        yield 2 * (first * rows >> 32), 2 * (second * columns >> 32)
+def _random(rule: PatchRule, stream_key: int, height: int, width: int, epoch: int) -> Iterator[tuple[int, int]]:
+    for place in patch_words(stream_key, rule.count, epoch):
+        yield even_corner(place, rule.side, height, width)
+
+
+def even_corner(place: tuple[int, int], side: int, height: int, width: int) -> tuple[int, int]:
+    """Return the even row and column of a square in a rectangle that two random words choose."""
+    rows, columns = ((length - side) // 2 + 1 for length in (height, width))
+    return 2 * (place[0] * rows >> 32), 2 * (place[1] * columns >> 32)
 
 
 def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:

@@ -27,7 +27,7 @@ SlotValues = dict[str, Any]
 def frame_words(plan: Plan, stream: str, shape: tuple[int, ...], origin: Shape = (0, 0)) -> Words:
     """Return the random words of a plan's frame, level and draw, [H, W]."""
     noise = plan.noise
-    place = {"frame": noise.frame, "level": noise.level, "draw": noise.draw}
+    place = {"frame": noise.frame_word, "level": noise.level, "draw": noise.draw}
     return words(plan.stream_key, stream, (shape[0], shape[1]), origin=origin, **place)
 
 
@@ -74,7 +74,7 @@ class Part:
 
 def slot_words(plan: Plan, stream: str) -> SlotWords:
     """Return the random words of a plan's frame, level and draw for a slot."""
-    return SlotWords(plan.stream_key, stream, plan.noise.level, plan.noise.draw, plan.noise.frame)
+    return SlotWords(plan.stream_key, stream, plan.noise.level, plan.noise.draw, plan.noise.frame_word)
 
 
 class Effect:

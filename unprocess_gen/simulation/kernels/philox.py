@@ -22,7 +22,7 @@ KEY_STEP0, KEY_STEP1 = (np.uint64(step) for step in KEY_STEPS)
 _M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
 
 PhiloxKey = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
-"""Two 32-bit words of the key, then two words that go into the counter: level and draw, and frame."""
+"""Two 32-bit words of the key, then two words that go into the counter: level and draw, and frame and epoch."""
 
 _CounterBlock = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 
@@ -34,7 +34,7 @@ def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Philo
 
 def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
     """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
-    noises = [(plan.stream_key, plan.noise.level, plan.noise.draw, plan.noise.frame) for plan in plans]
+    noises = [(plan.stream_key, plan.noise.level, plan.noise.draw, plan.noise.frame_word) for plan in plans]
     return np.array([philox_key(*numbers) for numbers in noises], dtype=np.uint64)
 
 

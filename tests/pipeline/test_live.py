@@ -1,0 +1,238 @@
+"""`LivePairs` makes the stored pairs in epoch 0, and others that depend only on (seed, epoch, number) afterwards."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.datasets import Make
+from helpers.photographs import fill
+
+import unprocess_gen as ug
+from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceError
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.random_streams import CLIP_FRAMES, EPOCHS, frame_word
+from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.self_test import _PHYSICAL, GOLDEN_PLAN
+from unprocess_gen.sources.scenes import synthetic
+
+RECIPES = {
+    "two numbers": ("noise=imx385_iso3200",),
+    "night": ("noise=sony_a7s2", "scene=night"),
+    "levels, draws and patches": (
+        "noise=sony_a7s2",
+        "noise.levels=[1600,3200]",
+        "noise.draws=2",
+        "source.patch=[random,64,2]",
+    ),
+    "packed": ("output.layout=packed", "source.patch=64"),
+    "random levels, float32": ("noise=brooks2019", "output.dtype=float32"),
+}
+
+
+@pytest.fixture(scope="module")
+def night(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of two scenes with a physical profile, in random patches."""
+    out = tmp_path_factory.mktemp("night") / "ds"
+    make(None, out, *RECIPES["night"], "source.limit=2", "source.patch=[random,64,2]")
+    return out
+
+
+def digests(live: ug.LivePairs, item: tuple[int, int]) -> tuple[str, str]:
+    """Digests of the clean and of the noisy frame."""
+    sample = live[item]
+    return array_xxh3(sample.clean), array_xxh3(sample.noisy)
+
+
+def assert_same(live: ug.LivePairs, stored: ug.RawPairs) -> None:
+    """Compare all pairs of epoch 0 with the stored ones."""
+    assert len(live) == len(stored)
+    for number in range(len(stored)):
+        made, read = live[number], stored[number]
+        assert (made.clean.dtype, made.noisy.dtype) == (read.clean.dtype, read.noisy.dtype)
+        np.testing.assert_array_equal(made.clean, read.clean)
+        np.testing.assert_array_equal(made.noisy, read.noisy)
+        assert made.row == read.row
+
+
+def test_epoch_0_is_the_dataset_of_photographs(dataset: Path, tmp_path: Path) -> None:
+    assert_same(ug.LivePairs(dataset, cache=tmp_path / "cache"), ug.RawPairs(dataset))
+    assert_same(ug.LivePairs(dataset, cache=tmp_path / "cache", redraw="all"), ug.RawPairs(dataset))
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_epoch_0_is_the_dataset_of_a_recipe(recipe: str, make: Make, tmp_path: Path) -> None:
+    overrides = (*RECIPES[recipe], "source.limit=2")
+    make(None, tmp_path / "ds", *overrides)
+    stored = ug.RawPairs(tmp_path / "ds")
+    assert_same(ug.LivePairs(tmp_path / "ds"), stored)
+    if recipe != "packed":
+        assert_same(ug.LivePairs(overrides, redraw="all"), stored)
+
+
+def test_each_epoch_has_new_noise_and_the_same_clean_frames(night: Path) -> None:
+    live = ug.LivePairs(night, cache="memory")
+    items = [(epoch, number) for epoch in (*range(10), EPOCHS - 1) for number in range(len(live))]
+    made = {item: digests(live, item) for item in items}
+    assert len({noisy for _, noisy in made.values()}) == len(items)
+    assert all(clean == made[0, number][0] for (_, number), (clean, _) in made.items())
+
+
+def test_all_redraws_parameters_and_patches_and_keeps_the_body(night: Path) -> None:
+    live = ug.LivePairs(night, redraw="all")
+    rows = [live[epoch, 0].row for epoch in range(3)]
+    for name in ("red_gain", "w_sony_a7r", "exposure_ratio", "noisy_xxh3", "clean_xxh3"):
+        assert len({row[name] for row in rows}) == 3, name
+    assert len({(row["patch_y"], row["patch_x"]) for row in rows}) == 3
+    for name in ("stream_key", "source_sha256", "key", "sensor_unit", "body_key", "split"):
+        assert len({row.get(name) for row in rows}) == 1, name
+    assert [row.get("epoch") for row in rows] == [None, 1, 2]
+
+
+def test_none_repeats_the_stored_pairs(night: Path) -> None:
+    live = ug.LivePairs(night, redraw="none")
+    assert digests(live, (7, 1)) == digests(live, (0, 1))
+
+
+def test_fixed_patterns_are_the_same_in_every_epoch() -> None:
+    effects = ("prnu", "column", "dsnu", "hot_pixels", "dead_pixels", "quantise")
+    plan, srgb = _PHYSICAL.replace(effects=tuple(name for name in effects if name != "hot_pixels")), _codes()
+    first, later = (make_pair(srgb, plan.replace(epoch=epoch)) for epoch in (0, 5))
+    np.testing.assert_array_equal(first.noisy, later.noisy)
+
+
+@pytest.mark.parametrize("plan", [GOLDEN_PLAN, _PHYSICAL], ids=["two numbers", "physical"])
+def test_kernels_equal_the_reference_in_a_later_epoch(plan: Any) -> None:
+    made, expected = (make(_codes(), plan.replace(epoch=3)) for make in (make_pair, reference_pair))
+    np.testing.assert_array_equal(made.clean, expected.clean)
+    np.testing.assert_array_equal(made.noisy, expected.noisy)
+    assert array_xxh3(made.noisy) != array_xxh3(make_pair(_codes(), plan).noisy)
+
+
+def test_an_epoch_has_words_of_its_own() -> None:
+    words = {frame_word(frame, epoch) for frame in (0, 1, CLIP_FRAMES - 1) for epoch in (0, 1, EPOCHS - 1)}
+    assert len(words) == 9
+    assert frame_word(2**32 - 1) == 2**32 - 1
+    for frame, epoch in ((CLIP_FRAMES, 1), (0, EPOCHS), (0, -1)):
+        with pytest.raises(ValueError, match="out of range"):
+            frame_word(frame, epoch)
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_items_depend_on_no_process_and_no_order(method: str, night: Path, tmp_path: Path) -> None:
+    live = ug.LivePairs(night, redraw="all", cache=tmp_path / "cache", patch=32)
+    items = [(epoch, number) for epoch in (3, 0, 2) for number in range(len(live))]
+    with multiprocessing.get_context(method).Pool(2) as pool:
+        made = pool.map(functools.partial(digests, live), items, chunksize=1)
+    again = pickle.loads(pickle.dumps(live))
+    assert made[::-1] == [digests(again, item) for item in items[::-1]]
+
+
+@pytest.mark.parametrize("redraw", ["noise", "all"])
+def test_a_patch_is_the_crop_of_the_pair(redraw: str, dataset: Path) -> None:
+    number = next(n for n, sample in enumerate(ug.RawPairs(dataset)) if min(sample.clean.shape) > 15)
+    complete, cut = (ug.LivePairs(dataset, redraw=redraw, patch=side) for side in (None, 8))
+    places = set()
+    for epoch in range(4):
+        crop, pair = cut[epoch, number], complete[epoch, number]
+        y, x = crop.row["patch_y"], crop.row["patch_x"]
+        assert (y % 2, x % 2, crop.row["width"], crop.row["height"]) == (0, 0, 8, 8)
+        np.testing.assert_array_equal(crop.clean, pair.clean[y : y + 8, x : x + 8])
+        np.testing.assert_array_equal(crop.noisy, pair.noisy[y : y + 8, x : x + 8])
+        places.add((y, x))
+    assert len(places) > 1
+
+
+def test_light_and_targets(night: Path) -> None:
+    names = ["variance", "noise_std", "srgb"]
+    live, dn = (ug.LivePairs(night, as_float=as_float, targets=names) for as_float in (True, False))
+    sample, stored = live[1, 2], dn[1, 2]
+    row = sample.row
+    span = row["white_level_dn"] - row["black_level_dn"]
+    np.testing.assert_array_equal(sample.noisy, ug.to_light(stored.noisy, row))
+    np.testing.assert_array_equal(stored.targets["noise_std"], ug.noise_std(stored.noisy, row))
+    law = row["a_dn"] * (stored.clean.astype(float) - row["black_level_dn"]) + row["dark_variance_dn2"]
+    np.testing.assert_allclose(stored.targets["variance"], law, rtol=1e-6)
+    np.testing.assert_allclose(sample.targets["variance"], law / span**2, rtol=1e-5)
+    y, x = row["patch_y"], row["patch_x"]
+    photograph = synthetic.scene(str(row["source"]))[y : y + 64, x : x + 64]
+    np.testing.assert_array_equal(sample.targets["srgb"], photograph)
+    arrays = ug.LivePairs(night, targets=names, arrays_only=True)[1, 2]
+    assert [array.shape for array in arrays] == [(64, 64)] * 4 + [(64, 64, 3)]
+
+
+def test_pixels_are_decoded_once_up_to_the_bound(tmp_path: Path, make: Make) -> None:
+    fill(tmp_path / "photos", 3)
+    make(tmp_path / "photos", tmp_path / "ds")
+    stored = ug.RawPairs(tmp_path / "ds")
+    size = stored[0].clean.size * 3 + 200
+    live = ug.LivePairs(tmp_path / "ds", cache=tmp_path / "cache", cache_bytes=2 * size)
+    assert_same(live, stored)
+    files = sorted((tmp_path / "cache").iterdir())
+    assert 1 <= len(files) <= 2
+    assert sum(file.stat().st_size for file in files) <= 2 * size
+    unbounded = ug.LivePairs(tmp_path / "ds", cache=tmp_path / "cache")
+    assert_same(unbounded, stored)
+    for photograph in (tmp_path / "photos").iterdir():
+        photograph.unlink()
+    assert_same(unbounded, stored)
+    files[0].write_bytes(b"damaged")
+    with pytest.raises(DamageError, match="not an NPY file"):
+        assert_same(unbounded, stored)
+
+
+def test_a_changed_source_is_reported(tmp_path: Path, make: Make) -> None:
+    fill(tmp_path / "photos", 2)
+    make(tmp_path / "photos", tmp_path / "ds")
+    first = sorted((tmp_path / "photos").iterdir())[0]
+    first.write_bytes(first.read_bytes() + b"\0")
+    with pytest.raises(MachineError, match="changed since it was listed"):
+        ug.LivePairs(tmp_path / "ds")[0]
+    first.write_bytes(b"no image")
+    with pytest.raises(SourceError):
+        ug.LivePairs(ug.load_config(), root=tmp_path / "photos")[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"redraw": "some"}, "redraw='some': unknown; expected one of noise, all, none"),
+        ({"targets": ["depth"]}, "targets="),
+        ({"patch": 7}, "patch=7: out of range"),
+        ({"cache": "/dev/null/cache"}, "cannot be created"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(arguments: dict[str, Any], message: str, dataset: Path) -> None:
+    with pytest.raises(ConfigError, match=message) as refusal:
+        ug.LivePairs(dataset, **arguments)
+    assert "\n" not in str(refusal.value)
+
+
+def test_grids_and_items_out_of_range_are_refused(dataset: Path) -> None:
+    with pytest.raises(ConfigError, match="depends on the sizes of the images"):
+        ug.LivePairs(["source.patch=64"])
+    live = ug.LivePairs(dataset, patch=4096)
+    with pytest.raises(ConfigError, match="patch=4096: exceeds a pair"):
+        live[0]
+    for item in (13, (EPOCHS, 0), (-1, 0)):
+        with pytest.raises(IndexError):
+            live[item]
+
+
+def test_pytorch_loads_the_items_of_a_sampler(night: Path) -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+    live, sampler = ug.LivePairs(night, arrays_only=True), ug.EpochSampler(4, seed=1)
+    expected = [live[item][1] for item in ug.EpochSampler(4, seed=1)]
+    for workers in (0, 2):
+        sampler.set_epoch(0)
+        loader = torch.utils.data.DataLoader(live, batch_size=2, sampler=sampler, num_workers=workers)
+        np.testing.assert_array_equal(np.concatenate([batch[1].numpy() for batch in loader]), expected)
+
+
+def _codes() -> np.ndarray[Any, np.dtype[np.uint8]]:
+    return np.random.default_rng(1).integers(0, 256, (33, 131, 3), dtype=np.uint8)
