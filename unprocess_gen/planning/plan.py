@@ -75,7 +75,7 @@ def plan_pairs(
 
 
 def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int) -> Plan:
-    """Draw the parameters of a pair anew for an epoch; its level, draw, frame, split and dark frame stay."""
+    """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay."""
     levels = _planner(config).levels_of_key(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
     noise = plan.noise
     redrawn, _ = next(itertools.islice(levels, noise.level, None))

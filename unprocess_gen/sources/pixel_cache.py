@@ -46,7 +46,7 @@ class PixelCache:
             ) from None
 
     def get(self, name: str, decode: Callable[[], Srgb]) -> Srgb:
-        """Return the pixels of a name; decode them if they are not in the cache, and add them if there is room."""
+        """Return the pixels of a name; decode them if they are not in the cache, and add them if there is space."""
         path = self._folder / f"{name}.npy"
         with suppress(FileNotFoundError):
             try:
