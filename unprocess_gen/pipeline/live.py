@@ -20,7 +20,7 @@ from unprocess_gen.core.random_streams import EPOCHS, crop_words
 from unprocess_gen.core.types import Frame, Patch, Plan, Row, Srgb
 from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.dataset.training import noise_std, to_light
-from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPairs, RecordedPairs, live_config
+from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPairs, RecordedPairs
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
@@ -192,7 +192,7 @@ def _live_source(dataset: Any, root: str | None, cache: PixelCache | None) -> Li
         from unprocess_gen.config.composition import load_config
 
         dataset = load_config(dataset)
-    return PlannedPairs(live_config(dataset, root), cache)
+    return PlannedPairs(dataset, root, cache)
 
 
 def _crop(plan: Plan, patch: Patch, side: int) -> Patch:

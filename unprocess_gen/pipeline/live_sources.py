@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from unprocess_gen.config.interpretation import noise_levels, patch_rule
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
@@ -119,7 +119,8 @@ class RecordedPairs:
 class PlannedPairs:
     """Pairs of listed photographs, planned when they are read, as a run would make them."""
 
-    def __init__(self, config: Config, cache: PixelCache | None) -> None:
+    def __init__(self, config: Config, root: str | None, cache: PixelCache | None) -> None:
+        config = config if root is None else replaced(config, {"source.root": root})
         validate_config(config)
         rule = patch_rule(config.source)
         if rule is not None and rule.kind == "grid":
@@ -169,11 +170,6 @@ class PlannedPairs:
             self._digests[number] = sha256, photograph.orientation
             kept = self._kept = number, photograph
         return self._digests[number][0], kept[1]
-
-
-def live_config(config: Config, root: str | None) -> Config:
-    """Return a config with another root of the sources, if one is given."""
-    return config if root is None else replace(config, source=replace(config.source, root=root))
 
 
 def _cache_name(sha256: str, source: Source, downscale: int) -> str:
