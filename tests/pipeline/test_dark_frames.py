@@ -527,3 +527,12 @@ def test_noise_of_a_real_camera_has_its_variance_and_its_bands(settings: Setting
     assert noise.var() == pytest.approx(scale**2 * real.var(), rel=0.15)
     assert noise.mean(axis=1).var() == pytest.approx(scale**2 * real.mean(axis=1).var(), rel=0.4)
     assert noise.mean(axis=1).var() > 2 * noise.var() / 640
+
+
+def test_live_pairs_have_another_dark_frame_in_each_epoch(made: Path) -> None:
+    live, stored = ug.LivePairs(made), ug.RawPairs(made)
+    np.testing.assert_array_equal(live[0].noisy, stored[0].noisy)
+    first, second = live[0], live[1, 0]
+    np.testing.assert_array_equal(first.clean, second.clean)
+    assert first.row["dark_frame"] != second.row["dark_frame"]
+    assert first.row["noisy_xxh3"] != second.row["noisy_xxh3"]
