@@ -100,7 +100,7 @@ def number(name: str) -> st.SearchStrategy[float]:
     """Return any number that a column allows."""
     allowed = BY_NAME[name].allowed
     assert isinstance(allowed, Range)
-    return st.floats(allowed.low, allowed.high)
+    return st.floats(allowed.low, allowed.high).map(lambda value: value + 0.0)  # no -0.0, which reads as 0
 
 
 def levels(bits: int) -> st.SearchStrategy[tuple[int, int, int]]:

@@ -1,4 +1,4 @@
-"""Sample noise effect by effect, in electrons and then in DN: the order of `reference.noise.physical`.
+"""Sample noise effect by effect, in electrons and then in DN: the order of `effects.order.noisy`.
 
 The way of a strip of a noisy frame. Left, the function; right, the buffers of the `Workspace` that it fills::
 
@@ -240,7 +240,7 @@ def _count_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> None
 def _sum_dn(
     electrons: Any, full_well_e: Any, dn_per_e: Any, black_dn: Any, noise_dn: Any, offset_dn: Any, site_dn: Any
 ) -> Any:
-    """Return DN in the order of `reference.noise.physical`: of one site, or of eight as vectors."""
+    """Return DN in the order of `effects.order.noisy`: of one site, or of eight as vectors."""
     dn = simd.minimum(electrons, full_well_e) * dn_per_e + black_dn
     return ((dn + noise_dn) + offset_dn) + site_dn
 
@@ -336,7 +336,7 @@ def _exact_dark(noise: Electrons, frame: FrameNumbers, x: int, workspace: Worksp
 
 @inner
 def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
-    """Add the fixed patterns to the unrounded clean frame, as `reference.noise.average`."""
+    """Add the fixed patterns to the unrounded clean frame, as `effects.order.average`."""
     frame, clean_dn, defects_e = load_frame(noise, np.int64(0)), workspace.unrounded_dn, workspace.defects_e
     _fill_defects(noise.body, strip, workspace)
     kept_e, sites_dn = frame.dark_e - frame.removed_e, strip_values(noise.body.sites_dn, strip)
