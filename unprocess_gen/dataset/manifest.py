@@ -30,7 +30,8 @@ from unprocess_gen.simulation.effects import Physics, dark_variance_dn2
 Part = TypeVar("Part")
 
 JSON_BYTES = 5632
-"""Bytes of a row's JSON without the name of its source; the longest row takes less."""
+"""Bytes of a row's JSON without the name of its source. The longest row takes 3 less, so the next number in JSON must
+shorten another. The size decides the bytes of shards."""
 
 MAX_LINE_BYTES = 2**17
 """Longest line of a manifest that is read. Paths have at most 4096 bytes, three characters each if encoded."""
