@@ -175,7 +175,7 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
         ),
         (
             ("noise.levels=[{a:1}]",),
-            r"noise.levels=\[{'a': 1}\]: {'a': 1} is not {a: …, b: …}; expected a list of them",
+            r"noise.levels=\[{a: 1}\]: {a: 1} is not {a: …, b: …}; expected a list of them",
         ),
         (("noise.draws=0",), r"noise.draws=0: expected 1 to 100"),
         (("noise=nikon_d850", "noise.levels=[100,99]"), r"noise.iso=99: noise=nikon_d850 is calibrated for ISO 100 to"),
