@@ -34,8 +34,24 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.effects import order
+from unprocess_gen.simulation.effects import EFFECTS, order
+from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.slots import Patterns, Slots
+
+# Slots ----------------------------------------------------------------------------------------------------------------
+
+IN_EVERY_PAIR = {"heteroscedastic", "quantise"}
+"""Two-parameter noise, which is no physical effect, and rounding, which no slot decides."""
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
+def test_every_physical_effect_fills_a_slot_of_the_kernels(effect: Effect) -> None:
+    """Kernels simulate slots only: without one, only the reference would have the effect that a row names."""
+    filled = effect.slots(plan_with(effect.name))
+    assert filled.keys() <= {*Slots._fields, *Patterns._fields}
+    assert bool(filled) != (effect.name in IN_EVERY_PAIR)
+
 
 # Shot noise -----------------------------------------------------------------------------------------------------------
 
