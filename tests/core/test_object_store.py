@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import builtins
 import json
 import os
 import pickle
@@ -11,7 +10,6 @@ import threading
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -258,14 +256,7 @@ def test_unreachable_server_ends_in_one_line(s3: str, monkeypatch: pytest.Monkey
 
 
 def test_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    imported = builtins.__import__
-
-    def without_obstore(name: str, *arguments: Any, **named: Any) -> ModuleType:
-        if name.startswith("obstore"):
-            raise ImportError(name)
-        return imported(name, *arguments, **named)
-
-    monkeypatch.setattr(builtins, "__import__", without_obstore)
+    monkeypatch.setattr("unprocess_gen.core.libraries.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"^s3://bucket/a: object stores need obstore; .*pip install '\.\[remote\]'"):
         ObjectPath("s3://bucket/a").read_bytes()
 

@@ -18,7 +18,6 @@ from PIL import Image
 
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.serialization import read_option
-from unprocess_gen.reports import report_files
 from unprocess_gen.reports.paper import figures as paper_figures
 from unprocess_gen.reports.paper import pictures as figure_pictures
 from unprocess_gen.reports.paper.figures import INTERPRETATIONS, PaperOptions, Saturation
@@ -197,7 +196,7 @@ def test_patches_are_refused(run_main: RunMain, tmp_path: Path) -> None:
 def test_missing_library_gives_one_line_that_names_the_extra(
     run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(report_files, "find_spec", lambda name: None)
+    monkeypatch.setattr("unprocess_gen.core.libraries.find_spec", lambda name: None)
     done = run_main("figures", "out=figs")
     assert done.code == 2
     assert (

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 from unprocess_gen.config.accuracy import choose_methods
@@ -42,6 +41,7 @@ from unprocess_gen.config.schema import (
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import one_of, refusal
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.libraries import require
 from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.core.types import UINT16
@@ -100,13 +100,7 @@ def _check_values(config: Config) -> None:
 def check_parquet(output: OutputConfig) -> None:
     """Check that pyarrow is installed if ``manifest.parquet`` is wanted."""
     if output.parquet:
-        _check_installed("pyarrow", "output.parquet=true", "pyarrow", "parquet", "output.parquet=false")
-
-
-def _check_installed(module: str, setting: str, library: str, extra: str, other: str) -> None:
-    if find_spec(module) is None:
-        install = f"in the source folder, run: pip install '.[{extra}]'"
-        raise ConfigError(f"{setting}: needs {library}; {install}, or set {other}")
+        require("pyarrow", "output.parquet=true: needs pyarrow", "parquet", ", or set output.parquet=false")
 
 
 def _check_settings(config: Config) -> None:
@@ -136,9 +130,9 @@ def _check_environment(config: Config) -> None:
         problem = "the built-in scenes are not clips; expected folders or videos; give source.root=…"
         raise refusal("source.clips", "true", problem)
     if source.icc == "refuse":
-        _check_installed("PIL", "source.icc=refuse", "Pillow", "icc", "source.icc=ignore")
+        require("PIL", "source.icc=refuse: needs Pillow", "icc", ", or set source.icc=ignore")
     if config.executor.kind == "dask":
-        _check_installed("distributed", "executor.kind=dask", "Dask", "dask", "executor=local")
+        require("distributed", "executor.kind=dask: needs Dask", "dask", ", or set executor=local")
 
 
 def _check_root(root: str) -> None:

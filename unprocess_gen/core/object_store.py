@@ -29,6 +29,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar
 
 from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.libraries import require
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -491,14 +492,10 @@ def _store(scheme: str, bucket: str) -> Any:
 @contextmanager
 def _request(path: ObjectPath) -> Iterator[tuple[Any, Any]]:
     """Provide obstore and the client of a bucket; turn the exceptions of the body into those of this module."""
-    try:
-        import obstore
-        from obstore import exceptions
-    except ImportError:
-        raise ConfigError(
-            f"{path}: object stores need obstore; in the source folder, run: pip install '.[remote]', or give a "
-            "local path"
-        ) from None
+    require("obstore", f"{path}: object stores need obstore", "remote", ", or give a local path")
+    import obstore
+    from obstore import exceptions
+
     _check_process(path)
     try:
         yield obstore, _store(path.scheme, path.bucket)

@@ -30,7 +30,6 @@ import io
 import json
 import math
 from collections.abc import Iterable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import escape
@@ -39,6 +38,7 @@ import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import array_xxh3, machine_errors
+from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath, LocalPath
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
@@ -112,8 +112,7 @@ def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> Expor
     MachineError
         If writing fails.
     """
-    if find_spec("tifffile") is None:
-        raise ConfigError("dng: tifffile is missing; in the source folder, run: pip install '.[dng]'")
+    require("tifffile", "dng: tifffile is missing", "dng")
     check_output_folder(to, f"--to {to}")
     selected = select_pairs(folder / "manifest.csv", keys).rows
     numbers = {str(_writable(row)["key"]): number for number, row in selected.items()}

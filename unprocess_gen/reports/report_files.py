@@ -6,11 +6,11 @@ A report is not part of a dataset. This module imports no kernel, so that the da
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_folder
 
 LIBRARIES = {"matplotlib": "drawing needs", "jinja2": "HTML pages need"}
@@ -33,8 +33,7 @@ def require_libraries(verb: str, names: tuple[str, ...] = ("matplotlib", "jinja2
         If a library is missing; the message names the extra that installs it.
     """
     for name in names:
-        if find_spec(name) is None:
-            raise ConfigError(f"{verb}: {LIBRARIES[name]} {name}; in the source folder, run: pip install '.[figures]'")
+        require(name, f"{verb}: {LIBRARIES[name]} {name}", "figures")
 
 
 def check_report_folder(out: Path, verb: str) -> None:

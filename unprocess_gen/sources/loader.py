@@ -12,7 +12,8 @@ import numpy as np
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
-from unprocess_gen.core.errors import ConfigError, FilteredError, MachineError, SourceError
+from unprocess_gen.core.errors import FilteredError, MachineError, SourceError
+from unprocess_gen.core.libraries import require
 from unprocess_gen.core.paths import local_path
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
 from unprocess_gen.sources import reading
@@ -22,7 +23,7 @@ from unprocess_gen.sources.listing import Listing, list_folder, matcher
 from unprocess_gen.sources.read_ahead import Read
 from unprocess_gen.sources.scenes import synthetic
 from unprocess_gen.sources.twins import number_twins
-from unprocess_gen.sources.video.decode import Video, is_installed
+from unprocess_gen.sources.video.decode import Video
 
 OPEN_VIDEOS = 2
 """Videos that a process keeps open: that of the current shard, and the next one."""
@@ -183,11 +184,8 @@ def _frame(config: SourceConfig, root: str, source: Source) -> tuple[str, Photog
 
 def _video(root: str, source: Source) -> tuple[str, Video]:
     """Return a video's digest and the open video; both are cached until the file changes."""
-    if not is_installed():
-        raise ConfigError(
-            f"source.video: {source.name} is a video, which needs PyAV; "
-            "in the source folder, run: pip install '.[video]', or omit videos with source.video=[]"
-        )
+    needs = f"source.video: {source.name} is a video, which needs PyAV"
+    require("av", needs, "video", ", or omit videos with source.video=[]")
     whole = replace(source, index=0, occurrence=0, sha256=None, frame=0, frames=1, clip_sha256=None, clip_occurrence=0)
     return _open_video(root, whole, reading.stamp(root, source))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import io
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.libraries import require
 
 PICTURES = (".png", ".tif", ".tiff")
 RAW_FILES = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".raf", ".rw2")
@@ -90,11 +90,7 @@ def _check_array(path: Path, key: str, pixels: NDArray[Any], numbers: bool) -> N
 
 def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
     """Decode a raw file with LibRaw: the visible part of the mosaic."""
-    if find_spec("rawpy") is None:
-        raise ConfigError(
-            f"{key}: {path} is a raw file, which needs rawpy; in the source folder, run: "
-            "pip install '.[raw]', or convert the frames to NPY"
-        )
+    require("rawpy", f"{key}: {path} is a raw file, which needs rawpy", "raw", ", or convert the frames to NPY")
     import rawpy
 
     try:

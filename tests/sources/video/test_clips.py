@@ -161,7 +161,7 @@ def test_photograph_named_like_a_video_is_read_without_clips(make: Make, tmp_pat
 def test_without_pyav_a_video_is_refused_with_advice(
     films: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(photographs, "is_installed", lambda: False)
+    monkeypatch.setattr("unprocess_gen.core.libraries.find_spec", lambda name: None)
     done = run_main(f"source.root={films}", "source.clips=true")
     assert (done.code, done.err.count("\n")) == (2, 1)
     assert "h264.mp4 is a video, which needs PyAV; in the source folder, run: pip install '.[video]'" in done.err
