@@ -93,7 +93,8 @@ def settings_page() -> str:
             blocks.append(_options(group, options, defaults[group]))
         settings = settings_of(kind)
         if options and len(options) > 1:
-            blocks.append(f"Keys, with their values in `{group}={defaults[group]}`:")
+            chosen = f", with their values in `{group}={defaults[group]}`" if defaults[group] else ""
+            blocks.append(f"Keys{chosen}:")
         for section in dict.fromkeys(setting.section for setting in settings.values()):
             if section:
                 blocks.append(f"### {section}")

@@ -88,7 +88,10 @@ def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(
     ("argument", "complaint"),
     [
         (f"{RECIPE}=ipol_demo", "a recipe is added to the settings; write +experiment=ipol_demo"),
-        (f"+{RECIPE}=imagenet", "no such option; expected one of brooks2019_training, crvd_like, eld_low_light, ipol"),
+        (
+            f"+{RECIPE}=imagenet",
+            "no such option; expected one of brooks2019_training, crvd_like, eld_body, eld_low_light, ipol",
+        ),
         (f"+{RECIPE}=[ipol_demo,crvd_like]", "expected the name of an option: brooks2019_training"),
         (
             f"+{RECIPE}=crvd_like",

@@ -53,6 +53,7 @@ MATRIX = "[0.7, 0.1, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6]"
 NEEDS = {
     "camera/custom.yaml": [f"camera.xyz2cam={MATRIX}"],
     "noise/heteroscedastic.yaml": ["noise.a=3.5", "noise.b=12"],
+    "body/imx385.yaml": ["noise.iso=3200"],
     "noise/imx385.yaml": ["noise.iso=3200"],  # the ISO of scene=daylight is not calibrated
 }
 SHA256 = "0" * 64
@@ -81,9 +82,12 @@ def test_fixture_settings_builds_what_hydra_composes(settings: Settings) -> None
 
 OPTIONS = """
 source: default
+body: sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x imx385
+camera: sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d
 camera: convex sony_a7r olympus_em10 sony_rx100 nexus_6p choice identity custom
 gains: brooks2019 fixed paper_min paper_max paper_literal fig6_top fig6_bottom unity
 isp: smoothstep_gamma22 gamma22 srgb linear
+sensor: sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x imx385_gbrg
 sensor: imx385_12bit generic_10bit generic_12bit generic_14bit generic_16bit
 noise: imx385_iso1600 imx385_iso3200 imx385_iso6400 imx385_iso12800 imx385_iso25600 imx385_iso3200_rvdd brooks2019
 noise: heteroscedastic none imx385 sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x
@@ -92,7 +96,7 @@ effects: default
 accuracy: reference exact fast
 output: webdataset
 executor: local dask
-experiment: ipol_demo brooks2019_training crvd_like eld_low_light
+experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body
 sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
 """
 """Options that commands of users name."""
@@ -279,6 +283,7 @@ def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> N
         "source": ("root", "max_failed"),
         "noise": ("dark_frames", "provenance"),
         "executor": ("kind", "address", "chunk_s", "window", "no_workers_s", "lost_worker_s"),
+        "body": ("name", "missing", "replaced"),
     }
     assert "executor" not in loaded
     assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)

@@ -12,7 +12,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import Container, DictConfig, OmegaConf, open_dict
 
 from unprocess_gen.config.composition import compose_node
-from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
+from unprocess_gen.config.option_files import ADDED_GROUPS, OPTIONAL_GROUPS, conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, replaced
 from unprocess_gen.config.serialization import writable_node
 
@@ -27,7 +27,7 @@ def composed(*overrides: str) -> Config:
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     options = [one for one in parsed if (conf_dir() / one.key_or_group).is_dir()]
     values = [one for one in parsed if one not in options]
-    added = any(one.key_or_group in ADDED_GROUPS for one in options)
+    added = any(one.key_or_group in (*ADDED_GROUPS, *OPTIONAL_GROUPS) for one in options)
     groups = {} if added else {one.key_or_group: _option(one.key_or_group, str(one.value())) for one in options}
     if added or None in groups.values() or not overrides or any(map(_needs_hydra, values)):
         node = copy.deepcopy(_choices(*(str(one.input_line) for one in options)))

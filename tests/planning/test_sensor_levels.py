@@ -17,7 +17,7 @@ def test_advice_gives_the_levels_of_the_calibration(profile: str, settings: Sett
     config = settings(f"noise={profile}")
     calibrated = {key: getattr(config.noise, key) for key in LEVELS}
     is_default = calibrated == {key: getattr(config.sensor, key) for key in LEVELS}
-    advice = fitting_sensor(calibrated)
+    advice = fitting_sensor(calibrated, profile)
     advised = settings(f"noise={profile}", *advice)
 
     assert bool(sensor_warning(config)) != is_default
@@ -37,4 +37,4 @@ def test_chosen_sensor_and_two_number_profiles_are_not_warned_about(
 def test_runs_and_plans_warn(verb: tuple[str, ...], run_main: RunMain, tmp_path: Path) -> None:
     done = run_main(*verb, "noise=oppo_reno10x", "source.limit=1", "source.patch=64", "n_jobs=1", f"out={tmp_path}/ds")
     assert done.code == 0
-    assert "sensor=generic_10bit gives the calibrated levels" in " ".join((done.out + done.err).split())
+    assert "sensor=oppo_reno10x gives the calibrated levels" in " ".join((done.out + done.err).split())

@@ -19,7 +19,13 @@ ONLY_IN = {
         "cli.sweep_plugins",
     },
     "omegaconf": {
-        *("cli.jobs", "config.composition", "config.composition_errors", "config.serialization"),
+        *(
+            "cli.jobs",
+            "config.body_composition",
+            "config.composition",
+            "config.composition_errors",
+            "config.serialization",
+        ),
         *("cli.sweep_plugins", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},

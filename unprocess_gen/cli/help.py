@@ -100,7 +100,7 @@ def group_help(group: str, conf: Path) -> str:
     if group in GROUPS:
         from unprocess_gen.config.defaults import default_options, default_values
 
-        values, option = default_values(group), default_options().get(group, "default")
+        values, option = default_values(group), default_options().get(group) or "default"
         chosen = f" with {group}={option}" if option != "default" else ""
         title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"
         lines = [

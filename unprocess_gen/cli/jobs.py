@@ -74,11 +74,11 @@ def run_hydra(
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
-    from unprocess_gen.config.composition import VERSION_BASE, quoted_path
+    from unprocess_gen.config.composition import VERSION_BASE, hydra_override
     from unprocess_gen.config.composition_errors import explain
     from unprocess_gen.config.option_files import conf_dir
 
-    sys.argv = ["gen-dataset", *flags, *map(quoted_path, overrides)]
+    sys.argv = ["gen-dataset", *flags, *map(hydra_override, overrides)]
     application = hydra.main(version_base=VERSION_BASE, config_path=str(conf_dir()), config_name="config")
     try:
         application(job)()

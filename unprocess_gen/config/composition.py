@@ -21,6 +21,7 @@ import hydra
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
@@ -31,8 +32,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from unprocess_gen.config.body_composition import replaced_parts
 from unprocess_gen.config.composition_errors import explain, unknown_key
-from unprocess_gen.config.option_files import check_override, conf_dir
+from unprocess_gen.config.option_files import OPTIONAL_GROUPS, check_override, conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import validate_config
@@ -119,7 +121,7 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     try:
         _check_own_options(overrides, folders)
         with _hydra_for(folders):
-            return hydra.compose(folders.name or "config", [*map(quoted_path, overrides)], return_hydra_config=True)
+            return hydra.compose(folders.name or "config", [*map(hydra_override, overrides)], return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
         raise ConfigError(explain(error, overrides)) from error
 
@@ -130,7 +132,9 @@ def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
     ConfigError if a key is not in the schema, an interpolation fails or a value is out of range.
     """
     with open_dict(node):
-        node.pop("hydra", None)
+        hydra_settings = node.pop("hydra", None)
+        if "body" in node:
+            node.body.replaced = replaced_parts(node, hydra_settings or HydraConfig.get())
     for key in _unknown_keys(node, Config()):
         raise ConfigError(unknown_key(key, overrides))
     try:
@@ -154,6 +158,12 @@ def resolved_value(node: DictConfig, key: str, overrides: Sequence[str] = ()) ->
         return OmegaConf.select(node, key)
     except OmegaConfBaseException as error:
         raise ConfigError(explain(error, overrides)) from error
+
+
+def hydra_override(override: str) -> str:
+    """Return an override as Hydra takes it: with a quoted path, and without ``null`` as the option of a group."""
+    group, _, option = override.partition("=")
+    return f"~{group}" if group in OPTIONAL_GROUPS and option == "null" else quoted_path(override)
 
 
 def quoted_path(override: str) -> str:

@@ -10,8 +10,8 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 
-def default_options() -> dict[str, str]:
-    """Return the default option of each group that has option files."""
+def default_options() -> dict[str, str | None]:
+    """Return the default option of each group that has option files; None if that is no option."""
     entries = read_yaml_mapping(conf_dir() / "config.yaml")["defaults"]
     chosen = {group: option for entry in entries if isinstance(entry, dict) for group, option in entry.items()}
     return {group: option for group, option in chosen.items() if group in GROUPS}

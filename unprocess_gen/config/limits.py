@@ -174,6 +174,8 @@ NAME = Limit(
 )
 """Names that rows of a manifest contain."""
 
+BODY_GROUPS = Limit("a list of camera, sensor, noise", lambda value: set(value) <= {"camera", "sensor", "noise"})
+
 OUTPUT_PLACE = Limit(
     "the name of a folder or a URL s3://, gs:// or az://",
     lambda value: bool(value) and ("://" not in value or is_url(value)),

@@ -28,6 +28,9 @@ ADDED_GROUPS = {
 }
 """Groups without settings of their own: their options are added with ``+`` and are in no defaults list."""
 
+OPTIONAL_GROUPS = ("body",)
+"""Groups that may have no option: ``body=null``."""
+
 PACKAGE_DIRECTIVE = "# @package"
 """Begin of the first line of an option file whose keys are at the top level."""
 
@@ -73,6 +76,8 @@ def check_override(override: str) -> None:
         raise ConfigError(f"{override}: {ADDED_GROUPS[key].noun} is added to the settings; write +{override}")
     options = group_options(key) if key.isalpha() else []
     word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
+    if key in OPTIONAL_GROUPS and value == "null":
+        return
     if options and (not word or ("/" in value and value.endswith((".yaml", ".yml")))):
         raise ConfigError(f"{override}: expected the name of an option: {', '.join(options)}{file_hint(key, value)}")
 

@@ -646,6 +646,26 @@ class ExecutorConfig(Group):
 
 @documented
 @dataclass(frozen=True)
+class BodyConfig(Group):
+    """Name the real camera whose options of camera, sensor and noise a run uses.
+
+    Attributes
+    ----------
+    name
+        name of the body
+    missing
+        groups for which no numbers of the body are published
+    replaced
+        settings that take precedence over those of the body, as composition finds them
+    """
+
+    name: Optional[str] = key(None, limits.NAME, null="no body", decides_data=False)
+    missing: tuple[str, ...] = key((), limits.BODY_GROUPS, decides_data=False)
+    replaced: tuple[str, ...] = key((), Limit("a list of settings"), decides_data=False)
+
+
+@documented
+@dataclass(frozen=True)
 class Config(Group):
     """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level.
 
@@ -681,6 +701,7 @@ class Config(Group):
     accuracy: AccuracyConfig = field(default_factory=AccuracyConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
+    body: BodyConfig = field(default_factory=BodyConfig)
     seed: int = key(0, Integers(0, 2**63 - 1))
     split: Any = key(None, limits.SPLIT, null="no splits", since="0.3")
     out: str = key("ds", limits.OUTPUT_PLACE, decides_data=False)

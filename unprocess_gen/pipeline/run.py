@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -43,7 +44,7 @@ class Run:
     def warnings(self) -> tuple[str, ...]:
         """Collect what the user should know before the run begins, a sentence each."""
         config = self.config
-        about_noise = dark_scene_warning(config), sensor_warning(config)
+        about_noise = body_sentence(config), dark_scene_warning(config), sensor_warning(config)
         warnings = *self.listing.warnings, shards_warning(config, self.sources), *about_noise
         return tuple(filter(None, warnings))
 

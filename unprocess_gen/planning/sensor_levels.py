@@ -25,18 +25,24 @@ def sensor_warning(config: Config) -> str:
     return (
         f"noise={config.noise.name} was calibrated with {_levels_text(calibrated)}, but is simulated with "
         f"{_levels_text(chosen)} of the default sensor={default_options()['sensor']}; "
-        f"{' '.join(fitting_sensor(calibrated))} gives the calibrated levels"
+        f"{' '.join(fitting_sensor(calibrated, config.noise.name))} gives the calibrated levels"
     )
 
 
-def fitting_sensor(levels: dict[str, Any]) -> list[str]:
-    """Return the overrides of the group ``sensor`` that give some levels: an option, and settings that differ in it."""
+def fitting_sensor(levels: dict[str, Any], camera: str = "") -> list[str]:
+    """Return the overrides of the group ``sensor`` that give some levels: an option, and settings that differ in it.
+
+    Of equal options the one with the name of the camera is preferred.
+    """
     options = {name: read_yaml_mapping(conf_dir() / "sensor" / f"{name}.yaml") for name in group_options("sensor")}
 
     def differences(name: str) -> list[str]:
         return [f"sensor.{key}={value}" for key, value in levels.items() if options[name][key] != value]
 
-    option = min(options, key=lambda name: (options[name]["bits"] != levels["bits"], len(differences(name))))
+    def distance(name: str) -> tuple[bool, int, bool]:
+        return options[name]["bits"] != levels["bits"], len(differences(name)), name != camera
+
+    option = min(options, key=distance)
     return [f"sensor={option}", *differences(option)]
 
 

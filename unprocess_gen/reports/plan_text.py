@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from unprocess_gen.config import interpretation
+from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.schema import BRANCH_FIELDS, AccuracyConfig, Config, NoiseConfig
 from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Patch, Plan
@@ -129,6 +130,7 @@ def _noise_lines(config: Config, estimates: Sequence[SourceEstimate], dark_frame
         sensor_warning(config),
     )
     return [
+        *_labelled("body", [_body_text(config)]),
         *_labelled("scene", [_scene_sentence(config, plans)]),
         *(_physical_lines if interpretation.is_physical(config.noise) else _two_number_lines)(config, plans),
         *_labelled("dark", [_dark_frames_sentence(config, dark_frames)] if dark_frames else []),
@@ -137,6 +139,12 @@ def _noise_lines(config: Config, estimates: Sequence[SourceEstimate], dark_frame
         *_labelled("warning", warnings),
         *effect_table(config, [level for source in estimates for level in source.predictions]),
     ]
+
+
+def _body_text(config: Config) -> str:
+    """Name the body and the options that it has chosen, and what is not taken from it."""
+    name = config.body.name
+    return body_sentence(config) or f"{name}: camera, sensor and noise of one body" if name is not None else ""
 
 
 def _scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
