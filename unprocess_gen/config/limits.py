@@ -13,6 +13,7 @@ from typing import Any
 
 from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
 from unprocess_gen.core.object_store import is_url
+from unprocess_gen.core.targets import TARGETS
 
 Test = Callable[[Any], bool]
 
@@ -248,6 +249,11 @@ SPLIT = Limit(
     f"up to {MAX_SPLITS} names of up to 32 letters, digits, _ and -",
     _are_shares,
     lambda value: value_text(value)[:80],
+)
+
+TARGET_NAMES = Limit(
+    f"a list without repetitions of {', '.join(TARGETS)}",
+    lambda value: set(value) <= set(TARGETS) and len(set(value)) == len(value),
 )
 
 BLACK_LEVEL = LevelRange("0 to 2^bits - 2", lambda group: (0, 2**group.bits - 2))

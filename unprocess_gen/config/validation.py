@@ -59,6 +59,9 @@ SWITCHES = tuple(
 )
 """Effects that have a switch of their own."""
 
+MAX_TARGET_PIXELS = 2**29
+"""Pixels of a source up to which its targets fit a member of a shard."""
+
 SEED = settings_of(Config)["seed"]
 
 # --------------------------------------------------------------------------------------------------- public functions
@@ -264,7 +267,10 @@ def _check_output(config: Config) -> None:
 
     Integers are rounded and clipped; float32 is not.
     """
-    quantise = _named_switch(config, "quantise")
+    quantise, output = _named_switch(config, "quantise"), config.output
+    if output.targets and config.source.max_pixels > MAX_TARGET_PIXELS:
+        problem = f"12 bytes a pixel could exceed 8 GiB; expected source.max_pixels up to {MAX_TARGET_PIXELS}"
+        raise refusal("output.targets", output.targets, problem)
     if is_normalised(config):
         if config.output.clean_dtype == UINT16:
             problem = "output.dtype=float32 has no rounded clean frame; expected float32 or null"

@@ -16,20 +16,20 @@ from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.object_store import ObjectPath
 
 if TYPE_CHECKING:
-    from unprocess_gen.core.types import Frame
+    from unprocess_gen.core.types import Array
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors for which the free space of the disk is worth reporting."""
 
 
-def array_xxh3(array: Frame) -> str:
+def array_xxh3(array: Array) -> str:
     """XXH3-128 of an array's little-endian bytes, 32 hex digits."""
     import xxhash
 
     return xxhash.xxh3_128_hexdigest(little_endian(array).data)
 
 
-def little_endian(array: Frame) -> Frame:
+def little_endian(array: Array) -> Array:
     """Return an array as contiguous little-endian numbers, without a copy if it is that already."""
     import numpy as np  # takes longer than the start of a command may
 

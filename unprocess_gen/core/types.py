@@ -19,6 +19,8 @@ Raw = NDArray[np.uint16]
 Normalised = NDArray[np.float32]
 Frame = Raw | Normalised
 """Frame of a dataset: DN (uint16), or normalised to 0 at black and 1 at white (float32); mosaic or packed planes."""
+Array = Frame | Srgb
+"""Frame or target of a pair."""
 Float = NDArray[np.float64]
 
 
@@ -232,6 +234,8 @@ NEAR_NORMAL = "shot:gaussian_where_near"
 
 UINT16, FLOAT32 = "uint16", "float32"
 """Dtypes of frames."""
+UINT8 = "uint8"
+"""Dtype of most photographs."""
 MOSAIC, PACKED = "mosaic", "packed"
 """Layouts of frames: ``[H, W]``, or ``[4, H / 2, W / 2]`` (`cfa.pack`)."""
 
@@ -647,7 +651,7 @@ class Distribution:
     numbers: tuple[float, ...]
 
 
-DESCRIPTIONS = {UINT16: "<u2", FLOAT32: "<f4"}
+DESCRIPTIONS = {UINT8: "|u1", UINT16: "<u2", FLOAT32: "<f4"}
 """NumPy descriptions of the dtypes in files: little-endian."""
 
 

@@ -17,7 +17,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.core.types import (
+    DESCRIPTIONS,
     FLOAT32,
     MOSAIC,
     PACKED,
@@ -164,6 +166,9 @@ KEY_TEXT = Text(re.compile(r"\d{8,12}(-p\d{4,12})?(-l\d\dd\d\d)?"), "eight digit
 HEX_64 = Text(re.compile(r"([0-9a-f]{16})?|none"), "16 hexadecimal digits")
 HEX_128 = Text(re.compile(r"([0-9a-f]{32})?"), "32 hexadecimal digits")
 HEX_256 = Text(re.compile(r"([0-9a-f]{64})?"), "64 hexadecimal digits")
+
+
+_TARGET = f"({'|'.join(TARGETS)}):({'|'.join(DESCRIPTIONS)}):[0-9a-f]{{32}}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,6 +414,9 @@ COLUMNS = (
     Column("split", "part of the dataset that the image belongs to",
            Text(re.compile(r"[\w-]{1,32}", re.ASCII), "up to 32 letters, digits, _ and -"), Plan, since="0.3",
            empty_if="there are no splits, or the source failed"),
+    Column("targets", "stored targets, each with dtype and XXH3-128 (srgb:uint8:…), separated by ;",
+           Text(re.compile(f"({_TARGET}(;{_TARGET})*)?"), "targets as name:dtype:digest, separated by ;"), since="0.3",
+           empty_if="output.targets is empty, or the source failed"),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 

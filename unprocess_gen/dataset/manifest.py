@@ -33,6 +33,9 @@ JSON_BYTES = 5632
 """Bytes of a row's JSON without the name of its source. The longest row takes 3 less, so the next number in JSON must
 shorten another. The size decides the bytes of shards."""
 
+TARGET_JSON_BYTES = 72
+"""More bytes for each stored target: its name, dtype and digest."""
+
 MAX_LINE_BYTES = 2**17
 """Longest line of a manifest that is read. Paths have at most 4096 bytes, three characters each if encoded."""
 
@@ -41,6 +44,9 @@ MAX_DETAIL = 300
 
 FRAME_BYTES = 2**33 - 1024
 """Most bytes of one array: a member of a USTAR archive has less than 8 GiB."""
+
+TARGET_BYTES = 12
+"""Most bytes of a pixel of a target: three of float32."""
 
 
 # ------------------------------------------------------------------------------------------------------------ rows
@@ -348,8 +354,8 @@ def _check_together(row: Row) -> None:
     for name in _NEEDED:
         if row[name] is None or row[name] == "":
             raise ValueError(f"{name} is empty")
-    is_float = "float32" in (row["dtype"], row["clean_dtype"])
-    size = int(row["width"] or 0) * int(row["height"] or 0) * (4 if is_float else 2)
+    largest = TARGET_BYTES if row["targets"] else 4 if "float32" in (row["dtype"], row["clean_dtype"]) else 2
+    size = int(row["width"] or 0) * int(row["height"] or 0) * largest
     if size > FRAME_BYTES:
         raise ValueError(
             f"width={row['width']}, height={row['height']}: an array of {size} bytes; expected at most {FRAME_BYTES}"
@@ -616,7 +622,7 @@ OTHERS = "others"
 _JSON_COLUMNS = tuple(column for column in COLUMNS if column.in_json)
 
 
-def json_size(source_name: str, pairs: int = 1) -> int:
+def json_size(source_name: str, pairs: int = 1, targets: int = 0) -> int:
     """Return the size of a sample's JSON in the shard.
 
     Parameters
@@ -625,6 +631,8 @@ def json_size(source_name: str, pairs: int = 1) -> int:
         The column ``source``.
     pairs : int
         Noisy frames of the sample.
+    targets : int
+        Stored targets of a pair.
 
     Returns
     -------
@@ -632,7 +640,7 @@ def json_size(source_name: str, pairs: int = 1) -> int:
         Bytes, padding included; a multiple of 512.
     """
     named = 2 * len(json.dumps(source_name))  # the name of its clip is a part of it, or equal to it
-    return -(-(JSON_BYTES + named) * pairs // 512) * 512
+    return -(-(JSON_BYTES + named + TARGET_JSON_BYTES * targets) * pairs // 512) * 512
 
 
 def row_json(rows: Sequence[Row]) -> bytes:
@@ -657,7 +665,8 @@ def row_json(rows: Sequence[Row]) -> bytes:
     first, *others = (without_empty(row, _JSON_COLUMNS) for row in rows)
     content = {**first, OTHERS: others} if others else first
     text = json.dumps(content, separators=(",", ":")).encode("ascii")
-    size = json_size(str(first["source"]), len(rows))
+    targets = str(rows[0]["targets"])
+    size = json_size(str(first["source"]), len(rows), targets.count(";") + 1 if targets else 0)
     if len(text) >= size:
         raise ValueError(f"row {first['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")
     return text.ljust(size - 1) + b"\n"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import copy
 import csv
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, SupportsIndex, overload
+from types import MappingProxyType
+from typing import Any, NamedTuple, Self, SupportsIndex, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +20,13 @@ from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row,
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
 from unprocess_gen.dataset.shards import (
-    CLEAN,
     ArrayFormat,
     Member,
-    frame_formats,
+    arrays_of,
     map_array,
-    noisy_member,
     read_index,
     shard_name,
+    target_names,
 )
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
@@ -62,14 +62,24 @@ class Sample(_Frames):
         Manifest row: value by column.
     dataset : str
         Name of the dataset's folder; for a sweep as in ``sweep.csv``. Its path if several datasets have the same name.
+    targets : dict of str to ndarray
+        Stored targets (``output.targets``) by name.
     """
 
     dataset: str
+    targets: Mapping[str, NDArray[Any]]
 
-    def __new__(cls, clean: Frame, noisy: Frame, row: dict[str, Any], dataset: str = "") -> Sample:
-        """Return a tuple of three items with one more attribute."""
+    def __new__(
+        cls,
+        clean: Frame,
+        noisy: Frame,
+        row: dict[str, Any],
+        dataset: str = "",
+        targets: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    ) -> Self:
+        """Return a tuple of three items with two more attributes."""
         sample = super().__new__(cls, clean, noisy, row)
-        sample.dataset = dataset
+        sample.dataset, sample.targets = dataset, dict(targets)
         return sample
 
 
@@ -115,8 +125,8 @@ class RawPairs:
         sweep's datasets follow each other as in its ``sweep.csv``; jobs that left no dataset are omitted. The pairs of
         a list follow each other in its order.
     arrays_only : bool
-        Items are tuples ``(clean, noisy)`` without the row, which PyTorch's default ``collate_fn`` stacks if all frames
-        have one size. It cannot stack rows, because cells without a value are None.
+        Items are tuples ``(clean, noisy)`` and stored targets, without the row, which PyTorch's default ``collate_fn``
+        stacks if all frames have one size. It cannot stack rows, because cells without a value are None.
     split : str, optional
         Only pairs of this split (key ``split`` of the settings), by default all.
 
@@ -128,8 +138,8 @@ class RawPairs:
     Raises
     ------
     ConfigError
-        If the list is empty, no pair is in the split, or the datasets of a list differ in dtype or layout with
-        ``arrays_only``.
+        If the list is empty, no pair is in the split, or the datasets of a list differ in dtype, layout or targets
+        with ``arrays_only``.
     DamageError
         If a manifest, a shard or ``sweep.csv`` is missing or damaged; for shards when a pair is read.
     IndexError
@@ -197,7 +207,7 @@ class RawPairs:
         place = operator.index(number)
         dataset: _Dataset = self._datasets[int(self._dataset_of[place])]
         sample = dataset.read(int(self._offsets[place]))
-        return sample[:2] if self.arrays_only else sample
+        return (*sample[:2], *sample.targets.values()) if self.arrays_only else sample
 
 
 class _Dataset:
@@ -222,7 +232,8 @@ class _Dataset:
     def _is_pair(self, row: Row, split: str | None) -> bool:
         if row["status"] != "ok":
             return False
-        self.formats.add((row["dtype"], row["clean_dtype"] or row["dtype"], row["layout"]))
+        clean, targets = row["clean_dtype"] or row["dtype"], ", ".join(target_names(row)) or "no"
+        self.formats.add((row["dtype"], clean, row["layout"], targets))
         self.splits.add(str(row["split"]))
         return split in (None, row["split"])
 
@@ -230,12 +241,12 @@ class _Dataset:
         """Return the pair whose row begins at a byte."""
         row = dict(read_row(self._manifest, offset, self._columns))
         shard = int(row["shard"] or 0)
-        members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
-        clean, noisy = (
-            self._array(shard, f"{sample_key(row)}.{member}", form)
-            for member, form in zip(members, frame_formats(row), strict=True)
-        )
-        return Sample(clean, noisy, row, self.name)
+        arrays = {
+            name: self._array(shard, f"{sample_key(row)}.{stored.member}", stored.array)
+            for name, stored in arrays_of(row).items()
+        }
+        targets = {name: arrays[name] for name in target_names(row)}
+        return Sample(arrays["clean"], arrays["noisy"], row, self.name, targets)
 
     def _array(self, shard: int, name: str, form: ArrayFormat) -> Frame:
         path = self.path / "shards" / shard_name(shard)
@@ -268,8 +279,11 @@ def _check_formats(datasets: Sequence[_Dataset]) -> None:
     """Raise ConfigError if frames of several datasets cannot be stacked, whatever their sizes."""
     first = {form: dataset.name for dataset in reversed(datasets) for form in dataset.formats}
     if len(first) > 1:
-        kinds = "; ".join(f"{name}: {noisy}, clean {clean}, {layout}" for (noisy, clean, layout), name in first.items())
-        problem = "the frames differ in dtype or layout"
+        kinds = "; ".join(
+            f"{name}: {noisy}, clean {clean}, {layout}, {targets} targets"
+            for (noisy, clean, layout, targets), name in first.items()
+        )
+        problem = "the frames differ in dtype or layout, or the targets differ"
         raise ConfigError(f"RawPairs: arrays_only=True: {problem} ({kinds}); expected one; use arrays_only=False")
 
 

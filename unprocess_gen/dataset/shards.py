@@ -1,9 +1,9 @@
 """Write, read and check shards: uncompressed tar archives in the WebDataset layout.
 
 The members of one sample (an image, or a patch of it) are consecutive: ``KEY.clean.npy``, ``KEY.noisy.npy``, the noisy
-frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Arrays are uint16 or float32, mosaics [H, W]
-or packed planes [4, H / 2, W / 2]. Headers are USTAR with fixed time, owner and mode, so the bytes depend only on the
-members.
+frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Each stored target follows the frame that it
+belongs to. Frames are uint16 or float32, mosaics [H, W] or packed planes [4, H / 2, W / 2]. Headers are USTAR with
+fixed time, owner and mode, so the bytes depend only on the members.
 
 Arrays are written without a copy, and SHA-256 is computed on the way. Reading maps one array into memory; its offset
 comes from the tar headers. Timings: ``docs/performance.md``.
@@ -18,7 +18,7 @@ import math
 import os
 import tarfile
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
@@ -28,21 +28,35 @@ import numpy as np
 import xxhash
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.files import little_endian
+from unprocess_gen.core.files import array_xxh3, little_endian
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.core.types import DESCRIPTIONS, PACKED, UINT16, Frame, Row
+from unprocess_gen.core.targets import FRAME_TARGETS
+from unprocess_gen.core.types import DESCRIPTIONS, FLOAT32, PACKED, UINT16, Array, Frame, Row
 
 RECORD = 512
 END = b"\0" * (2 * RECORD)
-CLEAN, ROW = "clean.npy", "json"
+ROW = "json"
+
+PER_PAIR = ("noisy", *FRAME_TARGETS)
+"""Arrays of which each noisy frame has its own; the others are those of the sample."""
 
 MAX_JSON_BYTES = 2**27
 """Largest JSON member that is read: the rows of 99 levels with 99 draws take half of it."""
 
 
-def noisy_member(level: int, draw: int) -> str:
-    """Return the name of a noisy frame's member, without the key."""
-    return f"noisy.l{level:02d}d{draw:02d}.npy" if level or draw else "noisy.npy"
+def member_of(name: str, level: int, draw: int) -> str:
+    """Return the member, without the key, of a frame or target of a pair."""
+    return f"{name}.l{level:02d}d{draw:02d}.npy" if name in PER_PAIR and (level or draw) else f"{name}.npy"
+
+
+def targets_cell(targets: Mapping[str, Array]) -> str:
+    """Return the cell of a row that names and identifies its targets."""
+    return ";".join(f"{name}:{array.dtype.name}:{array_xxh3(array)}" for name, array in targets.items())
+
+
+def target_names(row: Row) -> list[str]:
+    """Return the names of a row's stored targets, in the order of ``output.targets``."""
+    return [entry.partition(":")[0] for entry in str(row["targets"]).split(";") if entry]
 
 
 def shard_name(number: int) -> str:
@@ -85,11 +99,11 @@ def array_format(dtype: str, layout: str, height: int, width: int) -> ArrayForma
     return ArrayFormat(dtype, shape)
 
 
-def frame_formats(row: Row) -> tuple[ArrayFormat, ArrayFormat]:
-    """Return the formats of the clean and of the noisy frame of a row."""
-    layout, height, width = str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0)
-    noisy = array_format(str(row["dtype"]), layout, height, width)
-    return noisy._replace(dtype=str(row["clean_dtype"] or row["dtype"])), noisy
+def target_format(name: str, layout: str, height: int, width: int, dtype: str = FLOAT32) -> ArrayFormat:
+    """Return the format of a target."""
+    if name in FRAME_TARGETS:
+        return array_format(dtype, layout, height, width)
+    return ArrayFormat(dtype, (height, width, 3))
 
 
 def _tar_header(name: str, size: int) -> bytes:
@@ -102,9 +116,15 @@ def _padding(size: int) -> int:
     return -size % RECORD
 
 
-def image_bytes(array: ArrayFormat, json_bytes: int, pairs: int = 1, clean: ArrayFormat | None = None) -> int:
+def image_bytes(
+    array: ArrayFormat,
+    json_bytes: int,
+    pairs: int = 1,
+    clean: ArrayFormat | None = None,
+    targets: Sequence[ArrayFormat] = (),
+) -> int:
     """Return the bytes of one sample in a shard."""
-    sizes = [len(form.header) + form.size for form in (clean or array, *[array] * pairs)]
+    sizes = [len(form.header) + form.size for form in (clean or array, *[array] * pairs, *targets)]
     return sum(RECORD + member + _padding(member) for member in (*sizes, json_bytes))
 
 
@@ -159,7 +179,7 @@ class ShardWriter:
         self._wait(-1)
         return self._hash.hexdigest()
 
-    def add_frame(self, key: str, member: str, frame: Frame) -> None:
+    def add_frame(self, key: str, member: str, frame: Array) -> None:
         """Append a frame of a sample."""
         header = ArrayFormat(frame.dtype.name, frame.shape).header
         self._member(f"{key}.{member}", len(header) + frame.nbytes, header, little_endian(frame).data)
@@ -262,10 +282,25 @@ class ExpectedFrame(NamedTuple):
     array: ArrayFormat
 
 
+def arrays_of(row: Row) -> dict[str, ExpectedFrame]:
+    """Return the frames and targets of a row by name, in the order of their members."""
+    layout, height, width = str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0)
+    stored = (entry.split(":") for entry in str(row["targets"]).split(";") if entry)
+    targets = {name: (digest, target_format(name, layout, height, width, dtype)) for name, dtype, digest in stored}
+    clean, noisy = (
+        (str(row[f"{name}_xxh3"]), array_format(str(dtype), layout, height, width))
+        for name, dtype in (("clean", row["clean_dtype"] or row["dtype"]), ("noisy", row["dtype"]))
+    )
+    arrays = {"clean": clean, **targets, "noisy": noisy}
+    arrays |= {name: arrays.pop(name) for name in FRAME_TARGETS if name in targets}  # after the noisy frame
+    place = int(row["level"] or 0), int(row["draw"] or 0)
+    return {name: ExpectedFrame(member_of(name, *place), *array) for name, array in arrays.items()}
+
+
 class ExpectedSample(NamedTuple):
     """Hold what a shard must contain of one sample.
 
-    ``frames`` are the clean frame, then the noisy ones; ``json`` is the content of ``KEY.json``.
+    ``frames`` are in the order of their members; ``json`` is the content of ``KEY.json``.
     """
 
     key: str

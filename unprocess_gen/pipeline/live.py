@@ -17,31 +17,27 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.random_streams import EPOCHS, crop_words
-from unprocess_gen.core.types import Frame, Patch, Plan, Row, Srgb
+from unprocess_gen.core.targets import TARGETS
+from unprocess_gen.core.types import Frame, Patch, Plan, Row
 from unprocess_gen.dataset.reader import Sample
-from unprocess_gen.dataset.training import noise_std, to_light
+from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPairs, RecordedPairs
 from unprocess_gen.pipeline.pairs import PlannedImage
+from unprocess_gen.pipeline.targets import kernels_for, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.simulation import self_test
-from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
+from unprocess_gen.sources.patches import even_corner, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
 
 REDRAWS = ("noise", "all", "none")
-TARGETS = ("variance", "noise_std", "srgb")
 
 
 class LiveSample(Sample):
     """One pair of `LivePairs`: ``clean, noisy, row = sample``, as `Sample`.
 
-    Attributes
-    ----------
-    targets : dict of str to ndarray
-        The arrays that ``targets`` of `LivePairs` names.
+    ``targets`` are the arrays that ``targets`` of `LivePairs` names.
     """
-
-    targets: dict[str, NDArray[Any]]
 
 
 class LivePairs:
@@ -73,8 +69,9 @@ class LivePairs:
         Frames are float32 with 0 at black and 1 at white.
     targets : sequence of str
         More arrays: ``"variance"`` of the noise at each site, by the row's law on the clean frame; ``"noise_std"``, the
-        standard deviation that `noise_std` estimates from the noisy frame; ``"srgb"``, the pixels of the photograph.
-        The first two are float32, in DN² and DN, or in units of white with ``as_float``.
+        standard deviation that `noise_std` estimates from the noisy frame; ``"srgb"``, the pixels of the photograph;
+        ``"linear_rgb"``, the scene before the mosaic, 0 at black and 1 at white, [H, W, 3]. The first two are float32,
+        in DN² and DN, or in units of white with ``as_float``; the last is float32.
     arrays_only : bool
         Items are tuples of the clean frame, the noisy frame and the targets, which PyTorch's default ``collate_fn``
         stacks.
@@ -144,20 +141,17 @@ class LivePairs:
         image = self._source.image(number)
         plan, patch = self._redrawn(image, epoch if self._redraw != "none" else 0)
         settings = self._source.settings
-        self_test.check(self_test.kernels(plan))
+        for kernels in kernels_for(self._targets, plan):
+            self_test.check(kernels)
         _, _, pair = next(PlannedImage(image.srgb, (plan,), (patch,), dark_folder=settings.dark_folder).pairs())
         row: Any = image.row(plan, patch, pair)
         clean, noisy = pair.clean, pair.noisy
         if self._as_float:
             clean, noisy = _light(clean, row), _light(noisy, row)
-        sample = LiveSample(clean, noisy, row, self._source.name)
-        sample.targets = {
-            name: self._target(
-                name, pair.clean if name == "variance" else pair.noisy, row, crop_patch(image.srgb, patch)
-            )
-            for name in self._targets
-        }
-        return (clean, noisy, *sample.targets.values()) if self._arrays_only else sample
+        targets = targets_of(self._targets, image.srgb, plan, patch, pair, row, as_float=self._as_float)
+        if self._arrays_only:
+            return (clean, noisy, *targets.values())
+        return LiveSample(clean, noisy, row, self._source.name, targets)
 
     def _redrawn(self, image: LiveImage, epoch: int) -> tuple[Plan, Patch]:
         """Return the plan and the patch of an epoch."""
@@ -173,15 +167,6 @@ class LivePairs:
             if plan.noise.dark.sha256 and settings.dark_frames is not None:
                 plan = next_dark_frame(plan, settings.dark_frames, epoch)
         return plan, patch if self._patch is None else _crop(plan, patch, self._patch)
-
-    def _target(self, name: str, frame: Frame, row: Row, srgb: Srgb) -> NDArray[Any]:
-        """Compute a target from the frame of its law, or the photograph."""
-        if name == "srgb":
-            return np.array(srgb)
-        black, white = int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)
-        frame_dn = frame if frame.dtype == np.uint16 else frame * np.float32(white - black) + np.float32(black)
-        std = noise_std(frame_dn, row) / np.float32(white - black if self._as_float else 1)
-        return std * std if name == "variance" else std
 
 
 def _live_source(dataset: Any, root: str | None, cache: PixelCache | None) -> LiveSource:

@@ -18,7 +18,7 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,16 +30,16 @@ from unprocess_gen.config.validation import check_parquet
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.files import commit_file, file_sha256, machine_errors
 from unprocess_gen.core.records import parse_json
-from unprocess_gen.core.types import Frame, Row
+from unprocess_gen.core.types import Array, Row
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.columns import HEADERS, NAMES
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
 from unprocess_gen.dataset.manifest import read_rows, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import (
-    CLEAN,
     ExpectedSample,
     ShardWriter,
+    arrays_of,
     check_members,
     intact_frames,
     json_inside,
@@ -49,7 +49,7 @@ from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardResult, Tally
-from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, shard_rows
+from unprocess_gen.pipeline.verify import expected_samples, shard_rows
 from unprocess_gen.pipeline.worker import make_image
 from unprocess_gen.pipeline.workspace import add_parquet, dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkPlaces, with_dark_places
@@ -287,18 +287,17 @@ class _Repair:
         yield RepairStep(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs regenerated{others}")
 
     def _add_sample(
-        self, writer: ShardWriter, sample: ExpectedSample, rows: Sequence[Row], frames: dict[str, Frame]
+        self, writer: ShardWriter, sample: ExpectedSample, rows: Sequence[Row], frames: Mapping[str, Array]
     ) -> int:
         """Append a sample with kept or regenerated frames; return how many of its pairs were kept."""
-        intact = [row for row in rows if CLEAN in frames and noisy_member_of(row) in frames]
-        for row in rows:
-            if row not in intact:
-                pair = self._regenerator.regenerate_exactly(row)
-                frames = {CLEAN: pair.clean, **frames, noisy_member_of(row): pair.noisy}
-        for member in (CLEAN, *map(noisy_member_of, rows)):
-            writer.add_frame(sample.key, member, frames[member])
+        damaged = [row for row in rows if any(stored.member not in frames for stored in arrays_of(row).values())]
+        for row in damaged:
+            stored, arrays = arrays_of(row), self._regenerator.regenerate_exactly(row)
+            frames = {**{stored[name].member: array for name, array in arrays.items()}, **frames}
+        for frame in sample.frames:
+            writer.add_frame(sample.key, frame.member, frames[frame.member])
         writer.add_rows(sample.key, sample.json)
-        return len(intact)
+        return len(rows) - len(damaged)
 
     def _move_aside(self, path: Path) -> Path:
         place = self._folder / "set_aside"

@@ -21,11 +21,13 @@ from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Plan, Row, Source
+from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, read_rows, rows_with_offsets
+from unprocess_gen.dataset.shards import arrays_of, target_names
 from unprocess_gen.pipeline.pairs import PlannedImage
+from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkFolder, DarkPlaces
 from unprocess_gen.sources.loader import load_source
@@ -164,14 +166,14 @@ def replay(
 def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayResult:
     key, source = str(row["key"]), str(row["source"])
     try:
-        pair = regenerator.regenerate(row)
+        arrays = regenerator.regenerate(row)
     except SourceChangedError as error:
         return ReplayResult(key, source, str(error), source_changed=True)
     except DamageError as error:
         return ReplayResult(key, source, str(error))
     if to is not None:
-        _save(pair, to, key)
-    return ReplayResult(key, source, _difference(pair, row), written=to is not None)
+        _save(arrays, to, key)
+    return ReplayResult(key, source, _difference(arrays, row), written=to is not None)
 
 
 class PairRegenerator:
@@ -185,14 +187,15 @@ class PairRegenerator:
         self._root, self._dark = root, dark
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
-    def regenerate(self, row: Row) -> Pair:
-        """Return the pair of a row without comparing its digests.
+    def regenerate(self, row: Row) -> Targets:
+        """Return the frames and targets of a row by name, without comparing their digests.
 
         Raises SourceChangedError if the source was changed or deleted, DamageError if the row has no valid plan,
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
         """
-        plan = plan_from_row(row)
-        self_test.check(self_test.kernels(plan))
+        plan, names = plan_from_row(row), target_names(row)
+        for kernels in kernels_for(names, plan):
+            self_test.check(kernels)
         photograph = self.photograph(row)
         patch = patch_from_row(row)
         height, width = photograph.srgb.shape[:2]
@@ -203,7 +206,8 @@ class PairRegenerator:
             )
         image = PlannedImage(photograph.srgb, (plan,), (patch,), dark_folder=self._dark_pixels(plan))
         _, _, pair = next(image.pairs())
-        return pair
+        targets = targets_of(names, photograph.srgb, plan, patch, pair, row)
+        return {"clean": pair.clean, "noisy": pair.noisy, **targets}
 
     def photograph(self, row: Row) -> Photograph:
         """Return the decoded source of a row; raise as `regenerate`."""
@@ -232,12 +236,12 @@ class PairRegenerator:
         except ConfigError as error:
             raise SourceChangedError(str(error)) from error
 
-    def regenerate_exactly(self, row: Row) -> Pair:
-        """Return the pair of a row; raise as `regenerate`, and DamageError if the pair has other digests."""
-        pair = self.regenerate(row)
-        if difference := _difference(pair, row):
+    def regenerate_exactly(self, row: Row) -> Targets:
+        """Return the arrays of a row; raise as `regenerate`, and DamageError if they have other digests."""
+        arrays = self.regenerate(row)
+        if difference := _difference(arrays, row):
             raise DamageError(difference)
-        return pair
+        return arrays
 
     def _load_unchanged(self, row: Row) -> tuple[str, Photograph]:
         """Load a row's source; raise SourceChangedError unless the file can be read and used as when it was listed."""
@@ -261,11 +265,11 @@ class PairRegenerator:
         return self._kept[2:]
 
 
-def _difference(pair: Pair, row: Row) -> str:
+def _difference(arrays: Targets, row: Row) -> str:
     return "; ".join(
-        f"the XXH3-128 of {name} is {found}, the row records {row[f'{name}_xxh3']}"
-        for name, found in (("clean", array_xxh3(pair.clean)), ("noisy", array_xxh3(pair.noisy)))
-        if found != row[f"{name}_xxh3"]
+        f"the XXH3-128 of {name} is {found}, the row records {stored.digest}"
+        for name, stored in arrays_of(row).items()
+        if (found := array_xxh3(arrays[name])) != stored.digest
     )
 
 
@@ -273,11 +277,11 @@ def _changed(sha256: str, row: Row) -> str:
     return f"its source has changed: SHA-256 is {sha256}, the row records {row['source_sha256']}; {ADVICE}"
 
 
-def _save(pair: Pair, to: Path, key: str) -> None:
+def _save(arrays: Targets, to: Path, key: str) -> None:
     with machine_errors(to):
         to.mkdir(parents=True, exist_ok=True)
-        np.save(to / f"{key}.clean.npy", pair.clean)
-        np.save(to / f"{key}.noisy.npy", pair.noisy)
+        for name, array in arrays.items():
+            np.save(to / f"{key}.{name}.npy", array)
 
 
 def source_of(row: Row) -> Source:

@@ -21,9 +21,10 @@ from unprocess_gen.core.files import free_bytes
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import PACKED, Source
+from unprocess_gen.core.targets import FRAME_TARGETS
+from unprocess_gen.core.types import FLOAT32, PACKED, UINT8, UINT16, Source
 from unprocess_gen.dataset.manifest import json_size
-from unprocess_gen.dataset.shards import array_format, image_bytes, shard_bytes
+from unprocess_gen.dataset.shards import array_format, image_bytes, shard_bytes, target_format
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.sources.image.headers import probe
@@ -53,7 +54,7 @@ class SizeEstimate(NamedTuple):
     largest_shard: int
 
 
-def source_bytes(config: Config, name: str, height: int, width: int) -> int:
+def source_bytes(config: Config, name: str, height: int, width: int, bits: int = 8) -> int:
     """Return the bytes that one source takes in its shard.
 
     Parameters
@@ -64,6 +65,8 @@ def source_bytes(config: Config, name: str, height: int, width: int) -> int:
         Name of the source in the manifest; it decides the size of the JSON members.
     height, width : int
         Pixels of the decoded source after ``source.downscale``.
+    bits : int
+        Bits of the source, 8 or 16; they decide the size of the target ``srgb``.
 
     Returns
     -------
@@ -77,10 +80,18 @@ def source_bytes(config: Config, name: str, height: int, width: int) -> int:
     if min(height, width) < max(smallest, config.source.min_side or 1):
         return 0
     patches = list_patches(rule, 0, height, width, output.layout)
-    json_bytes = json_size(name, pairs)
-    noisy = [array_format(output.dtype, output.layout, patch.height, patch.width) for patch in patches]
-    clean = [form._replace(dtype=output.clean_dtype or output.dtype) for form in noisy]
-    return sum(image_bytes(form, json_bytes, pairs, of_clean) for form, of_clean in zip(noisy, clean, strict=True))
+    json_bytes, total = json_size(name, pairs, len(output.targets)), 0
+    srgb_dtype = UINT16 if bits == 16 or config.source.downscale > 1 else UINT8
+    for patch in patches:
+        noisy = array_format(output.dtype, output.layout, patch.height, patch.width)
+        targets = [
+            target_format(target, output.layout, patch.height, patch.width, srgb_dtype if target == "srgb" else FLOAT32)
+            for target in output.targets
+            for _ in range(pairs if target in FRAME_TARGETS else 1)
+        ]
+        clean = noisy._replace(dtype=output.clean_dtype or output.dtype)
+        total += image_bytes(noisy, json_bytes, pairs, clean, targets)
+    return total
 
 
 def estimate_shards(config: Config, tasks: Sequence[ShardTask], headers: int = SAMPLE) -> SizeEstimate:
@@ -216,7 +227,7 @@ def _sampled_bytes(config: Config, sources: Sequence[Source], count: int) -> lis
 
 
 def _size_in_shard(config: Config, source: Source, read: Read) -> int:
-    side = config.source.downscale
+    side, bits = config.source.downscale, 8
     if config.source.root is None:
         height, width = synthetic.SIZES.get(source.path, synthetic.DEFAULT_SIZE)
     elif source.is_video:
@@ -226,5 +237,5 @@ def _size_in_shard(config: Config, source: Source, read: Read) -> int:
         header = probe(read(config.source.root, source))
         if header.missing or header.width * header.height > config.source.max_pixels:
             return 0
-        height, width = header.height, header.width
-    return source_bytes(config, source.name, height // side, width // side)
+        height, width, bits = header.height, header.width, header.bits
+    return source_bytes(config, source.name, height // side, width // side, bits)

@@ -28,12 +28,10 @@ from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_rows, row_json
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 from unprocess_gen.dataset.shards import (
-    CLEAN,
     ExpectedFrame,
     ExpectedSample,
+    arrays_of,
     check_members,
-    frame_formats,
-    noisy_member,
     shard_name,
 )
 from unprocess_gen.pipeline.progress import with_bar
@@ -228,12 +226,8 @@ def _expected_sample(rows: Sequence[Row]) -> ExpectedSample:
     width, height = rows[0]["width"], rows[0]["height"]
     if not isinstance(width, int) or not isinstance(height, int):
         raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
-    of_clean, of_noisy = frame_formats(rows[0])
-    clean = ExpectedFrame(CLEAN, str(rows[0]["clean_xxh3"]), of_clean)
-    noisy = (ExpectedFrame(noisy_member_of(row), str(row["noisy_xxh3"]), of_noisy) for row in rows)
-    return ExpectedSample(sample_key(rows[0]), (clean, *noisy), row_json(rows))
-
-
-def noisy_member_of(row: Row) -> str:
-    """Return the name of the shard member that contains a row's noisy frame."""
-    return noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
+    frames: dict[str, ExpectedFrame] = {}
+    for row in rows:
+        for frame in arrays_of(row).values():
+            frames.setdefault(frame.member, frame)
+    return ExpectedSample(sample_key(rows[0]), tuple(frames.values()), row_json(rows))

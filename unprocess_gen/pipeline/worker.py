@@ -8,6 +8,7 @@ its memory, for minutes.
 from __future__ import annotations
 
 import ctypes
+import itertools
 import os
 import signal
 import sys
@@ -25,10 +26,11 @@ from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
-from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
+from unprocess_gen.dataset.shards import PER_PAIR, ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.pairs import plan_pixels
 from unprocess_gen.pipeline.run_records import LIMIT, Deaths, commit_shard
 from unprocess_gen.pipeline.storage import Storage
+from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
@@ -136,15 +138,21 @@ def make_image(
     is_cut = patch_rule(config.source) is not None
     rows: list[Row] = []
     sample: list[Row] = []
+    targets: Targets = {}
     for patch, plan, pair in log.times.each_simulated(image.pairs()):
         key = patch_key(source.index, patch, several=is_cut)
         if plan is image.plans[0]:
-            sample, clean_xxh3 = [], array_xxh3(pair.clean)
-            writer.add_frame(key, CLEAN, pair.clean)
-        writer.add_frame(key, noisy_member(plan.noise.level, plan.noise.draw), pair.noisy)
+            sample, targets, clean_xxh3 = [], {}, array_xxh3(pair.clean)
         digests = clean_xxh3, array_xxh3(pair.noisy)
         row_key = pair_key(key, plan, several=len(image.plans) > 1)
         row = pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn)
+        with log.times.adding("simulate_s"):
+            targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair, row, known=targets)
+        row = {**row, "targets": targets_cell(targets)}
+        arrays = {"clean": pair.clean, "noisy": pair.noisy, **targets}
+        for name, stored in arrays_of(row).items():
+            if not sample or name in PER_PAIR:
+                writer.add_frame(key, stored.member, arrays[name])
         sample.append(row)
         if plan is image.plans[-1]:
             writer.add_rows(key, row_json(sample))
@@ -169,7 +177,8 @@ def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
     Tests only the kernels in use, because each takes seconds to compile.
     """
     failures: list[str] = []
-    for kernels in dict.fromkeys(map(self_test.kernels, plans)):
+    needed = (kernels_for(context.config.output.targets, plan) for plan in plans)
+    for kernels in dict.fromkeys(itertools.chain.from_iterable(needed)):
         if not self_test.are_compiled(kernels):
             context.report_compiling()
         if context.config.self_test == "stop":

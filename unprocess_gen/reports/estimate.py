@@ -23,6 +23,7 @@ from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.targets import FRAME_TARGETS
 from unprocess_gen.core.types import Plan, Source, Srgb
 from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
@@ -30,6 +31,7 @@ from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import SAMPLE as SIZE_SAMPLE
 from unprocess_gen.pipeline.sizes import estimate_shards, source_bytes
+from unprocess_gen.pipeline.targets import targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
 from unprocess_gen.planning.source_noise import noise_ratio
@@ -205,16 +207,20 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     levels, predictions = zip(*planned, strict=True)
     height, width = photograph.srgb.shape[:2]
     clean_levels = 0
-    for _, plan, pair in image.pairs():
+    for patch, plan, pair in image.pairs():
         if not clean_levels and pair.clean.dtype == np.uint16:
             clean_levels = int(np.count_nonzero(np.bincount(pair.clean.reshape(-1))))
-        for frame in (pair.clean, pair.noisy) if plan is image.plans[0] else (pair.noisy,):
+        numbers = {name: getattr(plan.sensor, name) for name in ("black_level_dn", "white_level_dn")}
+        numbers |= {"a_dn": plan.noise.a_dn, "b_dn2": plan.noise.b_dn2}
+        names = [name for name in config.output.targets if plan is image.plans[0] or name in FRAME_TARGETS]
+        targets = targets_of(names, photograph.srgb, plan, patch, pair, numbers).values()
+        for frame in (*([pair.clean] if plan is image.plans[0] else []), pair.noisy, *targets):
             array_xxh3(frame)
             hashlib.sha256(frame.data)
     return SourceEstimate(
         source,
         time.perf_counter() - started,
-        source_bytes(config, source.name, height, width),
+        source_bytes(config, source.name, height, width, 8 * photograph.srgb.itemsize),
         levels,
         predictions=predictions,
         patches=len(image.patches),

@@ -17,12 +17,24 @@ from dataclasses import replace
 import numpy as np
 
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import PACKED, Counts, DarkPixels, Float, Frame, Pair, Plan, Srgb
+from unprocess_gen.core.types import (
+    FLOAT32,
+    MOSAIC,
+    PACKED,
+    Counts,
+    DarkPixels,
+    Float,
+    Frame,
+    Normalised,
+    Pair,
+    Plan,
+    Srgb,
+)
 from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
-from unprocess_gen.simulation.kernels.render import pass_key, render_pairs
-from unprocess_gen.simulation.reference.cfa import pack
-from unprocess_gen.simulation.reference.sensor import noisy_limits, normalise, quantise, to_dn
+from unprocess_gen.simulation.kernels.render import pass_key, render_clean, render_pairs
+from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
+from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
 
 
@@ -110,6 +122,45 @@ def _pairs(
         for pair in render_pairs(srgb, some, origin, dark_pixels):
             clean = pair.clean if clean is None else clean
             yield pair if clean is pair.clean else replace(pair, clean=clean)
+
+
+def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:
+    """Compute the scene before the mosaic: the clean frame with all three channels at every site.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Display-referred codes, R, G, B.
+    plan : Plan
+        All parameters of the pair.
+    origin : (int, int)
+        Row and column of ``srgb[0, 0]`` in the full frame.
+
+    Returns
+    -------
+    ndarray of float32, [H, W, 3]
+        Camera RGB with all that the clean frame contains, 0 at black and 1 at white. The channel of a site's filter is
+        its unrounded clean value. If clean frames are rounded, all values round to the DN of the exact light; a few
+        are therefore the second nearest float32. ``accuracy=fast`` changes clean frames, and not these values.
+
+    Raises
+    ------
+    ValueError
+        As `make_pair`.
+    """
+    _check_image(srgb, plan, origin)
+    srgb, levels_dn = _dequantise(srgb, plan, origin), (plan.sensor.black_level_dn, plan.sensor.white_level_dn)
+    channels: list[Normalised] = []
+    for pattern in ONE_COLOUR:
+        colour = plan.replace(pattern=pattern, layout=MOSAIC, methods=())
+        light = render_clean(srgb, colour.replace(clean_dtype=FLOAT32), origin).astype(np.float32, copy=False)
+        if not plan.output.clean_normalised:
+            dn = render_clean(srgb, colour, origin).astype(np.float64)
+            rounded = np.rint(in_dn(light, levels_dn))
+            towards = np.copysign(np.float32(np.inf), dn - rounded).astype(np.float32)
+            light = np.where(rounded == dn, light, np.nextafter(light, towards))
+        channels.append(light)
+    return np.stack(channels, axis=-1)
 
 
 FRAMES_PER_PASS = 5

@@ -14,6 +14,37 @@ CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """Filters of the sites (0, 0), (0, 1), (1, 0), (1, 1), in the order of the DNG tag CFAPattern."""
 
+MONO = "MONO"
+"""Pattern of a sensor without colour filters."""
+
+ONE_COLOUR = ("RRRR", "GGGG", "BBBB")
+"""Patterns with the same filter at all sites; no sensor has them."""
+
+
+def filters(pattern: str) -> str:
+    """Return the letters of the filters of the 2x2 tile, row by row.
+
+    Parameters
+    ----------
+    pattern : str
+        One of `PATTERNS` or `ONE_COLOUR`, or `MONO`, whose sites count as green: all channels of its camera are equal.
+
+    Returns
+    -------
+    str
+        Four letters.
+
+    Raises
+    ------
+    ValueError
+        If the pattern is unknown.
+    """
+    if pattern == MONO:
+        return "GGGG"
+    if pattern not in PATTERNS + ONE_COLOUR:
+        raise ValueError(f"pattern={pattern}: unknown CFA pattern; expected one of {', '.join((*PATTERNS, MONO))}")
+    return pattern
+
 
 def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the channel of each site of the 2x2 tile.
@@ -21,7 +52,7 @@ def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int
     Parameters
     ----------
     pattern : str
-        One of `PATTERNS`.
+        As for `filters`.
     origin : (int, int)
         Row and column in the full frame of the site at [0][0].
 
@@ -42,12 +73,10 @@ def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int
     >>> tile("RGGB", origin=(0, 1))
     ((1, 0), (2, 1))
     """
-    if pattern not in PATTERNS:
-        raise ValueError(f"pattern={pattern}: unknown CFA pattern; expected one of {', '.join(PATTERNS)}")
-    y0, x0 = origin
+    letters, (y0, x0) = filters(pattern), origin
 
     def channel(y: int, x: int) -> int:
-        return CHANNELS.index(pattern[(y + y0) % 2 * 2 + (x + x0) % 2])
+        return CHANNELS.index(letters[(y + y0) % 2 * 2 + (x + x0) % 2])
 
     return (channel(0, 0), channel(0, 1)), (channel(1, 0), channel(1, 1))
 
@@ -87,20 +116,22 @@ def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[i
     Parameters
     ----------
     pattern : str
-        One of `PATTERNS`.
+        As for `filters`.
     origin : (int, int)
         Row and column in the full frame of the tile's first site.
 
     Returns
     -------
     tuple of four (int, int)
-        Row and column for each of `PLANES`.
+        Row and column for each of `PLANES`; the four sites row by row if all have the same filter.
 
     Examples
     --------
     >>> plane_sites("GBRG")
     ((1, 0), (1, 1), (0, 0), (0, 1))
     """
+    if pattern not in PATTERNS and len(set(filters(pattern))) == 1:
+        return (0, 0), (0, 1), (1, 0), (1, 1)
     sites = tile(pattern, origin)
     red = next((y, x) for y in (0, 1) for x in (0, 1) if sites[y][x] == 0)
     y, x = red
@@ -127,8 +158,10 @@ def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame
     Raises
     ------
     ValueError
-        If a side is odd.
+        If a side is odd, or the pattern is unknown or `MONO`.
     """
+    if pattern == MONO:
+        raise ValueError(f"pattern={MONO}: one plane; expected a CFA pattern; use the frame as it is")
     height, width = mosaic.shape
     if height % 2 or width % 2:
         raise ValueError(f"mosaic={width} x {height}: odd side; expected even width and height for packed planes")
