@@ -157,8 +157,9 @@ def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Norm
         if not plan.output.clean_normalised:
             dn = render_clean(srgb, colour, origin).astype(np.float64)
             rounded = np.rint(in_dn(light, levels_dn))
-            towards = np.copysign(np.float32(np.inf), dn - rounded).astype(np.float32)
-            light = np.where(rounded == dn, light, np.nextafter(light, towards))
+            wrong = rounded != dn
+            towards = np.copysign(np.inf, (dn - rounded)[wrong]).astype(np.float32)
+            light[wrong] = np.nextafter(light[wrong], towards)
         channels.append(light)
     return np.stack(channels, axis=-1)
 

@@ -8,7 +8,6 @@ from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.reference.cfa import filters
 
 COLOURS = ("red", "green", "blue")
 
@@ -41,7 +40,7 @@ class GainByColour(Effect):
 
     def plane_gains(self, plan: Plan) -> tuple[float, ...]:
         """Return the gain of the colour of each site of the tile."""
-        return tuple(plan.physics.gain_by_colour["RGB".index(colour)] for colour in filters(plan.sensor.pattern))
+        return tuple(plan.physics.gain_by_colour["RGB".index(colour)] for colour in plan.sensor.pattern)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict a change of the shot noise: its standard deviation differs by a factor √gain."""

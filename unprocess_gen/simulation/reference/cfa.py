@@ -14,9 +14,6 @@ CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """Filters of the sites (0, 0), (0, 1), (1, 0), (1, 1), in the order of the DNG tag CFAPattern."""
 
-MONO = "MONO"
-"""Pattern of a sensor without colour filters."""
-
 ONE_COLOUR = ("RRRR", "GGGG", "BBBB")
 """Patterns with the same filter at all sites; no sensor has them."""
 
@@ -27,7 +24,7 @@ def filters(pattern: str) -> str:
     Parameters
     ----------
     pattern : str
-        One of `PATTERNS` or `ONE_COLOUR`, or `MONO`, whose sites count as green: all channels of its camera are equal.
+        One of `PATTERNS` or `ONE_COLOUR`.
 
     Returns
     -------
@@ -39,10 +36,8 @@ def filters(pattern: str) -> str:
     ValueError
         If the pattern is unknown.
     """
-    if pattern == MONO:
-        return "GGGG"
     if pattern not in PATTERNS + ONE_COLOUR:
-        raise ValueError(f"pattern={pattern}: unknown CFA pattern; expected one of {', '.join((*PATTERNS, MONO))}")
+        raise ValueError(f"pattern={pattern}: unknown CFA pattern; expected one of {', '.join(PATTERNS)}")
     return pattern
 
 
@@ -130,7 +125,7 @@ def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[i
     >>> plane_sites("GBRG")
     ((1, 0), (1, 1), (0, 0), (0, 1))
     """
-    if pattern not in PATTERNS and len(set(filters(pattern))) == 1:
+    if pattern in ONE_COLOUR:
         return (0, 0), (0, 1), (1, 0), (1, 1)
     sites = tile(pattern, origin)
     red = next((y, x) for y in (0, 1) for x in (0, 1) if sites[y][x] == 0)
@@ -158,10 +153,8 @@ def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame
     Raises
     ------
     ValueError
-        If a side is odd, or the pattern is unknown or `MONO`.
+        If a side is odd.
     """
-    if pattern == MONO:
-        raise ValueError(f"pattern={MONO}: one plane; expected a CFA pattern; use the frame as it is")
     height, width = mosaic.shape
     if height % 2 or width % 2:
         raise ValueError(f"mosaic={width} x {height}: odd side; expected even width and height for packed planes")
