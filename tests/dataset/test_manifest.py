@@ -198,12 +198,14 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     passed = {"the status is ok"}
     same = "the clean array has the dtype of the noisy one, or the source failed"
     unassumed, unsplit = "no effect uses one, or effects.assumed is off", "there are no splits, or the source failed"
-    absent = {unassumed, unsplit, same, *BY_DEFAULT}
+    untargeted = "output.targets is empty, or the source failed"
+    absent = {unassumed, unsplit, untargeted, same, *BY_DEFAULT}
     measured = pair_row("0" * 8, SOURCE, SHA256, 1, 0, PHYSICAL, PAIR, ("1" * 32, "2" * 32), PATCH, 1.5)
     holding = {
         "pair": (row_of(PHYSICAL), passed | absent),
         "measured": (measured, passed | absent - {UNMEASURED}),
         "split": (row_of(PHYSICAL.replace(split="val")), passed | absent - {unsplit}),
+        "targets": ({**row_of(PHYSICAL), "targets": "srgb:uint8:" + "1" * 32}, passed | absent - {untargeted}),
         "dark frame": (row_of(DARK), passed | absent - OF_DARK_FRAMES),
         "assumed": (row_of(PHYSICAL.replace(assumed=("prnu_std",))), passed | absent - {unassumed}),
         "float clean": (row_of(PHYSICAL.replace(clean_dtype="float32")), passed | absent - {same}),

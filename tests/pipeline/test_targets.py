@@ -26,7 +26,7 @@ RECIPE = ("noise=sony_a7s2", "noise.levels=[1600,3200]", "noise.draws=2", "sourc
 ORIGIN = (1, 57)
 
 
-def plan_with(**values: object) -> Plan:
+def plan_with(**values: object) -> ug.Plan:
     return GOLDEN_PLAN.replace(**values)
 
 

@@ -1,4 +1,4 @@
-"""Name the targets: arrays for a training beside the frames of a pair. Imports nothing, because ``--help`` needs it."""
+"""Name the targets: arrays for a training, next to the frames of a pair. Imports nothing: ``--help`` needs it."""
 
 FRAME_TARGETS = ("variance", "noise_std")
 """Targets that belong to a noisy frame, in its layout."""

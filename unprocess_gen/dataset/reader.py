@@ -283,7 +283,7 @@ def _check_formats(datasets: Sequence[_Dataset]) -> None:
             f"{name}: {noisy}, clean {clean}, {layout}, {targets} targets"
             for (noisy, clean, layout, targets), name in first.items()
         )
-        problem = "the frames differ in dtype or layout, or the targets differ"
+        problem = "the frames differ in dtype or layout, or in targets"
         raise ConfigError(f"RawPairs: arrays_only=True: {problem} ({kinds}); expected one; use arrays_only=False")
 
 

@@ -1,4 +1,4 @@
-"""Compute the targets of a pair: arrays for a training beside its frames."""
+"""Compute the targets of a pair: arrays for a training, next to its frames."""
 
 from __future__ import annotations
 
