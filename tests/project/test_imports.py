@@ -41,6 +41,7 @@ ONLY_IN = {
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng"},
     "pyarrow": {"dataset.parquet"},
+    "torch": {"torch"},
     "dask": {"pipeline.executors.dask"},
     "distributed": {"pipeline.executors.dask"},
 }
