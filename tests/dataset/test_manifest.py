@@ -177,7 +177,9 @@ def test_columns_have_the_order_of_the_contract() -> None:
 
 (UNMEASURED,) = (column.empty_if for column in COLUMNS if column.name == "source_noise_dn")
 OF_DARK_FRAMES = {column.empty_if for column in COLUMNS if column.name.startswith("dark_") and column.since == "0.2"}
+(NO_LIGHT,) = (column.empty_if for column in COLUMNS if column.name == "cct_k")
 BY_DEFAULT = {
+    NO_LIGHT,
     "exposure_ratio is 1",
     "it is 0",
     "all are 1",
@@ -206,6 +208,7 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
         "measured": (measured, passed | absent - {UNMEASURED}),
         "split": (row_of(PHYSICAL.replace(split="val")), passed | absent - {unsplit}),
         "targets": ({**row_of(PHYSICAL), "targets": "srgb:uint8:" + "1" * 32}, passed | absent - {untargeted}),
+        "light": (row_of(PHYSICAL.replace(light="a", cct_k=2856.0)), passed | absent - {NO_LIGHT}),
         "dark frame": (row_of(DARK), passed | absent - OF_DARK_FRAMES),
         "assumed": (row_of(PHYSICAL.replace(assumed=("prnu_std",))), passed | absent - {unassumed}),
         "float clean": (row_of(PHYSICAL.replace(clean_dtype="float32")), passed | absent - {same}),

@@ -39,6 +39,13 @@ NO_DARK_FRAMES = {"dark_frames": None, "dark_frames_sha256": None, **ONLY_WITH_D
 
 def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, Distribution]:
     """Parse the distributions of the gains."""
+    white_balance = ("red", "blue")
+    if gains.light is not None:
+        for name in white_balance:
+            if getattr(gains, name) is not None:
+                problem = f"gains.light={gains.light} gives this gain; expected null, or gains.light=null"
+                raise refusal(f"gains.{name}", getattr(gains, name), problem)
+        gains = dataclasses.replace(gains, red=1.0, blue=1.0)
     return (
         parse_drawn("gains.red", gains.red, limits.GAIN),
         parse_drawn("gains.blue", gains.blue, limits.GAIN),
@@ -53,6 +60,19 @@ def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
         raise refusal("noise.a", noise.a, "expected more than 0, because noise.b depends on ln a")
     return a, b
+
+
+def lights(config: Config) -> tuple[tuple[str, float], ...]:
+    """Return the lights from which the gains follow, and their shares; none if the gains are drawn by themselves."""
+    gains, scene = config.gains, config.scene
+    if gains.light != "scene":
+        return () if gains.light is None else ((gains.light, 1.0),)
+    if scene.light is None:
+        problem = f"scene={scene.name} states no light, which gains.light=scene needs; expected {limits.SCENE_LIGHT}"
+        raise refusal("scene.light", None, problem)
+    if isinstance(scene.light, str):
+        return ((scene.light, 1.0),)
+    return tuple(zip(scene.light[::2], scene.light[1::2], strict=True))
 
 
 # ----------------------------------------------------------------------------------------------------- noise levels

@@ -193,6 +193,26 @@ DEQUANTIZE = Switch("off", "dither", "dither_all")
 
 CAMERA_LAWS = Choice("fixed", "convex", "choice", "identity", "custom")
 
+LIGHTS = ("daylight", "cloudy", "shade", "tungsten", "fluorescent", "d65", "d50", "a")
+"""Lights whose gains follow from the matrix of the camera (`simulation.reference.light`)."""
+
+LIGHT = Choice(*LIGHTS, "scene")
+
+
+def _is_light(value: Any) -> bool:
+    """Check a light, or lights and their shares in turn."""
+    if not isinstance(value, list | tuple):
+        return value in LIGHTS
+    names, shares = value[::2], value[1::2]
+    known = len(names) == len(shares) > 0 and all(name in LIGHTS for name in names)
+    return known and all(is_number(share) and share > 0 for share in shares) and abs(sum(shares) - 1) <= 1e-9
+
+
+SCENE_LIGHT = Limit(
+    f"one of {', '.join(LIGHTS)}, or several with shares that sum to 1, such as [tungsten, 0.7, daylight, 0.3]",
+    _is_light,
+)
+
 GAIN_TEXT = f"a gain above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}"
 GAIN = Drawn(("uniform", "truncated_normal"), MIN_GAIN, MAX_GAIN, GAIN_TEXT)
 INVERSE_GAIN = Drawn((*GAIN.kinds, "inverse_truncated_normal"), MIN_GAIN, MAX_GAIN, GAIN_TEXT)

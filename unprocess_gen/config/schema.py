@@ -147,13 +147,16 @@ class GainsConfig(Group):
         none
     threshold
         linear signal above which highlights are preserved
+    light
+        light from which the gains of red and blue follow, by the matrix of the camera; scene is scene.light
     """
 
-    red: Any = key(None, limits.GAIN)
-    blue: Any = key(None, limits.GAIN)
+    red: Any = key(None, limits.GAIN, null="the gain that follows from light")
+    blue: Any = key(None, limits.GAIN, null="the gain that follows from light")
     inverse_rgb: Any = key(None, limits.INVERSE_GAIN)
     highlight: str = key("per_channel", Choice("per_channel", "gray_mean", "none"))
     threshold: float = key(0.9, Numbers(0, 1, open_high=True))
+    light: Optional[str] = key(None, limits.LIGHT, null="red and blue are the gains", since="0.3")
 
 
 @documented
@@ -481,6 +484,8 @@ class SceneConfig(Group):
     exposure_ratio
         number by which the light of the photograph is divided: 100 leaves a hundredth; the frames are not
         brightened afterwards
+    light
+        light of the scene, used by gains.light=scene
     """
 
     name: str = key("daylight", limits.NAME)
@@ -488,6 +493,7 @@ class SceneConfig(Group):
     exposure_s: Any = key(0.001, limits.EXPOSURE_S, unit="seconds")
     temperature_c: Any = key(25, limits.TEMPERATURE_C, unit="degrees Celsius")
     exposure_ratio: Any = key(1, limits.EXPOSURE_RATIO)
+    light: Any = key(None, limits.SCENE_LIGHT, null="not stated", since="0.3")
 
 
 @documented

@@ -74,6 +74,8 @@ def dataset_yaml(config: Config) -> str:
     settings["source"]["patch"] = canonical_patch(config.source)
     if shading_place(config.noise) is not None:
         settings["noise"].pop("dark_shading", None)  # dark_shading_sha256 identifies the map
+    if config.gains.light != "scene":
+        settings["scene"].pop("light", None)  # decides nothing
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
     if not uses_dark_frames(config.noise):

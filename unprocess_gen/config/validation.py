@@ -16,9 +16,11 @@ from unprocess_gen.config.interpretation import (
     NO_CLIP,
     ONLY_WITH_DARK_FRAMES,
     effect_switch,
+    gain_distributions,
     has_float_clean,
     is_normalised,
     is_physical,
+    lights,
     missing_number,
     noise_levels,
     patch_rule,
@@ -26,7 +28,7 @@ from unprocess_gen.config.interpretation import (
     uses_dark_frames,
     uses_physics,
 )
-from unprocess_gen.config.limits import CAMERA_LAWS, ISO, SWITCH, Drawn, LevelRange
+from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, MIN_GAIN, SWITCH, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.schema import (
     PHYSICAL,
@@ -47,6 +49,7 @@ from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains, chromaticity
 
 CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
 """Settings that `noise_validation` checks if the noise profile uses them, as version 0.1 did.
@@ -87,6 +90,8 @@ def _check_values(config: Config) -> None:
     _check_settings(config)
     _check_source(config.source)
     _check_camera(config.camera)
+    gain_distributions(config.gains)
+    _check_lights(config)
     for noise in noise_levels(config.noise):
         check_noise(noise, config.scene)
     _check_levels(config)
@@ -239,6 +244,26 @@ def _check_dark_folder(noise: NoiseConfig) -> None:
 
 def _local(key: str, place: str, content: str) -> Path:
     return local_path(place, f"noise.{key}={place}: {content} are read from a local folder only; copy them to one")
+
+
+def _check_lights(config: Config) -> None:
+    """Check that a camera responds to every light that may be drawn: red, green and blue above 0, gains in range."""
+    if config.camera.law != "custom":
+        return
+    matrix = colour.matrix(config.camera.xyz2cam or ())
+    for name, _ in lights(config):
+        one = LIGHTS[name]
+        for step in range(9):
+            mired = 1e6 / one.high_k + step / 8 * (1e6 / one.low_k - 1e6 / one.high_k)
+            for side in (-1, 1):
+                try:
+                    gains = camera_gains(matrix, chromaticity(one, 1e6 / mired, one.offset + side * one.scatter))
+                except ValueError as error:
+                    raise refusal("gains.light", name, f"{error}; expected another light or matrix") from None
+                if not all(MIN_GAIN <= gain <= MAX_GAIN for gain in gains):
+                    raise refusal(
+                        "gains.light", name, f"gives gains {gains[0]:g} and {gains[1]:g}; expected {GAIN_TEXT}"
+                    )
 
 
 # ------------------------------------------------------------------------------------------------ effects and output

@@ -285,6 +285,8 @@ class CameraPlan:
         White-balance gains of red and blue, and inverse of the brightness gain.
     highlight, highlight_threshold : str, float
         Method for highlights (`unprocess.HIGHLIGHTS`), and the intensity from which it acts, in [0, 1).
+    light, cct_k : str, float
+        Light from which the gains follow, and its correlated colour temperature; empty and 0 without one.
     """
 
     name: str
@@ -295,6 +297,8 @@ class CameraPlan:
     inverse_rgb_gain: float
     highlight: str
     highlight_threshold: float
+    light: str = ""
+    cct_k: float = 0.0
 
     @property
     def inverse_gains(self) -> tuple[float, float, float]:
