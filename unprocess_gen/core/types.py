@@ -519,6 +519,8 @@ class Plan:
         Methods of the simulation, and format of the frames.
     split : str
         Part of the dataset that the image belongs to; empty without splits. It decides no pixel.
+    mixture : int or None
+        Number of the entry of the mixture whose settings the image has; None without a mixture. It decides no pixel.
     """
 
     seed: int
@@ -532,6 +534,7 @@ class Plan:
     accuracy: AccuracyPlan
     output: OutputPlan = OutputPlan()
     split: str = ""
+    mixture: int | None = None
 
     @property
     def physics(self) -> Physics:

@@ -25,6 +25,7 @@ from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPa
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import kernels_for, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.mixture import config_of_key
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.simulation import self_test
 from unprocess_gen.sources.patches import even_corner, list_patches
@@ -157,7 +158,7 @@ class LivePairs:
         """Return the plan and the patch of an epoch."""
         plan, patch, settings = image.plan, image.patch, self._source.settings
         if epoch and self._redraw == "all":
-            config, (height, width) = settings.config, image.srgb.shape[:2]
+            config, (height, width) = config_of_key(settings.config, plan.stream_key, epoch), image.srgb.shape[:2]
             facts = facts_for(config, image.srgb, image.source.frames)
             plan = redraw_plan(config, plan, facts, settings.dark_frames, epoch)
             rule = patch_rule(config.source)
