@@ -68,8 +68,7 @@ def electron_noise(
 def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, int]) -> Electrons:
     """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
     first, members = frames[0], _members_of_sites(frames, origin[0])
-    fixed_dn = _fixed_columns(first.fixed_columns, columns, origin[1])
-    columns_dn = np.array([_columns_dn(slots, fixed_dn, origin[1]) for slots in frames])
+    columns_dn = np.stack([_columns_dn(slots, columns, origin[1]) for slots in frames])
     base_dn = columns_dn.reshape(len(frames), 1, -1, VECTOR_WIDTH) + members["planes_dn"][:, :, None]
     numbers = members["numbers"].copy()
     numbers[:, _ERROR_DN] += 2 * FLOAT32_ERROR_DN * np.abs(columns_dn).max(axis=1)
@@ -79,7 +78,7 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, 
         base_dn=(first.black_dn + base_dn).astype(np.float32).reshape(len(frames), 2, columns),
         rows_dn=np.zeros(1),
         rows_step=0,
-        fixed_columns_dn=fixed_dn,
+        fixed_columns_dn=_fixed_columns(first.fixed_columns, columns, origin[1]),
         sites_dn=NO_OFFSETS,
         sites_step=0,
         padded_width=columns,
@@ -91,11 +90,12 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, 
     )
 
 
-def _columns_dn(slots: Slots, fixed_dn: Float, left: int) -> Float:
-    """Add the offsets that are new in a frame to those of the columns of the body, from column ``left`` on."""
-    if not slots.columns:
-        return fixed_dn
-    return fixed_dn + slots.columns.std_dn * _normals(slots.columns.words, len(fixed_dn), left)
+def _columns_dn(slots: Slots, columns: int, left: int) -> Float:
+    """Return the offsets of the columns of a frame, whose body can be another one, from column ``left`` on."""
+    columns_dn = _fixed_columns(slots.fixed_columns, columns, left)
+    if slots.columns:
+        columns_dn = columns_dn + slots.columns.std_dn * _normals(slots.columns.words, columns, left)
+    return columns_dn
 
 
 @functools.lru_cache(maxsize=256)
