@@ -244,7 +244,7 @@ def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, spli
 
 
 def _is_dataset(place: Any) -> bool:
-    """Tell folders in a list from overrides."""
+    """Check whether an item of a list is a folder, not an override."""
     return not isinstance(place, str) or "://" in place.partition("=")[0] or any_path(place).is_dir()
 
 
