@@ -28,7 +28,7 @@ PACKAGE = "unprocess_gen"
 LAYERS = (
     ("cli",),
     ("reports",),
-    ("pipeline",),
+    ("pipeline", "calibration"),
     ("planning", "sources", "dataset"),
     ("config",),
     ("simulation",),

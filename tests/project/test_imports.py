@@ -39,9 +39,10 @@ ONLY_IN = {
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},
     "tarfile": {"dataset.shards"},
-    "tifffile": {"dataset.dng"},
+    "tifffile": {"dataset.dng", "sources.raw_metadata"},
+    "rawpy": {"sources.mosaics", "sources.raw_metadata"},
+    "scipy": {"calibration.body", "calibration.frame_sums", "calibration.iso_laws", "calibration.shape"},
     "pyarrow": {"dataset.parquet"},
-    "torch": {"torch"},
     "dask": {"pipeline.executors.dask"},
     "distributed": {"pipeline.executors.dask"},
 }

@@ -174,6 +174,25 @@ _VERBS = (
         resumes=True,
     ),
     Verb(
+        "calibrate",
+        "measure the noise of a camera from raw flats and darks; write a noise profile",
+        "calibration.calibrate",
+        (
+            _to("write the profile to FILE.yaml, and all estimates to FILE.json", "FILE", required=True),
+            Argument(("--quick",), "accept one level of two flats, and two darks; intervals are wider"),
+            Argument(("--two-parameter",), "write gain and variance without light only: a and b"),
+            Argument(
+                ("--keep-darks",),
+                "copy the darks to FOLDER/isoN, for noise.dark_frames",
+                "FOLDER",
+                _local_path,
+                "a local folder",
+                "folders",
+            ),
+        ),
+        Place("CAPTURES", "the folder of the raw frames"),
+    ),
+    Verb(
         "completion",
         'print a completion script: eval "$(gen-dataset completion bash)"',
         "completion.completion",

@@ -225,6 +225,7 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
         Tag(700, BYTE, len(packet), packet),  # XMP
         Tag(33421, SHORT, 2, (2, 2)),  # CFARepeatPatternDim
         Tag(33422, BYTE, 4, bytes(CHANNELS.index(letter) for letter in plan.sensor.pattern)),  # CFAPattern
+        *_exposure(row),
         Tag(50706, BYTE, 4, bytes((1, 4, 0, 0))),  # DNGVersion
         Tag(50707, BYTE, 4, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
         Tag(50708, ASCII, 0, f"{MAKE} {plan.camera.name}"),  # UniqueCameraModel
@@ -242,6 +243,16 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
         Tag(50829, LONG, 4, (0, 0, height, width)),  # ActiveArea
         *([Tag(51041, DOUBLE, 6, profile * 3)] if profile else []),  # NoiseProfile: the same for the three planes
     ]
+
+
+def _exposure(row: Row) -> list[Tag]:
+    """Return the EXIF tags of exposure time and ISO, which rows of physical profiles have."""
+    iso, seconds = float(row.get("iso") or 0), float(row.get("exposure_s") or 0)
+    if not iso or not seconds:
+        return []
+    short = min(round(iso), 65535)  # the largest of 16 bits refers to ISOSpeed
+    speed = [Tag(34867, LONG, 1, round(iso))] if short == 65535 else []
+    return [Tag(33434, RATIONAL, 1, rational(seconds)), Tag(34855, SHORT, 1, short), *speed]
 
 
 def color_matrix(plan: Plan) -> Matrix:

@@ -1,0 +1,201 @@
+"""Combine what all ISOs show of numbers that do not depend on ISO: fixed patterns, dark current, defects, full well."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from unprocess_gen.calibration.gain import NORMAL_95, SIGNIFICANT, Estimate, combined, estimate, root_estimate
+from unprocess_gen.calibration.measure import Dark, IsoResult, usable
+
+LEAST_EXPOSURE_RATIO = 2.0
+"""Least ratio of exposures from which dark current is measured."""
+LEAST_HOT_EXPOSURE_S = 0.2
+"""Least exposure of darks that show hot pixels. Chosen: their excess is some electrons then."""
+LEAST_WARMING_C = 4.0
+"""Least range of temperatures from which their effect is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class BodyResult:
+    """Numbers of the camera body; None for those that the captures do not show."""
+
+    prnu: Estimate | None = None
+    prnus: tuple[Estimate, ...] = ()
+    dsnu_e: Estimate | None = None
+    dark_e_per_s: Estimate | None = None
+    dark_reference_c: float | None = None
+    dark_doubling_c: Estimate | None = None
+    hot_share: Estimate | None = None
+    hot_e_per_s: Estimate | None = None
+    dead_share: Estimate | None = None
+    dead_level: Estimate | None = None
+    full_well_e: Estimate | None = None
+    is_mean_removed: bool = True
+
+
+def measure_body(results: Sequence[IsoResult], black_dn: float) -> BodyResult:
+    """Combine the results of all ISOs."""
+    prnus = tuple(_prnu(results, (plane,)) for plane in range(4))
+    currents = _dark_currents(results)
+    doubling = _doubling(currents)
+    warmest = max(currents, default=None)
+    current = combined(currents[warmest]) if warmest is not None else None
+    if current is not None and current.low <= 0:
+        current = None
+    hot_share, hot_e_per_s = _hot(results)
+    dead_share, dead_level = _dead(results, black_dn)
+    wells = [
+        Estimate(*(end / result.gain.sensor.value for end in (well.value, well.low, well.high)))
+        for result in results
+        if (well := result.full_well_dn) is not None
+    ]
+    dsnu = [result.dsnu_dn.scaled(1 / result.gain.sensor.value) for result in results if result.dsnu_dn.value]
+    return BodyResult(
+        prnu=_positive(_prnu(results, range(4))),
+        prnus=prnus,
+        dsnu_e=combined(dsnu) if dsnu else None,
+        dark_e_per_s=current,
+        dark_reference_c=warmest if warmest else None,
+        dark_doubling_c=doubling,
+        hot_share=hot_share,
+        hot_e_per_s=hot_e_per_s,
+        dead_share=dead_share,
+        dead_level=dead_level,
+        full_well_e=wells[0] if wells else None,
+        is_mean_removed=_is_mean_removed(results),
+    )
+
+
+def without_dark_current(result: IsoResult, body: BodyResult) -> IsoResult:
+    """Return a result whose read noise does not contain the dark current of its darks: K²·D·t less variance."""
+    if body.dark_e_per_s is None:
+        return result
+    added = body.dark_e_per_s.scaled(result.gain.sensor.value**2 * result.dark.exposure_s)
+
+    def corrected(read: Estimate) -> Estimate:
+        return root_estimate(read.value**2 - added.value, math.hypot(2 * read.value * read.error, added.error))
+
+    return replace(result, read=corrected(result.read), reads=[corrected(read) for read in result.reads])
+
+
+def _positive(number: Estimate) -> Estimate | None:
+    return number if number.value > 0 else None
+
+
+def _prnu(results: Sequence[IsoResult], planes: Sequence[int]) -> Estimate:
+    """Return the PRNU of planes: √((fixed variance of flats - that of darks) / signal²), weighted over levels."""
+    values, errors = list[float](), list[float]()
+    sites = 0
+    for result in results:
+        dark = result.dark.measured
+        for flat in usable(result.flats):
+            sites = flat.measured.sites
+            for plane in planes:
+                signal = flat.measured.mean_dn[plane] - dark.mean_dn[plane]
+                noise = math.hypot(flat.measured.fixed_error[plane], dark.fixed_error[plane])
+                values.append((flat.measured.fixed[plane] - dark.fixed[plane]) / signal**2)
+                errors.append(noise / signal**2)
+    weights = 1 / np.array(errors) ** 2
+    square = float(weights @ values / weights.sum())
+    # the pixels are a sample of the sensor's
+    error = math.hypot(float(weights.sum()) ** -0.5, square * math.sqrt(2 / max(sites * len(planes), 1)))
+    if square <= SIGNIFICANT * error:
+        return Estimate(0.0, 0.0, math.sqrt(max(square + NORMAL_95 * error, 0.0)))
+    return estimate(math.sqrt(square), error / 2 / math.sqrt(square))
+
+
+def _dark_currents(results: Sequence[IsoResult]) -> dict[float, list[Estimate]]:
+    """Return the dark currents of all ISOs by temperature (0 if it is not stated): slope of σ²/K² over the exposure."""
+    currents = defaultdict(list)
+    for result in results:
+        by_temperature = defaultdict(list)
+        for dark in result.darks:
+            by_temperature[dark.frames[0].temperature_c or 0.0].append(dark)
+        for temperature, darks in by_temperature.items():
+            seconds = np.array([dark.exposure_s for dark in darks])
+            if seconds.max() < LEAST_EXPOSURE_RATIO * seconds.min() or seconds.max() == 0:
+                continue
+            electrons = np.array([dark.measured.variance.mean() for dark in darks]) / result.gain.sensor.value**2
+            errors = np.array([np.linalg.norm(dark.measured.error) / 4 for dark in darks]) / result.gain.sensor.value**2
+            design = np.stack([seconds, np.ones_like(seconds)])
+            covariance = np.linalg.inv((design / errors**2) @ design.T)
+            slope = float((covariance @ design / errors**2 @ electrons)[0])
+            gain_error = 2 * slope * result.gain.sensor.error / result.gain.sensor.value
+            currents[temperature].append(estimate(slope, math.hypot(math.sqrt(covariance[0, 0]), gain_error)))
+    return dict(currents)
+
+
+def _doubling(currents: dict[float, list[Estimate]]) -> Estimate | None:
+    """Return the rise of the temperature that doubles the dark current; None without two temperatures."""
+    points = [(celsius, combined(values)) for celsius, values in currents.items()]
+    points = [(celsius, value) for celsius, value in points if value.low > 0]
+    if len(points) < 2 or max(points)[0] - min(points)[0] < LEAST_WARMING_C:
+        return None
+    celsius = np.array([point[0] for point in points])
+    logs = np.array([math.log2(point[1].value) for point in points])
+    errors = np.array([point[1].error / point[1].value / math.log(2) for point in points])
+    design = np.stack([celsius, np.ones_like(celsius)])
+    covariance = np.linalg.inv((design / errors**2) @ design.T)
+    slope = float((covariance @ design / errors**2 @ logs)[0])
+    return estimate(1 / slope, math.sqrt(covariance[0, 0]) / slope**2) if slope > 0 else None
+
+
+def _is_mean_removed(results: Sequence[IsoResult]) -> bool:
+    """Return whether the mean of darks stays while their variance rises: the camera subtracts the mean dark signal."""
+    for result in results:
+        first, last = result.darks[0].measured, result.darks[-1].measured
+        rise = (last.variance.mean() - first.variance.mean()) / result.gain.sensor.value
+        if rise > 0 and last.mean_dn.mean() - first.mean_dn.mean() > rise / 2 > 0.5:
+            return False
+    return True
+
+
+def _hot(results: Sequence[IsoResult]) -> tuple[Estimate | None, Estimate | None]:
+    """Return share and mean current of hot pixels, from the darks that show the smallest currents.
+
+    The currents are exponentially distributed (the profile's law), so those above a threshold have the mean of all plus
+    the threshold.
+    """
+    longest = [(result, result.darks[-1]) for result in results if result.darks[-1].exposure_s >= LEAST_HOT_EXPOSURE_S]
+    if not longest:
+        return None, None
+
+    def threshold(result: IsoResult, dark: Dark) -> float:
+        return dark.hot_threshold_dn / result.gain.sensor.value / dark.exposure_s
+
+    result, dark = min(longest, key=lambda pair: threshold(*pair))
+    least, sites = threshold(result, dark), 4 * dark.measured.sites
+    if not len(dark.hot_dn):
+        return share_estimate(0, sites), None
+    excess = dark.hot_dn / result.gain.sensor.value / dark.exposure_s
+    mean = max(float(excess.mean()) - least, 1e-3 * least)
+    factor = math.exp(min(least / mean, 5.0))
+    return share_estimate(len(excess), sites).scaled(factor), estimate(mean, mean / math.sqrt(len(excess)), 0.0)
+
+
+def share_estimate(count: int, sites: int) -> Estimate:
+    """Return the share of rare pixels with its exact Poisson interval."""
+    from scipy.stats import chi2
+
+    low = chi2.ppf(0.025, 2 * count) / 2 if count else 0.0
+    return Estimate(count / sites, float(low) / sites, float(chi2.ppf(0.975, 2 * count + 2)) / 2 / sites)
+
+
+def _dead(results: Sequence[IsoResult], black_dn: float) -> tuple[Estimate | None, Estimate | None]:
+    """Return share of dead pixels and their value relative to black, from the brightest flats."""
+    bright = [
+        flat for result in results for flat in result.flats[-1:] if flat.signal_dn > 0 and flat in usable(result.flats)
+    ]
+    if not bright:
+        return None, None
+    flat = max(bright, key=lambda one: one.signal_dn / math.sqrt(float(one.measured.variance.mean())))
+    share = share_estimate(len(flat.dead_dn), 4 * flat.measured.sites)
+    if not len(flat.dead_dn) or not black_dn:
+        return share, None
+    level = flat.dead_dn / black_dn
+    return share, estimate(min(float(np.median(level)), 1.0), float(level.std()) / math.sqrt(len(level)), 0.0)

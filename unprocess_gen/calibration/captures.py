@@ -1,0 +1,316 @@
+"""List the frames of a folder of captures: what each one is, and the levels of the sensor that recorded them.
+
+Facts come from ``captures.csv``, or from the metadata of raw files and the words dark and flat in their names. A folder
+with ``EMVA1288_Data.txt`` is read as that file describes it. A fact that neither states is measured or assumed, with a
+note. Frames are decoded by the functions that use them, one at a time.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.files import file_sha256
+from unprocess_gen.sources.mosaics import RAW_FILES, SUFFIXES, even_sides, read_mosaic
+from unprocess_gen.sources.raw_metadata import read_metadata
+
+LIST, EMVA = "captures.csv", "EMVA1288_Data.txt"
+REQUIRED = ("file", "kind", "iso")
+OPTIONAL = ("exposure_s", "level", "temperature_c", "black_level_dn", "white_level_dn", "bits", "pattern")
+KINDS = {"dark": ("dark", "bias"), "flat": ("flat",)}
+"""Kinds of frames, and the words by which names state them."""
+EMVA_ISO = 100.0
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
+LEAST_SIDE = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """One frame: its file, what it is, and the levels of the sensor as far as they are stated.
+
+    ``level`` labels the light of a flat; flats of one ISO, exposure and level belong together. ``pattern`` is a CFA
+    pattern or ``MONO``.
+    """
+
+    path: Path
+    kind: str
+    iso: float
+    exposure_s: float | None = None
+    level: str = ""
+    black_level_dn: float | None = None
+    white_level_dn: float | None = None
+    pattern: str | None = None
+    bits: int | None = None
+    temperature_c: float | None = None
+
+    @property
+    def group(self) -> tuple[float, str, float, str, float]:
+        """Key that the frames of one measurement share."""
+        seconds = -1.0 if self.exposure_s is None else self.exposure_s
+        return self.iso, self.kind, seconds, self.level, self.temperature_c or 0.0
+
+    def pixels(self) -> NDArray[np.uint16]:
+        """Decode the mosaic, uint16 [H, W] with even sides.
+
+        Raises ConfigError or MachineError.
+        """
+        mosaic = read_mosaic(self.path, "calibrate", numbers=True).pixels
+        if mosaic.dtype not in (np.uint16, np.uint8) or min(mosaic.shape) < LEAST_SIDE:
+            found = f"is {mosaic.dtype} {list(mosaic.shape)}"
+            raise ConfigError(
+                f"calibrate: {self.path}: {found}; expected a mosaic of uint16 with sides of {LEAST_SIDE} or more"
+            )
+        return even_sides(mosaic).astype(np.uint16, copy=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """Levels and pattern of the sensor that recorded all frames, and the shape of the frames."""
+
+    bits: int
+    black_dn: float
+    white_dn: float
+    pattern: str
+    shape: tuple[int, int]
+
+    @property
+    def span_dn(self) -> float:
+        """White above black."""
+        return self.white_dn - self.black_dn
+
+
+class CaptureSet(NamedTuple):
+    """Frames of a folder, their sensor, digest of all files, and notes for the user."""
+
+    captures: list[Capture]
+    sensor: Sensor
+    sha256: str
+    notes: list[str]
+
+    def groups(self, kind: str, iso: float) -> Iterator[list[Capture]]:
+        """Yield the frames of each exposure and level of one ISO."""
+        chosen = sorted((one for one in self.captures if (one.kind, one.iso) == (kind, iso)), key=lambda one: one.group)
+        for _, frames in groupby(chosen, key=lambda one: one.group):
+            yield list(frames)
+
+    @property
+    def isos(self) -> list[float]:
+        """ISOs of the frames, in ascending order."""
+        return sorted({capture.iso for capture in self.captures})
+
+
+def read_captures(folder: Path) -> CaptureSet:
+    """List the frames of a folder.
+
+    Raises ConfigError or MachineError.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of raw frames, darks and flats")
+    try:
+        if (folder / LIST).is_file():
+            captures = list(_from_list(folder))
+        elif (folder / EMVA).is_file():
+            captures = list(_from_emva(folder))
+        else:
+            captures = list(_from_names(folder))
+        if not captures:
+            raise ConfigError(
+                f"calibrate: {folder}: contains no raw frame; expected darks and flats as {', '.join(SUFFIXES)}"
+            )
+        digests = [file_sha256(capture.path) for capture in captures]
+    except OSError as error:
+        raise MachineError(f"{error.filename or folder}: cannot be read ({error.strerror or error})") from error
+    _check_twins(captures, digests)
+    notes: list[str] = []
+    sensor = _sensor(captures, notes)
+    return CaptureSet(captures, sensor, hashlib.sha256("\n".join(sorted(digests)).encode()).hexdigest(), notes)
+
+
+def _check_twins(captures: Iterable[Capture], digests: Iterable[str]) -> None:
+    """Refuse a frame that occurs twice: its noise would cancel. Saturated frames are equal."""
+    seen: dict[str, Path] = {}
+    for capture, digest in zip(captures, digests, strict=True):
+        if digest in seen and int(np.ptp(capture.pixels())) > 0:
+            raise ConfigError(f"calibrate: {capture.path}: has the bytes of {seen[digest].name}; remove one of them")
+        seen[digest] = capture.path
+
+
+# ------------------------------------------------------------------------------------------------------------- sources
+
+
+def _from_list(folder: Path) -> Iterator[Capture]:
+    """Yield the frames that ``captures.csv`` lists."""
+    path = folder / LIST
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            missing = [name for name in REQUIRED if name not in (reader.fieldnames or ())]
+            unknown = [name for name in reader.fieldnames or () if name not in (*REQUIRED, *OPTIONAL)]
+            if missing or unknown:
+                problem = f"the column {missing[0]} is missing" if missing else f"{unknown[0]!r} is no column"
+                raise ConfigError(f"{path}: {problem}; expected {','.join(REQUIRED)} and any of {','.join(OPTIONAL)}")
+            rows = [(number, row) for number, row in enumerate(reader, start=2) if any(row.values())]
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not text in UTF-8 ({error.reason}); save it as UTF-8") from error
+    for number, row in rows:
+        yield _listed(folder, f"{path}, line {number}", {name: value or "" for name, value in row.items() if name})
+
+
+def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
+    """Return the frame of a line of ``captures.csv``; empty cells follow from the metadata of a raw file."""
+    file = folder / row["file"]
+    if not file.is_file() or file.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"{place}: file={row['file']}: no such frame; expected a file as {', '.join(SUFFIXES)}")
+    kind, pattern = row["kind"].strip().lower(), row.get("pattern", "").strip().upper()
+    if kind not in KINDS:
+        raise ConfigError(f"{place}: kind={row['kind']}: expected {' or '.join(KINDS)}")
+    if pattern and pattern not in PATTERNS:
+        raise ConfigError(f"{place}: pattern={pattern}: expected one of {', '.join(PATTERNS)}")
+    given: dict[str, Any] = {
+        name: _number(place, name, row[name]) for name in ("iso", *OPTIONAL) if name in row and _is_numeric(name)
+    }
+    given |= {"pattern": pattern or None, "level": row.get("level", "").strip()}
+    stated = _metadata(file) if file.suffix.lower() in RAW_FILES else {}
+    facts = stated | {name: value for name, value in given.items() if value is not None}
+    if facts.get("iso") is None:
+        raise ConfigError(f"{place}: iso is empty, and {file.name} does not state it; expected an ISO")
+    return Capture(file, kind, **facts)
+
+
+def _is_numeric(name: str) -> bool:
+    return name not in ("level", "pattern")
+
+
+def _number(place: str, name: str, text: str) -> float | None:
+    """Return the number of a cell, None if it is empty."""
+    if not text.strip():
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    is_valid = math.isfinite(value) and (value >= 0 if name != "temperature_c" else value > -273)
+    if not is_valid or (name == "iso" and value == 0) or (name == "bits" and value not in range(1, 17)):
+        raise ConfigError(f"{place}: {name}={text}: expected a number{' above 0' if name == 'iso' else ''}")
+    return int(value) if name == "bits" else value
+
+
+def _metadata(file: Path) -> dict[str, Any]:
+    """Return the facts of a raw file by the names of `Capture`."""
+    facts = read_metadata(file, "calibrate")
+    stated = {
+        "iso": facts.iso,
+        "exposure_s": facts.exposure_s,
+        "black_level_dn": None if facts.black_dn is None else sum(facts.black_dn) / len(facts.black_dn),
+        "white_level_dn": facts.white_dn,
+        "pattern": facts.pattern,
+        "bits": facts.bits,
+    }
+    return {name: value for name, value in stated.items() if value is not None}
+
+
+def _from_names(folder: Path) -> Iterator[Capture]:
+    """Yield the raw files of a folder; their names, or those of their folders, state the kind."""
+    for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
+        if file.suffix.lower() not in RAW_FILES:
+            raise ConfigError(
+                f"calibrate: {file}: states no ISO; expected raw files, or {LIST} in {folder} with the columns "
+                f"{','.join((*REQUIRED, 'exposure_s', 'level'))}"
+            )
+        name = str(file.relative_to(folder)).lower()
+        kinds = [kind for kind, words in KINDS.items() if any(word in name for word in words)]
+        facts = _metadata(file)
+        if len(kinds) != 1 or "iso" not in facts:
+            problem = "its name has neither dark nor flat" if not kinds else "its name has dark and flat"
+            problem = "it states no ISO" if len(kinds) == 1 else problem
+            raise ConfigError(f"calibrate: {file}: {problem}; expected {LIST} in {folder}, with a line for each frame")
+        yield Capture(file, kinds[0], level=file.parent.name if kinds[0] == "flat" else "", **facts)
+
+
+def _from_emva(folder: Path) -> Iterator[Capture]:
+    """Yield the frames that an EMVA 1288 description lists: b has exposure (ns) and photons, d has the exposure."""
+    path, bits = folder / EMVA, None
+    kind, seconds, level = "", 0.0, ""
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#") or words[0] == "v":
+            continue
+        try:
+            if words[0] == "n":
+                bits = int(words[1])
+            elif words[0] in ("b", "d"):
+                kind, seconds = {"b": "flat", "d": "dark"}[words[0]], float(words[1]) * 1e-9
+                level = f"{float(words[2]):g}" if kind == "flat" else ""
+            elif words[0] == "i" and kind:
+                file = folder / words[1].replace("\\", "/")
+                if not file.is_file():
+                    raise ConfigError(f"{path}, line {number}: {words[1]}: no such file; restore it")
+                yield Capture(file, kind, EMVA_ISO, seconds, level, pattern="MONO", bits=bits)
+            else:
+                raise ValueError
+        except (ValueError, IndexError):
+            raise ConfigError(f"{path}, line {number}: {line!r}: expected v, n, b, d or i and its values") from None
+
+
+# -------------------------------------------------------------------------------------------------------------- sensor
+
+
+def _sensor(captures: list[Capture], notes: list[str]) -> Sensor:
+    """Return the sensor of all frames; levels that no file states are measured, with a note."""
+    stated = {name: _common(captures, name) for name in ("bits", "black_level_dn", "white_level_dn", "pattern")}
+    height, width = captures[0].pixels().shape
+    shape = height, width
+    darks = [capture for capture in captures if capture.kind == "dark"]
+    black, white, bits = stated["black_level_dn"], stated["white_level_dn"], stated["bits"]
+    if bits is None:
+        brightest = max(int(capture.pixels().max()) for capture in captures) if white is None else int(white)
+        bits = next(number for number in (8, 10, 12, 14, 16) if brightest < 2**number)
+        notes.append(f"bits={bits}: not stated, follows from the largest value, {brightest} DN")
+    if white is None:
+        white = 2.0**bits - 1
+        notes.append(f"white_level_dn={white:g}: not stated, the largest value of {bits} bits is assumed")
+    if black is None and darks:
+        shortest = min(darks, key=lambda capture: capture.exposure_s or 0.0)
+        black = float(np.rint(shortest.pixels().mean()))
+        notes.append(f"black_level_dn={black:g}: not stated, rounded mean of {shortest.path.name}")
+    if stated["pattern"] is None:
+        notes.append("pattern=RGGB: not stated, and assumed; only the names of the sites depend on it")
+    if not (black or 0.0) < white < 2**bits:
+        raise ConfigError(
+            f"calibrate: black_level_dn={black:g}, white_level_dn={white:g}, bits={bits}: expected black below white "
+            "within the bits; correct them in captures.csv"
+        )
+    return Sensor(bits, float(round(black or 0.0)), float(round(white)), stated["pattern"] or "RGGB", shape)
+
+
+def _common(captures: Iterable[Capture], name: str) -> Any:
+    """Return the value that all frames have; ConfigError names the first frame that differs."""
+    first, *others = captures
+    for capture in others:
+        if getattr(capture, name) != getattr(first, name):
+            raise ConfigError(
+                f"calibrate: {capture.path}: {name}={getattr(capture, name)}: {first.path.name} has "
+                f"{getattr(first, name)}; expected frames of one camera and mode; remove those that differ"
+            )
+    return getattr(first, name)
+
+
+def with_measured_levels(captures: list[Capture], means: Mapping[Path, float], apart: float) -> list[Capture]:
+    """Return flats without a stated level, each with a level that frames of nearly the same mean share."""
+    result, before, number = [], -math.inf, 0
+    for capture in sorted(captures, key=lambda capture: means[capture.path]):
+        mean = means[capture.path]
+        number += mean > before * (1 + apart) if before > 0 else 1
+        before = mean
+        result.append(replace(capture, level=f"{number}"))
+    return result

@@ -1,0 +1,326 @@
+"""Measure all that the captures of one ISO show: darks, flats, and the noise that follows from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unprocess_gen.calibration import checks
+from unprocess_gen.calibration.captures import Capture, CaptureSet, Sensor, with_measured_levels
+from unprocess_gen.calibration.frame_sums import FAR, ROBUST, TILE, FrameSums, Measured, high_passed, summed
+from unprocess_gen.calibration.gain import Estimate, Gain, Transfer, emva_gain, estimate, fit_gain, root_estimate
+from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Float
+
+Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
+"""Function that passes frames on while they are read, and shows progress."""
+
+ROUNDING_DN2 = 1 / 12
+LEAST_FRAMES, LEAST_LEVELS = 2, 4
+DARKEST_LEVEL = 0.1
+"""Largest signal of the darkest level, as a fraction of white."""
+FULL_SHARE = 1e-4
+"""Largest share of values at white in a level that is fitted."""
+ROUNDED_STD_DN = 0.7
+"""Noise below which variances are taken from the fitted distribution, because rounding distorts them."""
+STILL_RISING = 0.9
+"""Least variance of brighter levels that are not saturated, relative to the largest."""
+LARGEST_WELL = 0.97
+"""Signal, as a fraction of white, from which the converter may end first."""
+DEAD_RESPONSE, DEAD_SIGNAL = 0.2, 0.05
+"""Largest response of dead pixels, and least signal at which they are counted, as a fraction of white."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dark:
+    """Darks of one exposure: frames, noise, and high values of their fixed pattern."""
+
+    frames: list[Capture]
+    measured: Measured
+    columns: Float
+    hot_dn: Float
+    hot_threshold_dn: float
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time; 0 if it is not stated."""
+        return self.frames[0].exposure_s or 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Flat:
+    """Flats of one level: frames, noise, the darks of the nearest exposure, and values of dead pixels in DN."""
+
+    frames: list[Capture]
+    measured: Measured
+    dark: int
+    dead_dn: Float
+    signal_dn: float
+
+
+@dataclass(frozen=True, slots=True)
+class IsoResult:
+    """Measured noise of one ISO; lists are by plane of `TILE`."""
+
+    iso: float
+    gain: Gain
+    emva_gain: float
+    curves: list[Transfer]
+    darks: list[Dark]
+    flats: list[Flat]
+    reference: int
+    read: Estimate
+    reads: list[Estimate]
+    shape: Shape
+    shapes: list[Shape]
+    histogram: Histogram
+    row: Estimate
+    row_correlation: Estimate
+    column: Estimate
+    column_temporal: Estimate
+    black: list[Estimate]
+    dsnu_dn: Estimate
+    full_well_dn: Estimate | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def dark(self) -> Dark:
+        """Darks from which read noise and offsets are measured."""
+        return self.darks[self.reference]
+
+
+def measure_iso(captures: CaptureSet, iso: float, quick: bool, watch: Watch) -> IsoResult:
+    """Measure the captures of one ISO; ConfigError if they are too few, or do not pass a check."""
+    sensor, notes = captures.sensor, list[str]()
+    darks = [_dark(frames, sensor, watch, notes) for frames in _groups(captures, "dark", iso, notes)]
+    if not darks:
+        raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
+    darks.sort(key=lambda dark: dark.exposure_s)
+    reference = max(range(len(darks)), key=lambda number: (darks[number].measured.count, -number))
+    shapes, histogram = _shapes(darks[reference], watch)
+    flats = _flats(captures, iso, darks, watch, notes)
+    checks.check_dark_noise(darks[reference].frames, sensor, _rounded_std(darks[reference].measured, shapes[0]))
+    _check_levels(iso, flats, sensor, quick)
+    curves = [_curve(plane, darks, usable(flats), shapes[0]) for plane in range(4)]
+    gain = fit_gain(curves, sensor.span_dn)
+    return IsoResult(
+        iso=iso,
+        gain=gain,
+        emva_gain=float(np.mean([emva_gain(curve) for curve in curves])),
+        curves=curves,
+        darks=darks,
+        flats=flats,
+        reference=reference,
+        shape=shapes[0],
+        shapes=shapes[1:],
+        histogram=histogram,
+        full_well_dn=_full_well(flats, sensor),
+        notes=notes,
+        **_of_darks(darks[reference], sensor, shapes),
+    )
+
+
+def _groups(captures: CaptureSet, kind: str, iso: float, notes: list[str]) -> list[list[Capture]]:
+    """Return the measurements of a kind; those of a single frame are left out with a note."""
+    groups = []
+    for frames in captures.groups(kind, iso):
+        if len(frames) < LEAST_FRAMES:
+            notes.append(f"{checks.place(frames)}: one frame shows no noise, and is left out")
+        else:
+            groups.append(frames)
+    return groups
+
+
+def _add(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSums:
+    """Sum frames; ConfigError names one of another size."""
+
+    def pixels() -> Iterable[Any]:
+        for frame in watch(frames):
+            mosaic = frame.pixels()
+            if mosaic.shape != sensor.shape:
+                raise ConfigError(
+                    f"calibrate: {frame.path}: has {mosaic.shape[1]} x {mosaic.shape[0]} pixels; expected "
+                    f"{sensor.shape[1]} x {sensor.shape[0]}, as the first frame has"
+                )
+            if int(mosaic.max()) >= 2**sensor.bits:
+                raise ConfigError(
+                    f"calibrate: {frame.path}: has values up to {mosaic.max()} DN; expected {sensor.bits} bits; "
+                    "correct bits in captures.csv"
+                )
+            yield mosaic
+
+    return summed(pixels(), sensor.white_dn)
+
+
+def _dark(frames: list[Capture], sensor: Sensor, watch: Watch, notes: list[str]) -> Dark:
+    sums = _add(frames, sensor, watch)
+    measured = sums.measure()
+    checks.check_dark(frames, sensor, measured, notes)
+    mean = sums.mean_frame()
+    patterns = [high_passed(mean[y::2, x::2]) for y, x in TILE]
+    spread = [ROBUST * float(np.median(np.abs(pattern - np.median(pattern)))) for pattern in patterns]
+    threshold = FAR * max(*spread, 0.05)
+    hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
+    return Dark(frames, measured, sums.column_offsets(), hot, threshold)
+
+
+def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch, notes: list[str]) -> list[Flat]:
+    """Measure the levels that are not saturated, in ascending order."""
+    sensor, flats = captures.sensor, []
+    for frames in _levels(captures, iso, notes):
+        sums = _add(frames, sensor, watch)
+        measured = sums.measure()
+        seconds = frames[0].exposure_s or 0.0
+        nearest = min(range(len(darks)), key=lambda number: abs(darks[number].exposure_s - seconds))
+        dark = darks[nearest].measured
+        signal = float(measured.mean_dn.mean() - dark.mean_dn.mean())
+        if measured.full_share > FULL_SHARE:
+            notes.append(
+                f"{checks.place(frames)}: {measured.full_share:.2%} of the values are at white; left out of fits"
+            )
+        else:
+            checks.check_flat(frames, sensor, measured, dark, notes)
+        dead = np.zeros(0)
+        if DEAD_SIGNAL * sensor.span_dn < signal:
+            above = sums.mean_frame() - dark.mean_dn.mean()
+            dead = above[above < DEAD_RESPONSE * signal] + dark.mean_dn.mean()
+        flats.append(Flat(frames, measured, nearest, dead, signal))
+    return sorted(flats, key=lambda flat: flat.signal_dn)
+
+
+def _levels(captures: CaptureSet, iso: float, notes: list[str]) -> Iterable[list[Capture]]:
+    """Return the frames of each level; frames without a stated level are grouped by exposure and mean."""
+    groups: list[list[Capture]] = []
+    for frames in captures.groups("flat", iso):
+        if frames[0].level or len(frames) <= LEAST_FRAMES:
+            groups.append(frames)
+            continue
+        named = with_measured_levels(frames, {frame.path: float(frame.pixels().mean()) for frame in frames}, 0.03)
+        groups += [[one for one in named if one.level == level] for level in sorted({one.level for one in named})]
+    for frames in groups:
+        if len(frames) < LEAST_FRAMES:
+            notes.append(f"{checks.place(frames)}: one frame shows no noise, and is left out")
+        else:
+            yield frames
+
+
+def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor, quick: bool) -> None:
+    """Refuse too few levels."""
+    signals = [flat.signal_dn for flat in usable(flats)]
+    least = 1 if quick else LEAST_LEVELS
+    if len(signals) < least:
+        advice = "" if quick else "; --quick takes one level, and gives wider intervals"
+        raise ConfigError(
+            f"calibrate: ISO {iso:g} has {len(signals)} levels of {LEAST_FRAMES} flats that are not saturated; "
+            f"expected {least} or more{advice}"
+        )
+    if min(signals) <= 0:
+        raise ConfigError(f"calibrate: ISO {iso:g} has flats that are not brighter than the darks; correct kind")
+    if not quick and min(signals) > DARKEST_LEVEL * sensor.span_dn:
+        raise ConfigError(
+            f"calibrate: ISO {iso:g}: the darkest level has {min(signals) / sensor.span_dn:.0%} of white; expected one "
+            f"below {DARKEST_LEVEL:.0%}, which shows whether the gain depends on the light"
+        )
+
+
+# --------------------------------------------------------------------------------------------------------------- noise
+
+
+def _shapes(dark: Dark, watch: Watch) -> tuple[list[Shape], Histogram]:
+    """Fit the distribution of the read noise: that of all planes, then that of each plane."""
+    std = math.sqrt(float(dark.measured.variance.mean()))
+    counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.columns, std)
+    together = counts[0]
+    for histogram in counts[1:]:
+        together = together.plus(histogram)
+    first = fit_shape(together)
+    return [first, *(fit_shape(histogram, first) for histogram in counts)], together
+
+
+def _rounded_std(measured: Measured, shape: Shape) -> float:
+    """Return the noise of darks without that of rounding."""
+    variance = float(measured.variance.mean()) - ROUNDING_DN2
+    return math.sqrt(variance) if variance > ROUNDED_STD_DN**2 else shape.std_dn
+
+
+def _variance(measured: Measured, plane: int, shape: Shape) -> float:
+    """Return the variance of a site, rounding included; from the fitted distribution where rounding distorts it."""
+    variance = float(measured.variance[plane])
+    return variance if variance - ROUNDING_DN2 > ROUNDED_STD_DN**2 else shape.std_dn**2 + ROUNDING_DN2
+
+
+def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: Shape) -> Transfer:
+    """Return the photon transfer curve of a plane."""
+    pairs = [(flat.measured, darks[flat.dark].measured) for flat in flats]
+    return Transfer(
+        signal=np.array([flat.mean_dn[plane] - dark.mean_dn[plane] for flat, dark in pairs]),
+        variance=np.array([flat.variance[plane] - _variance(dark, plane, shape) for flat, dark in pairs]),
+        error=np.array([flat.error[plane] for flat, _ in pairs]),
+        dark_error=np.array([dark.error[plane] for _, dark in pairs]),
+        dark=np.array([flat.dark for flat in flats]),
+    )
+
+
+def _of_darks(dark: Dark, sensor: Sensor, shapes: Sequence[Shape]) -> dict[str, Any]:
+    """Return what the darks show."""
+    measured, columns = dark.measured, dark.measured.column
+    temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
+    variances = [_variance(measured, plane, shapes[0]) - ROUNDING_DN2 - temporal for plane in range(4)]
+    reads = [
+        root_estimate(variance, math.hypot(float(error), columns[1] if temporal else 0.0))
+        for variance, error in zip(variances, measured.error, strict=True)
+    ]
+    read = root_estimate(float(np.mean(variances)), float(np.linalg.norm(measured.error)) / 4)
+    row, correlation = root_estimate(*measured.row), measured.row_correlation
+    drift = measured.frame_means.var(axis=0, ddof=1) / measured.count
+    per_line = max(measured.fixed_column[0], 0.0) / measured.shape[1] + max(measured.fixed.mean(), 0.0) / measured.sites
+    own = (measured.variance / measured.sites + max(measured.row[0], 0.0) / measured.shape[0]) / measured.count
+    ripple = math.exp(-2 * math.pi**2 * float(np.mean(variances))) / math.pi
+    errors = np.sqrt(np.maximum(drift, own) + per_line + ripple**2)
+    return {
+        "read": read,
+        "reads": reads,
+        "row": row,
+        "row_correlation": estimate(correlation[0] if row.value else 0.0, correlation[1] if row.value else 1.0),
+        "column": root_estimate(*measured.fixed_column),
+        "column_temporal": root_estimate(*columns),
+        "black": [
+            estimate(float(mean) - sensor.black_dn, float(error))
+            for mean, error in zip(measured.mean_dn, errors, strict=True)
+        ],
+        "dsnu_dn": root_estimate(
+            float((measured.fixed - max(measured.fixed_column[0], 0.0)).mean()),
+            float(np.linalg.norm(measured.fixed_error)) / 4,
+        ),
+    }
+
+
+def usable(flats: Sequence[Flat]) -> list[Flat]:
+    """Return the levels below saturation: not at white, and not beyond the largest variance."""
+    below = [flat for flat in flats if flat.measured.full_share <= FULL_SHARE]
+    variances = [float(flat.measured.variance.mean()) for flat in below]
+    peak = int(np.argmax(variances)) if variances else 0
+    return [
+        flat
+        for number, (flat, variance) in enumerate(zip(below, variances, strict=True))
+        if number <= peak or variance > variances[peak] * STILL_RISING
+    ]
+
+
+def _full_well(flats: Sequence[Flat], sensor: Sensor) -> Estimate | None:
+    """Return the signal of full pixels, DN: the largest mean where the variance has fallen.
+
+    None if the converter ends first, or no level is that bright.
+    """
+    chosen = usable(flats)
+    full = [flat for flat in flats if flat not in chosen and flat.measured.full_share <= FULL_SHARE]
+    if not full or full[-1].signal_dn > LARGEST_WELL * sensor.span_dn:
+        return None
+    level, falling = full[-1].signal_dn, float(full[-1].measured.variance.mean())
+    is_flat = falling < chosen[-1].measured.variance.mean() / 4  # all pixels are full
+    return Estimate(level, level * 0.995 if is_flat else chosen[-1].signal_dn, level * (1.005 if is_flat else 1.1))
