@@ -30,6 +30,7 @@ highlight_language = "none"
 myst_heading_anchors = 4
 
 autodoc_typehints = "none"
+autodoc_mock_imports = ["torch"]  # no dependency; only unprocess_gen.torch imports it
 autosummary_generate = False
 default_role = "autolink"
 numpydoc_xref_param_type = True

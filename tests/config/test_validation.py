@@ -85,7 +85,7 @@ source: default
 body: sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x imx385
 camera: sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d
 camera: convex sony_a7r olympus_em10 sony_rx100 nexus_6p choice identity custom
-gains: brooks2019 fixed paper_min paper_max paper_literal fig6_top fig6_bottom unity
+gains: by_light brooks2019 fixed paper_min paper_max paper_literal fig6_top fig6_bottom unity
 isp: smoothstep_gamma22 gamma22 srgb linear
 sensor: sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x imx385_gbrg
 sensor: imx385_12bit generic_10bit generic_12bit generic_14bit generic_16bit

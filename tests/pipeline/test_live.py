@@ -183,7 +183,34 @@ def test_pixels_are_decoded_once_up_to_the_bound(tmp_path: Path, make: Make) -> 
     assert_same(unbounded, stored)
     files[0].write_bytes(b"damaged")
     with pytest.raises(DamageError, match="not an NPY file"):
-        assert_same(unbounded, stored)
+        assert_same(ug.LivePairs(tmp_path / "ds", cache=tmp_path / "cache"), stored)
+
+
+def test_datasets_are_joined_and_split(make: Make, tmp_path: Path) -> None:
+    for name, seed in (("a", 0), ("b", 1)):
+        make(None, tmp_path / name, "source.limit=4", f"seed={seed}", "split={train: 0.5, test: 0.5}")
+    folders = [tmp_path / "a", tmp_path / "b"]
+    assert_same(ug.LivePairs(folders), ug.RawPairs(folders))
+    assert_same(ug.LivePairs([*map(str, folders)], split="test"), ug.RawPairs(folders, split="test"))
+    with pytest.raises(ConfigError, match="LivePairs: split='val': no pair is in it"):
+        ug.LivePairs(folders, split="val")
+    with pytest.raises(ConfigError, match="expected the folder of a dataset"):
+        ug.LivePairs(["source.limit=2"], split="train")
+
+
+def test_several_patches_of_a_pair_are_consecutive_items(night: Path) -> None:
+    live, complete = ug.LivePairs(night, patch=16, patches=3), ug.LivePairs(night)
+    assert len(live) == 3 * len(complete)
+    sampler = ug.EpochSampler(len(live), block=3)
+    assert sorted(sampler) == [(0, number) for number in range(len(live))]
+    order = [number for _, number in sampler]
+    assert all(order[n + k] == order[n] + k and order[n] % 3 == 0 for n in range(0, len(order), 3) for k in range(3))
+    crops = [live[2, number] for number in range(3)]
+    assert len({(crop.row["patch_y"], crop.row["patch_x"]) for crop in crops}) == 3
+    corner = complete[2, 0].row
+    for crop in crops:
+        y, x = (crop.row[f"patch_{axis}"] - corner[f"patch_{axis}"] for axis in "yx")
+        np.testing.assert_array_equal(crop.noisy, complete[2, 0].noisy[y : y + 16, x : x + 16])
 
 
 def test_a_changed_source_is_reported(tmp_path: Path, make: Make) -> None:
@@ -204,6 +231,7 @@ def test_a_changed_source_is_reported(tmp_path: Path, make: Make) -> None:
         ({"redraw": "some"}, "redraw='some': unknown; expected one of noise, all, none"),
         ({"targets": ["depth"]}, "targets="),
         ({"patch": 7}, "patch=7: out of range"),
+        ({"patches": 2}, "patches=2: out of range"),
         ({"cache": "/dev/null/cache"}, "cannot be created"),
     ],
 )

@@ -43,6 +43,7 @@ ONLY_IN = {
     "rawpy": {"sources.mosaics", "sources.raw_metadata"},
     "scipy": {"calibration.body", "calibration.frame_sums", "calibration.iso_laws", "calibration.shape"},
     "pyarrow": {"dataset.parquet"},
+    "torch": {"torch"},
     "dask": {"pipeline.executors.dask"},
     "distributed": {"pipeline.executors.dask"},
 }

@@ -12,6 +12,7 @@ from unprocess_gen.config import limits
 from unprocess_gen.config.distributions import lowest, parse_drawn
 from unprocess_gen.config.schema import (
     BRANCH_FIELDS,
+    ENTRY_GROUPS,
     BranchConfig,
     Config,
     EffectsConfig,
@@ -39,6 +40,13 @@ NO_DARK_FRAMES = {"dark_frames": None, "dark_frames_sha256": None, **ONLY_WITH_D
 
 def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, Distribution]:
     """Parse the distributions of the gains."""
+    white_balance = ("red", "blue")
+    if gains.light is not None:
+        for name in white_balance:
+            if getattr(gains, name) is not None:
+                problem = f"gains.light={gains.light} gives this gain; expected null, or gains.light=null"
+                raise refusal(f"gains.{name}", getattr(gains, name), problem)
+        gains = dataclasses.replace(gains, red=1.0, blue=1.0)
     return (
         parse_drawn("gains.red", gains.red, limits.GAIN),
         parse_drawn("gains.blue", gains.blue, limits.GAIN),
@@ -53,6 +61,33 @@ def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
         raise refusal("noise.a", noise.a, "expected more than 0, because noise.b depends on ln a")
     return a, b
+
+
+def lights(config: Config) -> tuple[tuple[str, float], ...]:
+    """Return the lights from which the gains follow, and their shares; none if the gains are drawn by themselves."""
+    gains, scene = config.gains, config.scene
+    if gains.light != "scene":
+        return () if gains.light is None else ((gains.light, 1.0),)
+    if scene.light is None:
+        problem = f"scene={scene.name} states no light, which gains.light=scene needs; expected {limits.SCENE_LIGHT}"
+        raise refusal("scene.light", None, problem)
+    if isinstance(scene.light, str):
+        return ((scene.light, 1.0),)
+    return tuple(zip(scene.light[::2], scene.light[1::2], strict=True))
+
+
+# ---------------------------------------------------------------------------------------------------------- mixture
+
+
+def entry_config(config: Config, number: int) -> Config:
+    """Return the config of an entry of a mixture; its ``mixture`` is the number of the entry."""
+    groups = {group: getattr(config.mixture[number], group) for group in ENTRY_GROUPS}
+    return dataclasses.replace(config, mixture=number, **groups)
+
+
+def entry_configs(config: Config) -> tuple[Config, ...]:
+    """Return the configs that images draw from: those of the entries of a mixture, or the config itself."""
+    return (config,) if config.mixture is None else tuple(entry_config(config, n) for n in range(len(config.mixture)))
 
 
 # ----------------------------------------------------------------------------------------------------- noise levels

@@ -165,6 +165,9 @@ MAX_ISO = 1e7
 MAX_SPLITS = 16
 """Most splits. Chosen: more than any benchmark has."""
 
+MAX_ENTRIES = 64
+"""Most entries of a mixture, of which each takes 0.2 s to compose."""
+
 BOOLEAN = Limit("true or false")
 """OmegaConf converts and checks it."""
 
@@ -192,6 +195,26 @@ SCATTER = Switch("off", "unit", "body", "image")
 DEQUANTIZE = Switch("off", "dither", "dither_all")
 
 CAMERA_LAWS = Choice("fixed", "convex", "choice", "identity", "custom")
+
+LIGHTS = ("daylight", "cloudy", "shade", "tungsten", "fluorescent", "d65", "d50", "a")
+"""Lights whose gains follow from the matrix of the camera (`simulation.reference.light`)."""
+
+LIGHT = Choice(*LIGHTS, "scene")
+
+
+def _is_light(value: Any) -> bool:
+    """Check a light, or lights and their shares in turn."""
+    if not isinstance(value, list | tuple):
+        return value in LIGHTS
+    names, shares = value[::2], value[1::2]
+    known = len(names) == len(shares) > 0 and all(name in LIGHTS for name in names)
+    return known and all(is_number(share) and share > 0 for share in shares) and abs(sum(shares) - 1) <= 1e-9
+
+
+SCENE_LIGHT = Limit(
+    f"one of {', '.join(LIGHTS)}, or several with shares that sum to 1, such as [tungsten, 0.7, daylight, 0.3]",
+    _is_light,
+)
 
 GAIN_TEXT = f"a gain above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}"
 GAIN = Drawn(("uniform", "truncated_normal"), MIN_GAIN, MAX_GAIN, GAIN_TEXT)
@@ -254,6 +277,13 @@ SPLIT = Limit(
 TARGET_NAMES = Limit(
     f"a list without repetitions of {', '.join(TARGETS)}",
     lambda value: set(value) <= set(TARGETS) and len(set(value)) == len(value),
+)
+
+MIXTURE = Limit(
+    f"null, or a list of up to {MAX_ENTRIES} entries such as {{weight: 3, camera: sony_a7r, noise.iso: 3200}}, each "
+    "with a weight above 0",
+    lambda value: isinstance(value, tuple) and 1 <= len(value) <= MAX_ENTRIES,
+    lambda value: value_text(value)[:80],
 )
 
 BLACK_LEVEL = LevelRange("0 to 2^bits - 2", lambda group: (0, 2**group.bits - 2))

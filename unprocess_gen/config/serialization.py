@@ -14,6 +14,7 @@ import yaml
 
 from unprocess_gen.config.interpretation import (
     canonical_patch,
+    entry_configs,
     has_float_clean,
     is_physical,
     saturated_as,
@@ -23,7 +24,7 @@ from unprocess_gen.config.interpretation import (
     uses_physics,
 )
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import GROUPS, Config, all_settings
+from unprocess_gen.config.schema import ENTRY_GROUPS, GROUPS, Config, MixtureEntry, all_settings, frozen
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
@@ -54,6 +55,9 @@ NOT_RECORDED = tuple(
 )
 """Groups of which no key decides data; ``config.yaml`` omits them."""
 
+_OMITTED = {kind: NOT_DATA.get(group, ()) for group, kind in GROUPS.items()}
+_OMITTED[Config] = (*NOT_DATA[""], *NOT_RECORDED)
+
 NUMBER_KEYS = _keys(lambda setting: setting.limit.is_float and setting.decides_data)
 """Keys whose numbers are written as floats, because users may write 1 or 1.0."""
 
@@ -68,12 +72,29 @@ def source_kind(config: Config) -> str:
 
 def dataset_yaml(config: Config) -> str:
     """Return the text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
-    settings = _recorded(config)
+    settings = _canonical_settings(config)
+    if config.mixture is not None:
+        entries = [_canonical_settings(entry) for entry in entry_configs(config)]
+        for entry in entries:
+            settings |= {group: settings[group] | entry[group] for group in ("effects", "accuracy")}
+        varying = [group for group in ENTRY_GROUPS if any(entry[group] != settings[group] for entry in entries)]
+        settings["mixture"] = [
+            {"weight": drawn.weight, **{group: entry[group] for group in varying}}
+            for drawn, entry in zip(config.mixture, entries, strict=True)
+        ]
+    return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
+
+
+def _canonical_settings(config: Config) -> dict[str, Any]:
+    """Return the keys that decide the bytes of a dataset, as mappings; entries of a mixture are left as they are."""
+    settings: dict[str, Any] = _recorded(config)
     settings["source"] = {"kind": source_kind(config)} | settings["source"]
     settings["sensor"]["saturated"] = saturated_as(config)
     settings["source"]["patch"] = canonical_patch(config.source)
     if shading_place(config.noise) is not None:
         settings["noise"].pop("dark_shading", None)  # dark_shading_sha256 identifies the map
+    if config.gains.light != "scene":
+        settings["scene"].pop("light", None)  # decides nothing
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
     if not uses_dark_frames(config.noise):
@@ -86,7 +107,7 @@ def dataset_yaml(config: Config) -> str:
         settings["output"].pop("clean_dtype", None)
     for group, keys in NUMBER_KEYS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in settings[group].items()}
-    return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
+    return settings
 
 
 def _recorded(group: Any) -> Any:
@@ -94,7 +115,7 @@ def _recorded(group: Any) -> Any:
     if isinstance(group, list | tuple):
         return [_recorded(item) for item in group]
     if isinstance(group, dict):
-        return dict(group)
+        return {name: _recorded(value) for name, value in group.items()}
     if not dataclasses.is_dataclass(group) or isinstance(group, type):
         return group
     settings = settings_of(group)
@@ -143,14 +164,24 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
     one_of("source.kind", kind, SOURCE_KINDS)
     config = _build(Config, loaded, "")
     assert isinstance(config, Config)
+    if config.mixture is not None:
+        config = dataclasses.replace(config, mixture=tuple(_entries(loaded)))
     return config, str(kind)
+
+
+def _entries(loaded: dict[str, Any]) -> Iterator[MixtureEntry]:
+    """Yield the entries of a mixture; groups that an entry lacks are those of the config."""
+    settings_of(Config)["mixture"].check("mixture", frozen(loaded["mixture"]))
+    common = {group: loaded[group] for group in ENTRY_GROUPS}
+    for number, entry in enumerate(loaded["mixture"]):
+        yield _build(MixtureEntry, common | entry if isinstance(entry, dict) else entry, f"mixture[{number}].")
 
 
 def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
     """Return a dataclass of the schema from a mapping; ``prefix`` is its dotted path, with a dot at the end."""
     if not isinstance(loaded, dict):
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
-    omitted = NOT_DATA.get(prefix[:-1], ()) if prefix else (*NOT_DATA[""], *NOT_RECORDED)
+    omitted = _OMITTED.get(group, ())
     fields = {one.name: one for one in dataclasses.fields(group) if one.name not in omitted}
     later = {name for name, setting in settings_of(group).items() if setting.since}
     missing, unknown = fields.keys() - loaded.keys() - later, loaded.keys() - fields.keys()

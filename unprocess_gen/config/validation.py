@@ -6,7 +6,10 @@ profiles: `noise_validation`.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,9 +19,12 @@ from unprocess_gen.config.interpretation import (
     NO_CLIP,
     ONLY_WITH_DARK_FRAMES,
     effect_switch,
+    entry_configs,
+    gain_distributions,
     has_float_clean,
     is_normalised,
     is_physical,
+    lights,
     missing_number,
     noise_levels,
     patch_rule,
@@ -26,13 +32,15 @@ from unprocess_gen.config.interpretation import (
     uses_dark_frames,
     uses_physics,
 )
-from unprocess_gen.config.limits import CAMERA_LAWS, ISO, SWITCH, Drawn, LevelRange
+from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, MIN_GAIN, SWITCH, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.schema import (
+    ENTRY_GROUPS,
     PHYSICAL,
     CameraConfig,
     Config,
     EffectsConfig,
+    MixtureEntry,
     NoiseConfig,
     OutputConfig,
     SourceConfig,
@@ -47,6 +55,7 @@ from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains, chromaticity
 
 CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
 """Settings that `noise_validation` checks if the noise profile uses them, as version 0.1 did.
@@ -84,9 +93,14 @@ def check_values(config: Config) -> None:
 @functools.lru_cache(maxsize=64)
 def _check_values(config: Config) -> None:
     """Check all values but the seed, once for each config: `unprocess_gen.make_pair` checks it in every call."""
+    if config.mixture is not None:
+        _check_mixture(config)
+        return
     _check_settings(config)
     _check_source(config.source)
     _check_camera(config.camera)
+    gain_distributions(config.gains)
+    _check_lights(config)
     for noise in noise_levels(config.noise):
         check_noise(noise, config.scene)
     _check_levels(config)
@@ -98,6 +112,36 @@ def _check_values(config: Config) -> None:
     if executor.address is not None and executor.kind != "dask":
         problem = f"executor={executor.kind} connects to no scheduler; set executor=dask"
         raise refusal("executor.address", executor.address, problem)
+
+
+def _check_mixture(config: Config) -> None:
+    """Check the entries of a mixture like configs, and that all give an image the same number of pairs."""
+    settings_of(Config)["mixture"].check("mixture", config.mixture)
+    pairs: dict[tuple[int, int], int] = {}
+    for number, entry in enumerate(entry_configs(config)):
+        with entry_errors(number):
+            settings_of(MixtureEntry)["weight"].check("weight", config.mixture[number].weight)
+            _check_values(replace(entry, mixture=None))
+            if uses_dark_frames(entry.noise):
+                problem = "the frames are of one camera at one ISO; expected no dark frames in a mixture"
+                raise refusal("noise.dark_frames", entry.noise.dark_frames, f"{problem}; leave one of both out")
+        pairs.setdefault((len(noise_levels(entry.noise)), entry.noise.draws), number)
+    if len(pairs) > 1:
+        (first, number), (other, another) = list(pairs.items())[:2]
+        raise ConfigError(
+            f"mixture[{another}].noise: {other[0]} x {other[1]} pairs of an image (levels x draws), but "
+            f"{first[0]} x {first[1]} of mixture[{number}]; expected the same; set noise.levels and noise.draws for all"
+        )
+
+
+@contextlib.contextmanager
+def entry_errors(number: int) -> Iterator[None]:
+    """Name the entry of a mixture in the ConfigErrors of the body: ``mixture[1].noise=…``."""
+    try:
+        yield
+    except ConfigError as error:
+        has_key = re.match(rf"({'|'.join((*ENTRY_GROUPS, 'weight'))})[.=:]", str(error))
+        raise ConfigError(f"mixture[{number}]{'.' if has_key else ': '}{error}") from error
 
 
 def check_parquet(output: OutputConfig) -> None:
@@ -239,6 +283,26 @@ def _check_dark_folder(noise: NoiseConfig) -> None:
 
 def _local(key: str, place: str, content: str) -> Path:
     return local_path(place, f"noise.{key}={place}: {content} are read from a local folder only; copy them to one")
+
+
+def _check_lights(config: Config) -> None:
+    """Check that a camera responds to every light that may be drawn: red, green and blue above 0, gains in range."""
+    if config.camera.law != "custom":
+        return
+    matrix = colour.matrix(config.camera.xyz2cam or ())
+    for name, _ in lights(config):
+        one = LIGHTS[name]
+        for step in range(9):
+            mired = 1e6 / one.high_k + step / 8 * (1e6 / one.low_k - 1e6 / one.high_k)
+            for side in (-1, 1):
+                try:
+                    gains = camera_gains(matrix, chromaticity(one, 1e6 / mired, one.offset + side * one.scatter))
+                except ValueError as error:
+                    raise refusal("gains.light", name, f"{error}; expected another light or matrix") from None
+                if not all(MIN_GAIN <= gain <= MAX_GAIN for gain in gains):
+                    raise refusal(
+                        "gains.light", name, f"gives gains {gains[0]:g} and {gains[1]:g}; expected {GAIN_TEXT}"
+                    )
 
 
 # ------------------------------------------------------------------------------------------------ effects and output

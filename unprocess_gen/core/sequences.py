@@ -1,11 +1,12 @@
-"""Pick items of a sequence."""
+"""Pick items of a sequence, and keep those that were used last."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 _Item = TypeVar("_Item")
+_Key = TypeVar("_Key")
 
 
 def evenly_spaced(items: Sequence[_Item], count: int) -> list[_Item]:
@@ -25,3 +26,21 @@ def evenly_spaced(items: Sequence[_Item], count: int) -> list[_Item]:
     """
     count = min(count, len(items))
     return [items[i * len(items) // count] for i in range(count)]
+
+
+class Recent(dict[_Key, _Item]):
+    """Keep a bounded number of values by key; its copies and pickles, for other processes, are empty."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self._most = most
+
+    def keep(self, key: _Key, value: _Item) -> _Item:
+        """Add a value and return it; a full mapping is emptied first, in one step, because other threads may read."""
+        if len(self) >= self._most:
+            self.clear()
+        self[key] = value
+        return value
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Recent, (self._most,)

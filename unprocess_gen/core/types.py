@@ -285,6 +285,8 @@ class CameraPlan:
         White-balance gains of red and blue, and inverse of the brightness gain.
     highlight, highlight_threshold : str, float
         Method for highlights (`unprocess.HIGHLIGHTS`), and the intensity from which it acts, in [0, 1).
+    light, cct_k : str, float
+        Light from which the gains follow, and its correlated colour temperature; empty and 0 without one.
     """
 
     name: str
@@ -295,6 +297,8 @@ class CameraPlan:
     inverse_rgb_gain: float
     highlight: str
     highlight_threshold: float
+    light: str = ""
+    cct_k: float = 0.0
 
     @property
     def inverse_gains(self) -> tuple[float, float, float]:
@@ -515,6 +519,8 @@ class Plan:
         Methods of the simulation, and format of the frames.
     split : str
         Part of the dataset that the image belongs to; empty without splits. It decides no pixel.
+    mixture : int or None
+        Number of the entry of the mixture whose settings the image has; None without a mixture. It decides no pixel.
     """
 
     seed: int
@@ -528,6 +534,7 @@ class Plan:
     accuracy: AccuracyPlan
     output: OutputPlan = OutputPlan()
     split: str = ""
+    mixture: int | None = None
 
     @property
     def physics(self) -> Physics:

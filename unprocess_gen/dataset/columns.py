@@ -417,6 +417,12 @@ COLUMNS = (
     Column("targets", "stored targets, each with dtype and XXH3-128 (srgb:uint8:…), separated by ;",
            Text(re.compile(f"({_TARGET}(;{_TARGET})*)?"), "targets as name:dtype:digest, separated by ;"), since="0.3",
            empty_if="output.targets is empty, or the source failed"),
+    Column("light", "light from which the white-balance gains follow", ANY_TEXT, CameraPlan, since="0.3", in_json=False,
+           empty_if="the gains follow from no light (gains.light=null), or the source failed"),
+    Column("cct_k", "correlated colour temperature of the light", Range(1000, 25000), CameraPlan, unit="K", since="0.3",
+           in_json=False, empty_if="the gains follow from no light (gains.light=null), or the source failed"),
+    Column("mixture", "number of the entry of mixture whose settings the image has, from 0", integers(0, 10**6), Plan,
+           since="0.3", in_json=False, empty_if="there is no mixture, or the source failed"),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 

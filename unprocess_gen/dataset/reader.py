@@ -8,7 +8,7 @@ import operator
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, Self, SupportsIndex, overload
+from typing import Any, NamedTuple, Protocol, Self, SupportsIndex, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,14 +165,14 @@ class RawPairs:
             raise ConfigError("RawPairs([]): no dataset; expected at least one folder")
         self.path = roots if is_list else roots[0]
         self.arrays_only = arrays_only
-        self._datasets = [_Dataset(folder) for root in roots for folder in _dataset_folders(root)]
+        self._datasets = [_Dataset(folder) for root in roots for folder in dataset_folders(root)]
         if is_list:
-            _name_apart(self._datasets)
+            name_apart(self._datasets)
         offsets = [dataset.offsets(split) for dataset in self._datasets]
         if is_list and arrays_only:
             _check_formats(self._datasets)
         if split is not None:
-            _check_split(split, self._datasets)
+            check_split("RawPairs", split, self._datasets)
         self._offsets: NDArray[np.int64] = np.concatenate([np.empty(0, np.int64), *offsets])
         self._dataset_of: NDArray[np.int32] = np.repeat(
             np.arange(len(offsets), dtype=np.int32), [len(some) for some in offsets]
@@ -268,7 +268,15 @@ class _Dataset:
         return index
 
 
-def _name_apart(datasets: Sequence[_Dataset]) -> None:
+class Folder(Protocol):
+    """Folder of a dataset: its path, its name for users, and its splits."""
+
+    path: AnyPath
+    name: str
+    splits: set[str]
+
+
+def name_apart(datasets: Sequence[Folder]) -> None:
     """Name datasets by their paths if folders have the same name."""
     if len({dataset.name for dataset in datasets}) < len(datasets):
         for dataset in datasets:
@@ -287,15 +295,15 @@ def _check_formats(datasets: Sequence[_Dataset]) -> None:
         raise ConfigError(f"RawPairs: arrays_only=True: {problem} ({kinds}); expected one; use arrays_only=False")
 
 
-def _check_split(split: str, datasets: Sequence[_Dataset]) -> None:
-    """Raise ConfigError if no pair is in a split."""
+def check_split(reader: str, split: str, datasets: Sequence[Folder]) -> None:
+    """Raise ConfigError if no pair is in a split; the sentence begins with the class that reads."""
     names = sorted(set().union(*(dataset.splits for dataset in datasets)) - {""})
     if split not in names:
         expected = f"expected one of {', '.join(names)}" if names else "there are no splits; generate with split={…}"
-        raise ConfigError(f"RawPairs: split={split[:40]!r}: no pair is in it; {expected}")
+        raise ConfigError(f"{reader}: split={split[:40]!r}: no pair is in it; {expected}")
 
 
-def _dataset_folders(path: AnyPath) -> list[AnyPath]:
+def dataset_folders(path: AnyPath) -> list[AnyPath]:
     """Return the folder of a dataset, or those of the finished datasets of a sweep."""
     table = path / SWEEP_TABLE
     if (path / "manifest.csv").exists() or not table.exists():

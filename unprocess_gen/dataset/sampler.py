@@ -25,6 +25,9 @@ class EpochSampler:
     rank, world : int
         Number of this process, from 0, and number of processes. Together they yield every pair of an epoch; if the
         length is no multiple of ``world``, the first pairs of the order occur twice, so that all yield equally many.
+    block : int
+        Number of consecutive pairs that stay together, for example those of one image (``patches`` of `LivePairs`).
+        The length is a multiple of it.
 
     Attributes
     ----------
@@ -35,7 +38,7 @@ class EpochSampler:
     Raises
     ------
     ConfigError
-        If ``length`` or ``rank`` is out of range.
+        If ``length``, ``rank`` or ``block`` is out of range.
 
     Examples
     --------
@@ -45,12 +48,16 @@ class EpochSampler:
     ([(0, 1), (0, 3)], [(1, 1), (1, 3)])
     """
 
-    def __init__(self, length: int, seed: int = 0, shuffle: bool = True, rank: int = 0, world: int = 1) -> None:
+    def __init__(
+        self, length: int, seed: int = 0, shuffle: bool = True, rank: int = 0, world: int = 1, block: int = 1
+    ) -> None:
         if not 0 < length < 2**32:
             raise ConfigError(f"EpochSampler: length={length}: out of range; expected 1 to {2**32 - 1}")
         if not 0 <= rank < world:
             raise ConfigError(f"EpochSampler: rank={rank}: out of range; expected 0 to {world - 1} (world={world})")
-        self._length, self._seed, self._shuffle = length, seed, shuffle
+        if not 0 < block <= length or length % block:
+            raise ConfigError(f"EpochSampler: block={block}: out of range; expected a divisor of length={length}")
+        self._blocks, self._block, self._seed, self._shuffle = length // block, block, seed, shuffle
         self._rank, self._world = rank, world
         self.state = (0, 0)
 
@@ -60,12 +67,13 @@ class EpochSampler:
 
     def __len__(self) -> int:
         """Count the items of an epoch, of this process."""
-        return -(-self._length // self._world)
+        return -(-self._blocks // self._world) * self._block
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         epoch, first = self.state
-        order = shuffled(self._length, self._seed, epoch) if self._shuffle else range(self._length)
+        order = shuffled(self._blocks, self._seed, epoch) if self._shuffle else range(self._blocks)
         for position in range(first, len(self)):
             self.state = (epoch, position + 1)
-            yield epoch, int(order[(position * self._world + self._rank) % self._length])
+            number, rest = divmod(position, self._block)
+            yield epoch, int(order[(number * self._world + self._rank) % self._blocks]) * self._block + rest
         self.state = (epoch + 1, 0)

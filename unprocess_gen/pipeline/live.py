@@ -2,46 +2,51 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import operator
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.random_streams import EPOCHS, crop_words
+from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
 from unprocess_gen.core.targets import TARGETS
-from unprocess_gen.core.types import Frame, Patch, Plan, Row
-from unprocess_gen.dataset.reader import Sample
+from unprocess_gen.core.types import Frame, Patch, Plan, Srgb, Value
+from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_folders, name_apart
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPairs, RecordedPairs
-from unprocess_gen.pipeline.pairs import PlannedImage
+from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.targets import kernels_for, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.mixture import config_of_key
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.simulation import self_test
-from unprocess_gen.sources.patches import even_corner, list_patches
+from unprocess_gen.simulation.effects import dark_variance_dn2
+from unprocess_gen.simulation.pair import make_crop
+from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
 
 REDRAWS = ("noise", "all", "none")
 
 
 class LiveSample(Sample):
-    """One pair of `LivePairs`: ``clean, noisy, row = sample``, as `Sample`.
+    """One pair of `LivePairs`: ``clean, noisy, row = sample``, as `Sample`; ``row`` is built on first access.
 
     ``targets`` are the arrays that ``targets`` of `LivePairs` names.
     """
 
 
 class LivePairs:
-    """Make the pairs of a dataset when they are read, with new noise in each epoch: a map-style dataset.
+    """Make the pairs of datasets when they are read, with new noise in each epoch: a map-style dataset.
 
     ``live[epoch, i]`` depends only on the dataset, epoch and i, whatever process, worker or order reads it. ``live[i]``
     is epoch 0, which equals ``RawPairs(ds)[i]`` byte for byte. Fixed patterns of a camera body are the same in every
@@ -49,10 +54,10 @@ class LivePairs:
 
     Parameters
     ----------
-    dataset : str, Path, Config, or list of str
-        Folder of a finished dataset, whose manifest and sources are read, not its shards. Or a config or Hydra
-        overrides, of which no dataset is generated: pairs are planned when they are read, and a source that cannot be
-        used raises its error.
+    dataset : str, Path, Config, or a list of str or Path
+        Folder of a dataset or sweep, or a list of them, as for `RawPairs`: manifest and sources are read, not the
+        shards. Or a config or Hydra overrides, of which no dataset is generated:
+        pairs are planned when they are read, and a source that cannot be used raises its error.
     root : str or Path, optional
         Folder of the sources; by default the one that the dataset records, or ``source.root`` of the config.
     redraw : str
@@ -60,11 +65,16 @@ class LivePairs:
         and random patches too. ``"none"``: the pairs of epoch 0 in every epoch.
     cache : str or Path, optional
         Folder for decoded pixels, 3 bytes a pixel, which worker processes share; ``"memory"`` for a temporary one.
+    split : str, optional
+        Only pairs of this split, by default all; needs a dataset.
     cache_bytes : int
         Size up to which pixels are added to the cache.
     patch : int, optional
         Side of a square that is cut from each pair at an even row and column, new in each epoch unless ``redraw`` is
         ``"none"``. It is the crop of the complete pair, bit for bit.
+    patches : int
+        Number of such squares of each pair, at random places: consecutive items, which share the decoded image. The
+        length grows by this factor. `EpochSampler` with this ``block`` keeps them together.
     as_float : bool
         Frames are float32 with 0 at black and 1 at white.
     targets : sequence of str
@@ -109,8 +119,10 @@ class LivePairs:
         redraw: str = "noise",
         cache: str | os.PathLike[str] | None = None,
         *,
+        split: str | None = None,
         cache_bytes: int = 2**36,
         patch: int | None = None,
+        patches: int = 1,
         as_float: bool = False,
         targets: Sequence[str] = (),
         arrays_only: bool = False,
@@ -122,75 +134,138 @@ class LivePairs:
             raise ConfigError(f"LivePairs: targets={targets!r}: unknown; expected a list of {', '.join(TARGETS)}")
         if patch is not None and (patch < 2 or patch % 2):
             raise ConfigError(f"LivePairs: patch={patch}: out of range; expected an even number from 2")
+        if patches < 1 or (patches > 1 and patch is None):
+            expected = "1 or more, and patch with more than 1"
+            raise ConfigError(f"LivePairs: patches={patches}: out of range; expected {expected}")
         pixels = None if cache is None else PixelCache(cache, cache_bytes)
-        self._source = _live_source(dataset, None if root is None else os.fspath(root), pixels)
-        self._redraw, self._patch, self._as_float = redraw, patch, as_float
+        self._sources = _live_sources(dataset, None if root is None else os.fspath(root), pixels, split)
+        self._ends = [*itertools.accumulate(map(len, self._sources))]
+        self._redraw, self._patch, self._patches, self._as_float = redraw, patch, patches, as_float
         self._targets, self._arrays_only = tuple(targets), arrays_only
 
     def __len__(self) -> int:
-        return len(self._source)
+        return (self._ends[-1] if self._ends else 0) * self._patches
 
     def __repr__(self) -> str:
-        return f"LivePairs({self._source.name!r}, length={len(self)}, redraw={self._redraw!r})"
+        names = ", ".join(repr(source.name) for source in self._sources)
+        return f"LivePairs({names}, length={len(self)}, redraw={self._redraw!r})"
 
     def __getitem__(self, item: int | tuple[int, int]) -> Any:  # arrays instead of a LiveSample with arrays_only
         epoch, number = map(operator.index, item if isinstance(item, tuple) else (0, item))
         if not 0 <= epoch < EPOCHS:
             raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
-        number = range(len(self))[number]
-        image = self._source.image(number)
-        plan, patch = self._redrawn(image, epoch if self._redraw != "none" else 0)
-        settings = self._source.settings
+        number, crop = divmod(range(len(self))[number], self._patches)
+        place = bisect.bisect_right(self._ends, number)
+        source = self._sources[place]
+        image = source.image(number - (self._ends[place - 1] if place else 0))
+        epoch = epoch if self._redraw != "none" else 0
+        srgb = source.pixels(image)
+        plan, patch = self._redrawn(source.settings, image, srgb, epoch)
+        if self._patch is not None:
+            patch = _crop(plan, epoch, patch, self._patch, crop)
         for kernels in kernels_for(self._targets, plan):
             self_test.check(kernels)
-        _, _, pair = next(PlannedImage(image.srgb, (plan,), (patch,), dark_folder=settings.dark_folder).pairs())
-        row: Any = image.row(plan, patch, pair)
-        clean, noisy = pair.clean, pair.noisy
-        if self._as_float:
-            clean, noisy = _light(clean, row), _light(noisy, row)
-        targets = targets_of(self._targets, image.srgb, plan, patch, pair, row, as_float=self._as_float)
+        pair = make_crop(crop_patch(srgb, patch), plan, patch.origin, epoch, source.settings.dark_folder)
+        targets = {}
+        if self._targets:
+            targets = targets_of(self._targets, srgb, plan, patch, pair, _law(plan), as_float=self._as_float)
+        clean, noisy = (self._frame(frame, plan) for frame in (pair.clean, pair.noisy))
         if self._arrays_only:
             return (clean, noisy, *targets.values())
-        return LiveSample(clean, noisy, row, self._source.name, targets)
+        row: Any = LiveRow(lambda: source.row(image, plan.replace(epoch=epoch), patch, pair))
+        return LiveSample(clean, noisy, row, source.name, targets)
 
-    def _redrawn(self, image: LiveImage, epoch: int) -> tuple[Plan, Patch]:
-        """Return the plan and the patch of an epoch."""
-        plan, patch, settings = image.plan, image.patch, self._source.settings
+    def _redrawn(self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int) -> tuple[Plan, Patch]:
+        """Return the plan of an epoch, without its number, and the patch."""
+        plan, patch = image.plan, image.patch
         if epoch and self._redraw == "all":
-            config, (height, width) = settings.config, image.srgb.shape[:2]
-            facts = facts_for(config, image.srgb, image.source.frames)
+            config, (height, width) = config_of_key(settings.config, plan.stream_key, epoch), srgb.shape[:2]
+            facts = facts_for(config, srgb, image.source.frames)
             plan = redraw_plan(config, plan, facts, settings.dark_frames, epoch)
             rule = patch_rule(config.source)
             patch = list_patches(rule, plan.stream_key, height, width, plan.output.layout, epoch)[patch.number]
-        if epoch:
-            plan = plan.replace(epoch=epoch)
-            if plan.noise.dark.sha256 and settings.dark_frames is not None:
-                plan = next_dark_frame(plan, settings.dark_frames, epoch)
-        return plan, patch if self._patch is None else _crop(plan, patch, self._patch)
+        if epoch and plan.noise.dark.sha256 and settings.dark_frames is not None:
+            plan = next_dark_frame(plan, settings.dark_frames, epoch)
+        return plan, patch
+
+    def _frame(self, frame: Frame, plan: Plan) -> Frame:
+        """Return a frame in DN, or as light."""
+        if not self._as_float or frame.dtype != np.uint16:
+            return frame
+        return to_light(frame, _levels(plan))
 
 
-def _live_source(dataset: Any, root: str | None, cache: PixelCache | None) -> LiveSource:
-    """Open a finished dataset, or list the sources of a config or of overrides."""
-    if isinstance(dataset, str | Path | ObjectPath):
-        return RecordedPairs(any_path(dataset), root, cache)
+class LiveRow(Mapping[str, Value]):
+    """Row of a live pair, built on first access: its digests take longer than a small pair. Pickled as a dict."""
+
+    def __init__(self, build: Callable[[], dict[str, Value]]) -> None:
+        self._build = build
+
+    @cached_property
+    def _row(self) -> dict[str, Value]:
+        return self._build()
+
+    def __getitem__(self, name: str) -> Value:
+        return self._row[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._row)
+
+    def __len__(self) -> int:
+        return len(self._row)
+
+    def __repr__(self) -> str:
+        return repr(self._row)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (self._row,)
+
+
+def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, split: str | None) -> list[LiveSource]:
+    """Open datasets, or list the sources of a config or of overrides."""
+    places = [dataset] if isinstance(dataset, Place) else [] if isinstance(dataset, Config) else list(dataset)
+    if isinstance(dataset, Place) or any(_is_dataset(place) for place in places):
+        folders = [folder for place in places for folder in dataset_folders(any_path(place))]
+        recorded = [RecordedPairs(folder, root, cache, split) for folder in folders]
+        if not isinstance(dataset, Place):
+            name_apart(recorded)
+        if split is not None:
+            check_split("LivePairs", split, recorded)
+        return [*recorded]
+    if split is not None:
+        raise ConfigError(
+            f"LivePairs: split={split!r}: splits follow from digests of the images; expected the folder of a dataset"
+        )
     if not isinstance(dataset, Config):
         from unprocess_gen.config.composition import load_config
 
         dataset = load_config(dataset)
-    return PlannedPairs(dataset, root, cache)
+    return [PlannedPairs(dataset, root, cache)]
 
 
-def _crop(plan: Plan, patch: Patch, side: int) -> Patch:
+def _is_dataset(place: Any) -> bool:
+    """Check whether an item of a list is a folder, not an override."""
+    return not isinstance(place, str) or "://" in place.partition("=")[0] or any_path(place).is_dir()
+
+
+def _crop(plan: Plan, epoch: int, patch: Patch, side: int, number: int) -> Patch:
     """Cut a random square from a patch, at an even row and column."""
     if side > min(patch.height, patch.width):
         raise ConfigError(
             f"LivePairs: patch={side}: exceeds a pair of {patch.width} x {patch.height} pixels; expected at most its "
             "shorter side"
         )
-    words = crop_words(plan.stream_key, patch.number, plan.noise.level, plan.noise.draw, plan.noise.frame_word)
+    noise = plan.noise
+    words = crop_words(plan.stream_key, patch.number, noise.level, noise.draw, frame_word(noise.frame, epoch), number)
     y, x = even_corner(words, side, patch.height, patch.width)
     return Patch(patch.number, patch.y + y, patch.x + x, side, side)
 
 
-def _light(frame: Frame, row: Row) -> NDArray[np.float32]:
-    return to_light(frame, row) if frame.dtype == np.uint16 else np.asarray(frame, dtype=np.float32)
+def _levels(plan: Plan) -> dict[str, Value]:
+    """Return the levels of a plan as columns of a row."""
+    return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
+
+
+def _law(plan: Plan) -> dict[str, Value]:
+    """Return the levels and the noise of a plan as columns of a row, without the others, which take longer."""
+    return {**_levels(plan), "a_dn": plan.noise.a_dn, "dark_variance_dn2": dark_variance_dn2(plan)}

@@ -1,7 +1,8 @@
-"""Find the pairs of epoch 0: from the rows of a finished dataset, or planned from listed photographs."""
+"""Find the pairs of epoch 0: from the rows of a manifest, or planned from listed photographs."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,7 +15,8 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import AnyPath, folder_name
-from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Row, Source, Srgb
+from unprocess_gen.core.sequences import Recent
+from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Source, Srgb, Value
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import (
     pair_row,
@@ -30,26 +32,28 @@ from unprocess_gen.sources.dark_frames import with_dark_places
 from unprocess_gen.sources.loader import list_photographs, load_source
 from unprocess_gen.sources.pixel_cache import PixelCache
 
+KEPT = 4096
+"""Plans that a process keeps, 8 kB each: reading or drawing one again takes longer than a patch of 128 x 128."""
+
 
 @dataclass(frozen=True, slots=True)
 class LiveImage:
-    """Hold the pixels of a pair, and all that decides it in epoch 0.
+    """Hold all that decides a pair in epoch 0.
 
     Attributes
     ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        The decoded image.
     source, sha256, orientation, shard, key
         As `dataset.manifest.pair_row` takes them.
     plan : Plan
         All parameters of the pair.
     patch : Patch
         Part of the image that the pair shows.
-    recorded : Row or None
-        Row of the pair in the manifest of a dataset.
+    source_noise_dn : float or None
+        As `dataset.manifest.pair_row` takes it.
+    offset : int or None
+        Place of the pair's row in the manifest of a dataset, if the row has digests.
     """
 
-    srgb: Srgb
     source: Source
     sha256: str
     orientation: int
@@ -57,19 +61,15 @@ class LiveImage:
     key: str
     plan: Plan
     patch: Patch
-    recorded: Row | None = None
+    source_noise_dn: float | None = None
+    offset: int | None = None
 
-    def row(self, plan: Plan, patch: Patch, pair: Pair) -> dict[str, object]:
-        """Return the row of a pair of this image; the recorded one in epoch 0."""
-        recorded, epoch = self.recorded, plan.noise.epoch
-        if recorded is not None and not epoch and patch == self.patch:
-            return dict(recorded)
+    def row(self, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
+        """Build the row of a pair of this image."""
         digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
-        noise_dn = recorded["source_noise_dn"] if recorded else None
-        assert not isinstance(noise_dn, str)
         identity = self.source, self.sha256, self.orientation, self.shard
-        row = pair_row(self.key, *identity, plan, pair, digests, patch, noise_dn)
-        return {**row, "epoch": epoch} if epoch else dict(row)
+        row = pair_row(self.key, *identity, plan, pair, digests, patch, self.source_noise_dn)
+        return {**row, "epoch": plan.noise.epoch} if plan.noise.epoch else dict(row)
 
 
 class LiveSource(Protocol):
@@ -81,39 +81,68 @@ class LiveSource(Protocol):
     def __len__(self) -> int: ...
 
     def image(self, number: int) -> LiveImage:
-        """Return the pixels and the plan of a pair."""
+        """Return all that decides a pair."""
+
+    def pixels(self, image: LiveImage) -> Srgb:
+        """Return the decoded image of a pair."""
+
+    def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
+        """Return the row of a pair; the recorded one in epoch 0."""
 
 
 class RecordedPairs:
-    """Pairs of a finished dataset; reads its manifest and its sources, and no shard."""
+    """Pairs of a dataset, or of those in a split; reads its manifest and its sources, and no shard."""
 
-    def __init__(self, folder: AnyPath, root: str | None, cache: PixelCache | None) -> None:
-        self.name, self._cache = folder_name(folder), cache
+    def __init__(self, folder: AnyPath, root: str | None, cache: PixelCache | None, split: str | None = None) -> None:
+        self.path, self.name, self._cache = folder, folder_name(folder), cache
         self._manifest = folder / "manifest.csv"
         config, _ = read_dataset_yaml(folder / "config.yaml")
         dark = dark_places(self._manifest)
         self.settings = PairSettings.read(with_dark_places(config, dark))
         self._sources = PairRegenerator(source_root(self._manifest, root), dark)
         self._columns = read_columns(self._manifest)
-        pairs = (offset for offset, row in rows_with_offsets(self._manifest) if row["status"] == "ok")
-        self._offsets = np.fromiter(pairs, dtype=np.int64)
+        self.splits: set[str] = set()
+        self._offsets = np.fromiter(self._places(split), dtype=np.int64)
+        self._kept: Recent[int, LiveImage] = Recent(KEPT)
 
     def __len__(self) -> int:
         return len(self._offsets)
 
+    def _places(self, split: str | None) -> Iterator[int]:
+        for offset, row in rows_with_offsets(self._manifest):
+            if row["status"] == "ok":
+                self.splits.add(str(row["split"]))
+                if split in (None, row["split"]):
+                    yield offset
+
+    def _read(self, offset: int) -> dict[str, Value]:
+        return dict(read_row(self._manifest, offset, self._columns))
+
     def image(self, number: int) -> LiveImage:
-        """Return the pixels and the plan of a row; raise as `PairRegenerator.photograph`."""
-        row = dict(read_row(self._manifest, int(self._offsets[number]), self._columns))
-        plan, patch, source = plan_from_row(row), patch_from_row(row), source_of(row)
-        sha256 = str(row["source_sha256"])
+        """Return all that decides the pair of a row."""
+        image = self._kept.get(number)
+        if image is None:
+            offset = int(self._offsets[number])
+            row = self._read(offset)
+            numbers, noise_dn = (int(row["orientation"] or 1), int(row["shard"] or 0)), row["source_noise_dn"]
+            identity = source_of(row), str(row["source_sha256"]), *numbers, str(row["key"])
+            assert not isinstance(noise_dn, str)
+            parts = plan_from_row(row), patch_from_row(row), noise_dn, offset if row["clean_xxh3"] else None
+            image = self._kept.keep(number, LiveImage(*identity, *parts))
+        return image
 
-        def decode() -> Srgb:
-            return self._sources.photograph(row).srgb
+    def pixels(self, image: LiveImage) -> Srgb:
+        """Return the decoded image of a pair; raise as `PairRegenerator.photograph`."""
+        names = image.source, image.sha256, image.plan.source.downscale
+        if self._cache is None:
+            return self._sources.photograph(*names).srgb
+        return self._cache.get(_cache_name(*names), lambda: self._sources.photograph(*names).srgb)
 
-        name = _cache_name(sha256, source, plan.source.downscale)
-        srgb = decode() if self._cache is None else self._cache.get(name, decode)
-        numbers = int(row["orientation"] or 1), int(row["shard"] or 0)
-        return LiveImage(srgb, source, sha256, *numbers, str(row["key"]), plan, patch, row)
+    def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
+        """Return the row of a pair; the recorded one in epoch 0."""
+        if image.offset is None or plan.noise.epoch or patch != image.patch:
+            return image.row(plan, patch, pair)
+        return self._read(image.offset)
 
 
 class PlannedPairs:
@@ -134,43 +163,45 @@ class PlannedPairs:
         self._sources = [source for source in listed if source.reason is None]
         self._patches = 1 if rule is None else rule.count
         self._plans = len(noise_levels(config.noise)) * config.noise.draws
-        self._digests: dict[int, tuple[str, int]] = {}
-        self._kept: tuple[int, Photograph] | None = None
+        self._planned: Recent[int, tuple[str, int, tuple[Plan, ...], tuple[Patch, ...]]] = Recent(KEPT)
+        self._decoded: tuple[Source, str, Photograph] | None = None
 
     def __len__(self) -> int:
         return len(self._sources) * self._patches * self._plans
 
     def image(self, number: int) -> LiveImage:
         """Plan a pair; raise as `load_source`."""
-        image, rest = divmod(number, self._patches * self._plans)
-        source, config = self._sources[image], self.settings.config
-        sha256, photograph = self._load(image)
-        planned = plan_pixels(self.settings, photograph.srgb, source, sha256)
-        patch, plan = planned.patches[rest // self._plans], planned.plans[rest % self._plans]
+        index, rest = divmod(number, self._patches * self._plans)
+        source, config = self._sources[index], self.settings.config
+        planned = self._planned.get(index)
+        if planned is None:
+            sha256, photograph = self._decode(source)
+            image = plan_pixels(self.settings, photograph.srgb, source, sha256)
+            planned = self._planned.keep(index, (sha256, photograph.orientation, image.plans, image.patches))
+        sha256, orientation, plans, patches = planned
+        patch, plan = patches[rest // self._plans], plans[rest % self._plans]
         sample = patch_key(source.index, patch, several=config.source.patch is not None)
         key = pair_key(sample, plan, several=self._plans > 1)
-        shard = source.index // config.output.pairs_per_shard
-        return LiveImage(photograph.srgb, source, sha256, photograph.orientation, shard, key, plan, patch)
+        return LiveImage(source, sha256, orientation, source.index // config.output.pairs_per_shard, key, plan, patch)
 
-    def _load(self, number: int) -> tuple[str, Photograph]:
-        """Load a source; its digest and orientation are kept, because they name its pixels in the cache."""
-        source, config = self._sources[number], self.settings.config
-        if number not in self._digests or self._cache is None:
-            return self._decode(number)
-        sha256, orientation = self._digests[number]
-        name = _cache_name(sha256, source, config.source.downscale)
-        return sha256, Photograph(self._cache.get(name, lambda: self._decode(number)[1].srgb), orientation)
+    def pixels(self, image: LiveImage) -> Srgb:
+        """Return the decoded image of a pair; raise as `load_source`."""
+        if self._cache is None:
+            return self._decode(image.source)[1].srgb
+        name = _cache_name(image.source, image.sha256, self.settings.config.source.downscale)
+        return self._cache.get(name, lambda: self._decode(image.source)[1].srgb)
 
-    def _decode(self, number: int) -> tuple[str, Photograph]:
+    def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
+        """Return the row of a pair."""
+        return image.row(plan, patch, pair)
+
+    def _decode(self, source: Source) -> tuple[str, Photograph]:
         """Decode a source; the last one stays decoded, because pairs of one image are consecutive."""
-        source, config = self._sources[number], self.settings.config
-        kept = self._kept
-        if kept is None or kept[0] != number:
-            sha256, photograph = load_source(config.source, source, config.output.layout)
-            self._digests[number] = sha256, photograph.orientation
-            kept = self._kept = number, photograph
-        return self._digests[number][0], kept[1]
+        decoded, config = self._decoded, self.settings.config
+        if decoded is None or decoded[0] != source:
+            decoded = self._decoded = source, *load_source(config.source, source, config.output.layout)
+        return decoded[1:]
 
 
-def _cache_name(sha256: str, source: Source, downscale: int) -> str:
+def _cache_name(source: Source, sha256: str, downscale: int) -> str:
     return f"{sha256}-{source.frame}-{downscale}"

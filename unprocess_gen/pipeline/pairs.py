@@ -12,6 +12,7 @@ from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import DarkFrames, Facts, Pair, Patch, Plan, Source, Srgb
 from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.mixture import image_config
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
@@ -76,7 +77,7 @@ class PlannedImage:
 
 def plan_pixels(settings: PairSettings, srgb: Srgb, source: Source, sha256: str) -> PlannedImage:
     """Plan the pairs of decoded pixels; ``sha256`` is the digest of the source's bytes."""
-    config = settings.config
+    config = image_config(settings.config, *source.stream_identity(sha256))
     facts = facts_for(config, srgb, source.frames)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, settings.dark_frames)
     height, width = srgb.shape[:2]

@@ -35,7 +35,7 @@ from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.columns import HEADERS, NAMES
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
-from unprocess_gen.dataset.manifest import read_rows, readable_rows, rows_of_json, write_rows
+from unprocess_gen.dataset.manifest import plan_from_row, read_rows, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import (
     ExpectedSample,
     ShardWriter,
@@ -52,6 +52,7 @@ from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardResult, Tall
 from unprocess_gen.pipeline.verify import expected_samples, shard_rows
 from unprocess_gen.pipeline.worker import make_image
 from unprocess_gen.pipeline.workspace import add_parquet, dataset_facts, dataset_text, fingerprint, read_dataset
+from unprocess_gen.planning.mixture import entry_number
 from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkPlaces, with_dark_places
 
 Facts = dict[str, Any]
@@ -225,10 +226,10 @@ class _Repair:
             yield from sorted([*self._rows_inside(entry), *failures[number]], key=lambda row: int(image_key(row)))
 
     def _rows_inside(self, entry: Facts) -> Iterator[Row]:
-        """Yield the rows of an intact shard; measured columns that they lack are in its entry."""
+        """Yield the rows of an intact shard; columns that they lack are in its entry, or follow from the settings."""
         if entry["file"] is None or _digest(self._folder / entry["file"]) != entry["sha256"]:
             return
-        contents = json_inside(self._folder / entry["file"])
+        contents, config = json_inside(self._folder / entry["file"]), self._read_config()
         clipped = itertools.chain(entry.get("light_clipped_high", ()), itertools.repeat(None))
         pairs = (row for content in contents for row in rows_of_json(content))
         images = group_by_image(
@@ -236,7 +237,8 @@ class _Repair:
         )
         noises = itertools.chain(entry.get("source_noise_dn", ()), itertools.repeat(None))
         for rows, noise in zip(images, noises, strict=False):
-            yield from ({**row, "source_noise_dn": noise} for row in rows)
+            number = None if config.mixture is None else entry_number(config, plan_from_row(rows[0]).stream_key)
+            yield from ({**row, "source_noise_dn": noise, "mixture": number} for row in rows)
 
     def _regenerated_rows(self, config: Config) -> Iterator[Row]:
         """Yield every row: read from intact shards, regenerated for damaged ones and for sources that failed.

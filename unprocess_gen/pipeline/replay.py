@@ -196,7 +196,7 @@ class PairRegenerator:
         plan, names = plan_from_row(row), target_names(row)
         for kernels in kernels_for(names, plan):
             self_test.check(kernels)
-        photograph = self.photograph(row)
+        photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source.downscale)
         patch = patch_from_row(row)
         height, width = photograph.srgb.shape[:2]
         if patch.y + patch.height > height or patch.x + patch.width > width:
@@ -209,16 +209,16 @@ class PairRegenerator:
         targets = targets_of(names, photograph.srgb, plan, patch, pair, row)
         return {"clean": pair.clean, "noisy": pair.noisy, **targets}
 
-    def photograph(self, row: Row) -> Photograph:
-        """Return the decoded source of a row; raise as `regenerate`."""
-        if self._root is None and row["source_bytes"] != 0:
+    def photograph(self, source: Source, recorded: str, downscale: int) -> Photograph:
+        """Return the decoded source of a row with this SHA-256; raise as `regenerate`."""
+        if self._root is None and source.size_bytes != 0:
             raise ConfigError(
-                f"source.root is missing: row {row['key']} was generated from the file {row['source']}; "
+                f"source.root is missing: row {source.index:08d} was generated from the file {source.name}; "
                 "expected its folder; give source.root=…"
             )
-        sha256, photograph = self._load_unchanged(row)
-        if sha256 != row["source_sha256"]:
-            raise SourceChangedError(_changed(sha256, row))
+        sha256, photograph = self._load_unchanged(source, recorded, downscale)
+        if sha256 != recorded:
+            raise SourceChangedError(_changed(sha256, recorded))
         return photograph
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
@@ -243,22 +243,21 @@ class PairRegenerator:
             raise DamageError(difference)
         return arrays
 
-    def _load_unchanged(self, row: Row) -> tuple[str, Photograph]:
-        """Load a row's source; raise SourceChangedError unless the file can be read and used as when it was listed."""
+    def _load_unchanged(self, source: Source, recorded: str, downscale: int) -> tuple[str, Photograph]:
+        """Load a source; raise SourceChangedError unless the file can be read and used as when it was listed."""
         try:
-            return self._load(row)
+            return self._load(source, downscale)
         except SourceError as error:
-            if error.sha256 not in (None, row["source_sha256"]):
-                raise SourceChangedError(_changed(str(error.sha256), row)) from error
+            if error.sha256 not in (None, recorded):
+                raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
             text = f"its source cannot be used ({error})"
             raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {ADVICE}")) from error
         except MachineError as error:
             raise SourceChangedError(f"{str(error).partition(';')[0]}; {ADVICE}") from error
 
-    def _load(self, row: Row) -> tuple[str, Photograph]:
-        root = None if row["source_bytes"] == 0 else self._root  # built-in scenes have no bytes
-        config = SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1))
-        source = source_of(row)
+    def _load(self, source: Source, downscale: int) -> tuple[str, Photograph]:
+        root = None if source.size_bytes == 0 else self._root  # built-in scenes have no bytes
+        config = SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=downscale)
         if self._kept is None or self._kept[:2] != (config, source):
             self._kept = None  # frees the last photograph first: two at a time would take twice the memory
             self._kept = config, source, *load_source(config, source)
@@ -273,8 +272,8 @@ def _difference(arrays: Targets, row: Row) -> str:
     )
 
 
-def _changed(sha256: str, row: Row) -> str:
-    return f"its source has changed: SHA-256 is {sha256}, the row records {row['source_sha256']}; {ADVICE}"
+def _changed(sha256: str, recorded: str) -> str:
+    return f"its source has changed: SHA-256 is {sha256}, the row records {recorded}; {ADVICE}"
 
 
 def _save(arrays: Targets, to: Path, key: str) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from unprocess_gen.config.bodies import body_sentence
+from unprocess_gen.config.interpretation import entry_configs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -43,10 +44,10 @@ class Run:
 
     def warnings(self) -> tuple[str, ...]:
         """Collect what the user should know before the run begins, a sentence each."""
-        config = self.config
-        about_noise = body_sentence(config), dark_scene_warning(config), sensor_warning(config)
-        warnings = *self.listing.warnings, shards_warning(config, self.sources), *about_noise
-        return tuple(filter(None, warnings))
+        checks = body_sentence, dark_scene_warning, sensor_warning
+        about_noise = [check(entry) for entry in entry_configs(self.config) for check in checks]
+        warnings = *self.listing.warnings, shards_warning(self.config, self.sources), *about_noise
+        return tuple(dict.fromkeys(filter(None, warnings)))
 
 
 def resolve(config: Config) -> Run:

@@ -19,6 +19,7 @@ class Draw(IntEnum):
     A, B = range(8, 10)
     ISO, EXPOSURE_S, TEMPERATURE_C, EXPOSURE_RATIO = range(10, 14)
     SENSOR_UNIT = 18
+    LIGHT, CCT, LIGHT_DISTANCE = range(20, 23)
 
 
 EFFECT_COUNTERS = tuple(number.counter for number in NUMBERS.values() if number.counter >= 0)

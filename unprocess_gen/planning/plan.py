@@ -32,6 +32,7 @@ from unprocess_gen.planning.effect_selection import (
 from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains, chromaticity
 from unprocess_gen.simulation.reference.sensor import noise_in_dn
 
 
@@ -140,12 +141,14 @@ class Planner:
     Parameters
     ----------
     config : Config
-        A configuration that `validate_config` accepts, and that does not change. Its seed is not used.
+        A configuration that `validate_config` accepts, and that does not change; of a mixture, that of one entry
+        (`mixture.image_config`). Its seed is not used.
     """
 
     def __init__(self, config: Config) -> None:
         self._camera, self._needs_dark_frames = config.camera, interpretation.uses_dark_frames(config.noise)
         self._red, self._blue, self._inverse_rgb = interpretation.gain_distributions(config.gains)
+        self._lights = interpretation.lights(config)
         self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
         levels = [replace(config, noise=noise) for noise in interpretation.noise_levels(config.noise)]
         self._is_physical = interpretation.is_physical(config.noise)
@@ -169,6 +172,7 @@ class Planner:
         self._source = types.SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
         self._isp = types.IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
         self._splits: dict[str, float] = config.split or {}
+        self._mixture: int | None = config.mixture
         sensor = config.sensor
         self._sensor = types.SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
         self._output = types.OutputPlan(
@@ -211,7 +215,7 @@ class Planner:
                     uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)
             parts = self._source, scene, camera, self._isp, self._sensor, noise, accuracy, self._output
-            yield Plan(seed, key, *parts, split), selection
+            yield Plan(seed, key, *parts, split, self._mixture), selection
 
     def _draw_split(self, seed: int, source_sha256: str) -> str:
         """Name the split of an image, empty without splits; the last one takes what the others leave."""
@@ -223,15 +227,12 @@ class Planner:
     def _draw_camera(self, uniforms: Sequence[float]) -> types.CameraPlan:
         """Draw colours and gains."""
         name, weights, rgb2cam = plan_camera(self._camera, uniforms)
-        return types.CameraPlan(
-            name,
-            weights,
-            rgb2cam,
-            draw_parameter(self._red, uniforms[Draw.RED]),
-            draw_parameter(self._blue, uniforms[Draw.BLUE]),
-            draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB]),
-            *self._highlight,
-        )
+        red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
+        light, cct_k = "", 0.0
+        if self._lights:
+            light, cct_k, (red, blue) = draw_light(self._lights, xyz2cam(self._camera, weights), uniforms)
+        inverse_rgb = draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB])
+        return types.CameraPlan(name, weights, rgb2cam, red, blue, inverse_rgb, *self._highlight, light, cct_k)
 
 
 NoiseAndSelection = tuple[types.NoisePlan, Selection | None]
@@ -361,6 +362,30 @@ def plan_camera(camera: CameraConfig, uniforms: Sequence[float]) -> tuple[str, W
     name = names[int(uniforms[Draw.CHOICE] * len(names))] if camera.law == "choice" else camera.name
     w0, w1, w2, w3 = (float(name == other) for other in names)
     return name, (w0, w1, w2, w3), colour.rgb2cam(colour.CAMERAS[name])
+
+
+def xyz2cam(camera: CameraConfig, weights: Weights) -> colour.Matrix:
+    """Return the matrix from XYZ to the camera of an image, before its rows are divided by their sums."""
+    if camera.law == "identity":
+        return colour.invert(colour.RGB2XYZ)
+    if camera.law == "custom":
+        return colour.matrix(camera.xyz2cam or ())
+    return colour.mix(tuple(colour.CAMERAS.values()), weights)
+
+
+def draw_light(
+    lights: Sequence[tuple[str, float]], matrix: colour.Matrix, uniforms: Sequence[float]
+) -> tuple[str, float, tuple[float, float]]:
+    """Draw a light and its colour temperature; return both, and the gains of red and blue of a camera under it."""
+    ends = list(itertools.accumulate(share for _, share in lights))
+    name = lights[bisect.bisect_right(ends[:-1], uniforms[Draw.LIGHT])][0]
+    light = LIGHTS[name]
+    kelvin = light.low_k
+    if light.low_k < light.high_k:
+        coolest, warmest = 1e6 / light.high_k, 1e6 / light.low_k
+        kelvin = 1e6 / (coolest + uniforms[Draw.CCT] * (warmest - coolest))
+    distance = light.offset + (2 * uniforms[Draw.LIGHT_DISTANCE] - 1) * light.scatter
+    return name, kelvin, camera_gains(matrix, chromaticity(light, kelvin, distance))
 
 
 def convex_weights(uniforms: Sequence[float]) -> Weights:

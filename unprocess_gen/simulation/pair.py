@@ -124,6 +124,40 @@ def _pairs(
             yield pair if clean is pair.clean else replace(pair, clean=clean)
 
 
+def make_crop(
+    srgb: Srgb, plan: Plan, origin: tuple[int, int], epoch: int, dark_pixels: DarkPixels | None = None
+) -> Pair:
+    """Simulate the pair of a crop in an epoch, with little fixed cost if the plan is that of earlier crops.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Display-referred codes, R, G, B.
+    plan : Plan
+        All parameters of the pair but its epoch.
+    origin : (int, int)
+        Row and column of ``srgb[0, 0]`` in the full frame.
+    epoch : int
+        Number of the epoch.
+    dark_pixels : DarkPixels, optional
+        As for `make_pair`.
+
+    Returns
+    -------
+    Pair
+        As `make_pair` with ``plan.replace(epoch=epoch)``.
+
+    Raises
+    ------
+    ValueError
+        As `make_pair`.
+    """
+    if plan.noise.dark.sha256 or plan.accuracy.uses_reference:
+        return make_pair(srgb, plan.replace(epoch=epoch), origin, dark_pixels)
+    _check_image(srgb, plan, origin)
+    return render_pairs(_dequantise(srgb, plan, origin), [plan], origin, epoch=epoch)[0]
+
+
 def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:
     """Compute the scene before the mosaic: the clean frame with all three channels at every site.
 

@@ -14,7 +14,7 @@ NORMAL_STREAM = "heteroscedastic"
 """Stream of noise that is one normal deviate per site, with a variance linear in the signal."""
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=256)
 def slots_of(plan: Plan) -> Slots:
     """Return the slots of a plan whose noise counts electrons."""
     black_dn, physics = float(plan.sensor.black_level_dn), plan.noise.physics
@@ -25,6 +25,14 @@ def slots_of(plan: Plan) -> Slots:
         filled |= effect.slots(plan)
     patterns = Patterns(**{name: filled.pop(name) for name in Patterns._fields if name in filled})
     return Slots(black_dn, physics.dn_per_e, patterns, **filled)
+
+
+def slots_in_epoch(plan: Plan, epoch: int | None) -> Slots:
+    """Return the slots of a plan in an epoch, by default its own: only offsets of lines have words of an epoch."""
+    slots = slots_of(plan)
+    if epoch is None or not (slots.columns or (slots.rows and slots.rows.correlation)):
+        return slots
+    return slots_of(plan.replace(epoch=epoch))
 
 
 def fixed_patterns(plan: Plan) -> Patterns:

@@ -14,7 +14,11 @@ import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import machine_errors
+from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.types import Srgb
+
+MAPS = 256
+"""Files that a process keeps mapped, each with a file descriptor; mapping takes longer than reading a patch."""
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -37,6 +41,7 @@ class PixelCache:
             root = SHARED_MEMORY if SHARED_MEMORY.is_dir() else None
             folder = tempfile.mkdtemp(prefix="unprocess_gen_", dir=root)
             weakref.finalize(self, _delete, folder, os.getpid())
+        self._maps: Recent[str, Srgb] = Recent(MAPS)
         self._folder = Path(folder).absolute()
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -47,17 +52,27 @@ class PixelCache:
 
     def get(self, name: str, decode: Callable[[], Srgb]) -> Srgb:
         """Return the pixels of a name; decode them if they are not in the cache, and add them if there is space."""
-        path = self._folder / f"{name}.npy"
-        with suppress(FileNotFoundError):
-            try:
-                pixels: Srgb = np.load(path, mmap_mode="r")
-                return pixels
-            except ValueError as error:
-                raise DamageError(f"{path}: not an NPY file ({error}); expected decoded pixels; delete it") from error
-        pixels = decode()
-        if self._bytes() + pixels.nbytes <= self._most_bytes:
-            self._add(path, pixels)
+        pixels = self._maps.get(name)
+        if pixels is None:
+            path = self._folder / f"{name}.npy"
+            pixels = self._mapped(path)
+            if pixels is None:
+                decoded = decode()
+                if self._bytes() + decoded.nbytes <= self._most_bytes:
+                    self._add(path, decoded)
+                return decoded
+            self._maps.keep(name, pixels)
         return pixels
+
+    @staticmethod
+    def _mapped(path: Path) -> Srgb | None:
+        """Map a file; None if there is none."""
+        try:
+            return np.asarray(np.load(path, mmap_mode="r"))
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            raise DamageError(f"{path}: not an NPY file ({error}); expected decoded pixels; delete it") from error
 
     def _bytes(self) -> int:
         """Size of the files in the folder; files that are deleted meanwhile count as empty."""

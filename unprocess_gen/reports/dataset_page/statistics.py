@@ -26,7 +26,7 @@ NUMBER_COLUMNS = tuple(
 )
 TEXT_COLUMNS = (
     *("camera", "sensor_unit", "scene", "noise", "noise_law", "tone", "gamma", "highlight", "pattern", "accuracy"),
-    "split",
+    *("split", "mixture"),
 )
 SITE_COLUMNS = (
     *("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy_clipped_high"),
@@ -131,7 +131,7 @@ class ManifestStatistics:
     def _add_texts(self, row: Row) -> None:
         add_value(self.sizes, f"{row['width']} × {row['height']}")
         for name, counts in self.texts.items():
-            add_value(counts, str(row[name]))
+            add_value(counts, "" if row[name] is None else str(row[name]))
         self.effects.update(str(row["effects"]).split(";"))
         for text in filter(None, str(row["skipped"]).split(";")):
             effect, _, reason = text.partition(": ")

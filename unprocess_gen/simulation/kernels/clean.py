@@ -72,9 +72,14 @@ class Scene32(Scene):
     """
 
 
-@functools.lru_cache(maxsize=4)
 def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] = Scene) -> Scene:
     """Return the parameters of a plan for sources of ``codes`` codes; ``kind`` is `Scene` or `Scene32`."""
+    compute: Any = _scenes[codes > 256]
+    scene: Scene = compute(plan, codes, origin, kind)
+    return scene
+
+
+def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -> Scene:
     in_float32, channels = kind is Scene32, _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2)
     f: Any = np.float32 if in_float32 else np.float64
     camera, exposure, brightest = plan.camera, plan.scene.exposure, plan.brightest
@@ -111,6 +116,10 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] 
         headroom=headroom,
         response=EQUAL_RESPONSE,
     )
+
+
+_scenes = [functools.lru_cache(maxsize=count)(_scene) for count in (256, 4)]
+"""Scenes of 256 codes (18 kB each) and of 65,536 codes (5 MB each), of which the last ones are kept."""
 
 
 def with_response(scene: Scene, response: SiteMap) -> Scene:

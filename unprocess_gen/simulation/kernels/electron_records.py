@@ -67,10 +67,15 @@ def electron_noise(
 @functools.lru_cache(maxsize=8)
 def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, int]) -> Electrons:
     """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
-    first, members = frames[0], [_members(slots, origin, columns) for slots in frames]
-    stacked = {name: np.stack([own[name] for own in members]) for name in members[0]}
+    first, members = frames[0], _members_of_sites(frames, origin[0])
+    columns_dn = np.stack([_columns_dn(slots, columns, origin[1]) for slots in frames])
+    base_dn = columns_dn.reshape(len(frames), 1, -1, VECTOR_WIDTH) + members["planes_dn"][:, :, None]
+    numbers = members["numbers"].copy()
+    numbers[:, _ERROR_DN] += 2 * FLOAT32_ERROR_DN * np.abs(columns_dn).max(axis=1)
     return Electrons(
-        **stacked,
+        **(members | {"numbers": numbers}),
+        columns_dn=columns_dn,
+        base_dn=(first.black_dn + base_dn).astype(np.float32).reshape(len(frames), 2, columns),
         rows_dn=np.zeros(1),
         rows_step=0,
         fixed_columns_dn=_fixed_columns(first.fixed_columns, columns, origin[1]),
@@ -85,21 +90,37 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, 
     )
 
 
-def _members(slots: Slots, origin: tuple[int, int], columns: int) -> dict[str, NDArray[Any]]:
-    """Return the members of `Electrons` that a frame has of its own; ``origin`` is that of the first block."""
-    gains, planes_dn = _by_site(slots.plane_gains, origin[0]), _by_site(slots.planes_dn, origin[0])
-    dn_per_e = slots.dn_per_e * gains
-    columns_dn = _fixed_columns(slots.fixed_columns, columns, origin[1])
+def _columns_dn(slots: Slots, columns: int, left: int) -> Float:
+    """Return the offsets of the columns of a frame, whose body can be another one, from column ``left`` on."""
+    columns_dn = _fixed_columns(slots.fixed_columns, columns, left)
     if slots.columns:
-        columns_dn = columns_dn + slots.columns.std_dn * _normals(slots.columns.words, columns, origin[1])
-    base_dn = slots.black_dn + (columns_dn + np.tile(planes_dn, columns // VECTOR_WIDTH))
+        columns_dn = columns_dn + slots.columns.std_dn * _normals(slots.columns.words, columns, left)
+    return columns_dn
+
+
+@functools.lru_cache(maxsize=256)
+def _members_of_sites(frames: tuple[Slots, ...], top: int) -> dict[str, NDArray[Any]]:
+    """Return the members of `Electrons` that frames have of their own, wherever a crop is; without columns.
+
+    Preparing them for every crop would take longer than a crop of 128 x 128. One frame shares its tables (98 kB).
+    """
+    members = [_members(slots, top) for slots in frames]
+    if len(members) == 1:
+        return {name: own[None] for name, own in members[0].items()}
+    return {name: np.stack([own[name] for own in members]) for name in members[0]}
+
+
+def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
+    """Return the members of `Electrons` that a frame whose first row is ``top`` has of its own, without columns."""
+    gains, planes_dn = _by_site(slots.plane_gains, top), _by_site(slots.planes_dn, top)
+    dn_per_e = slots.dn_per_e * gains
     noise, uniform = slots.noise or SiteNoise("read", 0.0), slots.uniform or UniformCounts("shot", 0.0, 0.0)
     quantiles = _quantiles(noise.law, noise.shape)
     has_thresholds = uniform.rate_e <= MAX_THRESHOLD_RATE
     fewest, ranks = count_thresholds(uniform.rate_e) if has_thresholds else (0, np.zeros(0, dtype=np.uint32))
     rows, bright = slots.rows or LineOffsets(Words(0, "row"), 0.0), slots.patterns.bright
     offset_dn = FARTHEST_NORMAL * rows.std_dn
-    offset_dn += slots.black_dn + float(np.abs(columns_dn).max(initial=0.0) + np.abs(planes_dn).max())
+    offset_dn += slots.black_dn + float(np.abs(planes_dn).max())
     most_dark_e = uniform.rate_e + 8 * math.sqrt(uniform.rate_e) + 40 if uniform.rate_e else 0.0
     summands_dn = 2 * noise.std_dn * quantiles.farthest + 2 * offset_dn + float(dn_per_e.max()) * most_dark_e + 0.5
     numbers = FrameNumbers(
@@ -126,8 +147,6 @@ def _members(slots: Slots, origin: tuple[int, int], columns: int) -> dict[str, N
         "dn_per_e": dn_per_e,
         "full_well_e": slots.full_well_e / gains,
         "planes_dn": planes_dn,
-        "columns_dn": columns_dn,
-        "base_dn": base_dn.astype(np.float32),
         "dark_ranks": np.resize(ranks, MAX_STEPS),
     }
 
@@ -171,7 +190,7 @@ def _fixed_columns(offsets: LineOffsets | None, columns: int, left: int) -> Floa
     return np.asarray(offsets.std_dn * deviates[left : left + columns])
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=512)
 def _first_normals(stream: Words, columns: int) -> Float:
     """Return the normals of the first columns of a body."""
     return _normals(stream, columns, 0)

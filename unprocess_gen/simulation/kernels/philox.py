@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
-from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS
+from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, frame_word
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.kernels.simd import Pointer
 from unprocess_gen.simulation.kernels.strips import Strip
@@ -32,10 +32,19 @@ def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Philo
     return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
 
 
-def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
-    """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
-    noises = [(plan.stream_key, plan.noise.level, plan.noise.draw, plan.noise.frame_word) for plan in plans]
-    return np.array([philox_key(*numbers) for numbers in noises], dtype=np.uint64)
+def philox_keys(plans: Sequence[Plan], epoch: int | None = None) -> NDArray[np.uint64]:
+    """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row.
+
+    ``epoch`` replaces that of the plans.
+    """
+    keys = [plan.stream_key for plan in plans]
+    noises = [plan.noise for plan in plans]
+    words = [noise.frame_word if epoch is None else frame_word(noise.frame, epoch) for noise in noises]
+    rows = [
+        (key & 0xFFFFFFFF, key >> 32, noise.level << 12 | noise.draw, word)
+        for key, noise, word in zip(keys, noises, words, strict=True)
+    ]
+    return np.array(rows, dtype=np.uint64)
 
 
 @inner

@@ -95,6 +95,7 @@ COUNTS = 7
 
 
 @functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=256)
 def readout_of(
     plans: tuple[Plan, ...], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
 ) -> ReadOut:

@@ -35,11 +35,15 @@ from unprocess_gen.simulation.kernels.readout import (
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
 from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, locate, scratch_of_thread, workspace_in
-from unprocess_gen.simulation.plan_slots import fixed_patterns, slots_of
+from unprocess_gen.simulation.plan_slots import fixed_patterns, slots_in_epoch
 
 
 def render_pairs(
-    srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None
+    srgb: Srgb,
+    plans: Sequence[Plan],
+    origin: tuple[int, int] = (0, 0),
+    dark_pixels: DarkPixels | None = None,
+    epoch: int | None = None,
 ) -> list[Pair]:
     """Simulate pairs that share the clean frame, in one pass.
 
@@ -53,13 +57,16 @@ def render_pairs(
         Row and column of ``srgb[0, 0]`` in the full frame.
     dark_pixels : DarkPixels, optional
         Access to the dark frames that the plans name.
+    epoch : int, optional
+        Epoch in place of that of the plans, which then name no dark frame. The records of a plan serve all its epochs:
+        preparing them for each would take longer than a patch of 128 x 128.
 
     Returns
     -------
     list of Pair
         One pair per plan; all share the clean array.
     """
-    clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin, dark_pixels)
+    clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin, dark_pixels, epoch)
     clean_low, clean_high, _, _, saturated, _, light_high = counts[0]
     light = None if plans[0].scene.exposure == 1 else light_high
     return [
@@ -74,7 +81,12 @@ def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Fr
 
 
 def _fill_frames(
-    srgb: Srgb, plans: Sequence[Plan], count: int, origin: tuple[int, int], dark_pixels: DarkPixels | None
+    srgb: Srgb,
+    plans: Sequence[Plan],
+    count: int,
+    origin: tuple[int, int],
+    dark_pixels: DarkPixels | None,
+    epoch: int | None = None,
 ) -> tuple[Frame, Frame, list[list[int]]]:
     """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`.
 
@@ -86,11 +98,11 @@ def _fill_frames(
     noisy = np.empty((count, *frame_shape), dtype=np.float32 if first.output.normalised else np.uint16)
     counts = np.zeros((max(count, 1), COUNTS), dtype=np.int64)
     codes_per_channel = 256 if srgb.itemsize == 1 else 65536
-    scene, noise, readout = _records(tuple(plans), shape, codes_per_channel, origin, dark_pixels)
+    scene, noise, readout = _records(tuple(plans), shape, codes_per_channel, origin, dark_pixels, epoch)
     scratch = scratch_of_thread(np.float32 if uses_scene32(first) else np.float64)
     # a view, a read-only array or a subclass would be another type, compiled again
     codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
-    keys, frames = philox_keys(plans)[:count], (clean.reshape(-1), noisy.reshape(count, clean.size))
+    keys, frames = philox_keys(plans, epoch)[:count], (clean.reshape(-1), noisy.reshape(count, clean.size))
     _render(codes, scene, noise, keys, origin, readout, scratch, *frames, counts)
     return clean, noisy, counts.tolist()
 
@@ -101,6 +113,7 @@ def _records(
     codes: int,
     origin: tuple[int, int],
     dark_pixels: DarkPixels | None = None,
+    epoch: int | None = None,
 ) -> tuple[Scene, Gaussian | Gaussian32 | Electrons, ReadOut]:
     """Return the scene, the noise and the read-out, whose classes select the compiled code.
 
@@ -113,7 +126,7 @@ def _records(
         return scene, gaussian_noise32(plans), readout
     if not first.noise.counts_electrons:
         return scene, gaussian_noise(plans), readout
-    frames = tuple(map(slots_of, plans))
+    frames = tuple(slots_in_epoch(plan, epoch) for plan in plans)
     body = body_of(frames[0].patterns, shape, origin)
     factor = light_factor(frames[0].patterns, body, shape, origin, first.noise.averaged)
     if factor is not None:
