@@ -124,7 +124,7 @@ def test_mixture_of_a_file_gives_the_same_dataset(
 @pytest.mark.slow
 def test_again_parts_verify_and_repair_follow_the_mixture(mixed: Path, run_main: RunMain, tree_hash: TreeHash) -> None:
     place = f"source.root={mixed.parent / 'photos'}"
-    assert run_main("again", str(mixed), "out=again").code == 0
+    assert run_main("again", str(mixed), "out=again", "n_jobs=1").code == 0
     run_main("prepare", "parts=2", MIXTURE, *PAIRS, place, "out=parts")
     for part in ("0", "1"):
         assert run_main("part", "parts", part).code == 0

@@ -105,7 +105,7 @@ def _settings(current: str, folders: list[Path]) -> list[str]:
 
 def _values(key: str, current: str, folders: list[Path]) -> tuple[str, list[str]]:
     """Return the values of a key: options of a group, words, folders; also of the last item of a sweep's list."""
-    if key in ("out", "source.root"):
+    if key in ("out", "source.root", "source.list"):
         return (FOLDERS if key == "out" else FILES), []
     limit = next((setting.limit for *path, setting in all_settings() if ".".join(filter(None, path)) == key), None)
     values: Iterable[str] = () if "." in key else group_options(key.lstrip("+"), *folders)

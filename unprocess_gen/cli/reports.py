@@ -24,6 +24,7 @@ from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import AccuracyConfig, Config
+    from unprocess_gen.core.roots import Root
     from unprocess_gen.reports.estimate import RunEstimate
 
 Option = TypeVar("Option")
@@ -168,16 +169,17 @@ def preview(call: Call) -> int:
     return code
 
 
-def _check_not_among_photographs(to: Path, root: str | None) -> None:
+def _check_not_among_photographs(to: Path, root: Root | None) -> None:
     """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
-    place = None if root is None else any_path(root).resolve()
-    if not isinstance(place, Path) or not place.is_dir():
-        return
-    if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
-        raise ConfigError(
-            f"--to {to}: is inside the folder of the photographs, {root}; expected a folder outside of it, because "
-            "runs would read the pictures; choose another folder"
-        )
+    for one in root if isinstance(root, tuple) else [root] if root is not None else []:
+        place = any_path(one).resolve()
+        if not isinstance(place, Path) or not place.is_dir():
+            continue
+        if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
+            raise ConfigError(
+                f"--to {to}: is inside the folder of the photographs, {one}; expected a folder outside of it, because "
+                "runs would read the pictures; choose another folder"
+            )
 
 
 def dng(call: Call) -> int:

@@ -55,7 +55,7 @@ VERSION_BASE = "1.3"
 PLAIN_ERRORS = (ValueError, TypeError, AttributeError, AssertionError, OSError, RecursionError)
 """Other exceptions that Hydra and OmegaConf raise for wrong overrides and files."""
 
-PATH_KEYS = ("source.root", "out")
+PATH_KEYS = ("source.root", "source.list", "out")
 """Keys whose values are paths, which are quoted for Hydra's grammar."""
 
 

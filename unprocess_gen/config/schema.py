@@ -13,12 +13,14 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional, TypeVar
 
 from unprocess_gen.config import limits
 from unprocess_gen.config.limits import Choice, Integers, IsoForm, Limit, NumberList, NumberOrWord, Numbers
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
 from unprocess_gen.config.values import is_number
+from unprocess_gen.core.roots import Root
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.effects.numbers import SHAPE, SITES, Number
@@ -57,6 +59,11 @@ class SourceConfig(Group):
     ----------
     root
         folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://
+    roots
+        several folders or URLs, instead of root; names of images begin with the number of their folder, 0/, 1/, …
+    list
+        text file with the path of an image in each line, or CSV file with paths in the column file, else in the first
+        one; relative paths are below root or roots, without them below the folder of the list; include is not applied
     include
         glob patterns of images; one with a slash matches the path below root, others the file name, in any case
     recursive
@@ -92,6 +99,10 @@ class SourceConfig(Group):
     root: Optional[str] = key(
         None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
     )
+    roots: tuple[str, ...] = key((), Limit("a list of folders and URLs, each once"), decides_data=False, since="0.3")
+    list: Optional[str] = key(
+        None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False, since="0.3"
+    )
     include: tuple[str, ...] = key((), Limit("a list of at least one pattern such as '*.jpg'"))
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
@@ -104,6 +115,13 @@ class SourceConfig(Group):
     downscale: int = key(1, Integers(1, 64), unit="pixels")
     dequantize: str = key("off", limits.DEQUANTIZE)
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
+
+    @property
+    def place(self) -> Root | None:
+        """Folder, or folders, that names of sources are relative to; None for the built-in scenes."""
+        if self.roots or self.root is not None or self.list is None:
+            return self.roots or self.root
+        return str(Path(self.list).parent)
 
 
 @documented
@@ -768,6 +786,11 @@ def all_settings() -> Iterator[tuple[str, str, Setting]]:
     for group, kind in [*GROUPS.items(), ("", Config)]:
         for name, setting in settings_of(kind).items():
             yield group, name, setting
+
+
+def at_place(place: Root | None) -> dict[str, Any]:
+    """Return the fields of `SourceConfig` that give a place."""
+    return {"root": None, "roots": place} if isinstance(place, tuple) else {"root": place, "roots": ()}
 
 
 def replaced(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -67,7 +67,7 @@ SOURCE_KINDS = ("folder", "synthetic")
 
 def source_kind(config: Config) -> str:
     """Return the kind of source that ``config.yaml`` records, ``folder`` or ``synthetic``."""
-    return "synthetic" if config.source.root is None else "folder"
+    return "synthetic" if config.source.place is None else "folder"
 
 
 def dataset_yaml(config: Config) -> str:

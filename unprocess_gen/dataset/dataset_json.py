@@ -14,10 +14,12 @@ PARQUET_SHA256 = "parquet_sha256"
 
 
 class SourceFacts(msgspec.Struct, frozen=True):
-    """Hold kind and place of the sources."""
+    """Hold kind and place of the sources, and the file that lists them."""
 
     kind: Literal["folder", "synthetic"]
     root: str | None
+    roots: tuple[str, ...] = ()
+    list: str | None = None
 
 
 class DarkFrameFacts(msgspec.Struct, frozen=True):

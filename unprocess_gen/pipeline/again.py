@@ -10,7 +10,8 @@ from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_root
+from unprocess_gen.core.roots import Root, root_path
+from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_changes, source_root
 from unprocess_gen.pipeline.verify import have_same_rows
 from unprocess_gen.sources.dark_frames import DarkPlaces, with_dark_places
 
@@ -30,12 +31,12 @@ def recorded_config(
     for name, place, what in places:
         if name in given and getattr(config.noise, f"{name}_sha256") is None:
             raise ConfigError(f"again: noise.{name}={place}: {folder} was generated without {what}; leave it out")
-    config = with_dark_places(replaced(config, {**changes, "source.root": _root(folder, kind, root)}), dark)
+    config = with_dark_places(replaced(config, {**changes, **source_changes(_root(folder, kind, root), folder)}), dark)
     validate_config(config)
     return config
 
 
-def _root(folder: AnyPath, kind: str, root: str | None) -> str | None:
+def _root(folder: AnyPath, kind: str, root: str | None) -> Root | None:
     """Return the root of the sources, given or recorded; None for the built-in scenes."""
     if kind != "folder":
         if root is not None:
@@ -55,8 +56,8 @@ def _root(folder: AnyPath, kind: str, root: str | None) -> str | None:
 
 def check_sources(folder: AnyPath, config: Config) -> None:
     """Raise SourceChangedError if sources are missing or have other sizes than the manifest records."""
-    manifest, root = folder / "manifest.csv", config.source.root
-    if root is not None and any_path(root).exists() and manifest.exists():
+    manifest, root = folder / "manifest.csv", config.source.place
+    if root is not None and root_path(root).exists() and manifest.exists():
         check_source_sizes(manifest, root)
 
 

@@ -28,6 +28,7 @@ from unprocess_gen.config.interpretation import shading_place
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
+from unprocess_gen.core.roots import absolute_root
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.frozen_run import freeze
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -170,7 +171,7 @@ def generate(config: Config, label: str = "") -> Summary:
 
 def begin(workspace: Workspace, run: Run) -> list[ShardTask]:
     """Check the opened folder and begin or continue the dataset in it; return the shards that are not committed."""
-    workspace.check_begun(run.sources, run.config.source.root)
+    workspace.check_begun(run.sources, run.config.source.place)
     tasks = run.tasks()
     done = workspace.records.committed(range(len(tasks)))
     todo = [task for task in tasks if task.shard not in done]
@@ -208,7 +209,7 @@ def execute_on_dask(workspace: Workspace, run: Run, todo: list[ShardTask], progr
     from unprocess_gen.pipeline.executors.dask import REPORTS, ChunkRequest, DaskRun, connected
 
     config = run.config
-    out, root = absolute_text(config.out), absolute_text(config.source.root)
+    out, root = absolute_text(config.out), absolute_root(config.source.place)
     assert out is not None
     with connected(config.executor, effective_jobs(config.n_jobs, len(todo)), workspace.storage) as client:
         plan = freeze(workspace, run, progress.report_compiling)
@@ -272,11 +273,20 @@ def dataset_json_facts(
         **tally.facts(),
         "not_matched": not_matched,
         "skipped_links": skipped_links,
-        "source": {"kind": source_kind(config), "root": absolute_text(config.source.root)},
+        "source": source_facts(config),
         **_dark_facts(settings),
         "run": run | machine(),
         "versions": {package: version(package) for package in PACKAGES},
     }
+
+
+def source_facts(config: Config) -> dict[str, Any]:
+    """Kind and places of the sources, for ``dataset.json`` only."""
+    place, file = absolute_root(config.source.place), absolute_text(config.source.list)
+    facts: dict[str, Any] = {"kind": source_kind(config), "root": place}
+    if isinstance(place, tuple):
+        facts |= {"root": None, "roots": list(place)}
+    return facts if file is None else facts | {"list": file}
 
 
 def machine() -> dict[str, Any]:

@@ -30,6 +30,7 @@ from unprocess_gen.config.validation import check_parquet
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.files import commit_file, file_sha256, machine_errors
 from unprocess_gen.core.records import parse_json
+from unprocess_gen.core.roots import Root
 from unprocess_gen.core.types import Array, Row
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.columns import HEADERS, NAMES
@@ -45,7 +46,8 @@ from unprocess_gen.dataset.shards import (
     json_inside,
     shard_name,
 )
-from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
+from unprocess_gen.pipeline.generate import source_facts
+from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, source_changes
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardResult, Tally
@@ -87,7 +89,7 @@ class RepairStep:
         return f"{self.file}: {self.what}"
 
 
-def repair(folder: Path, root: str | None, dark: DarkPlaces = NO_DARK_FRAMES) -> Iterator[RepairStep]:
+def repair(folder: Path, root: Root | None, dark: DarkPlaces = NO_DARK_FRAMES) -> Iterator[RepairStep]:
     """Restore every damaged file of a dataset; yield a step for each damaged or foreign file.
 
     ``root`` is the folder of the sources, None for built-in scenes or if no source is needed; ``dark`` has the places
@@ -103,7 +105,7 @@ def repair(folder: Path, root: str | None, dark: DarkPlaces = NO_DARK_FRAMES) ->
 class _Repair:
     """Hold a dataset under repair: its folder, the intact content of ``dataset.json`` (or {}), and its config."""
 
-    def __init__(self, folder: Path, root: str | None, dark: DarkPlaces, storage: Storage) -> None:
+    def __init__(self, folder: Path, root: Root | None, dark: DarkPlaces, storage: Storage) -> None:
         self._folder, self._root, self._dark = folder, root, dark
         self._storage, self._temporary = storage, storage.scratch
         self._config_file, self._manifest_file = folder / "config.yaml", folder / "manifest.csv"
@@ -182,7 +184,7 @@ class _Repair:
 
     def _read_config(self) -> Config:
         config, kind = read_dataset_yaml(self._config_file)
-        config = replaced(config, {"source.root": (self._root or "") if kind == "folder" else None})
+        config = replaced(config, source_changes((self._root or "") if kind == "folder" else None, self._folder))
         return with_dark_places(config, self._dark)
 
     # ---------------------------------------------------------------------------------------------------- manifest
@@ -340,7 +342,7 @@ class _Repair:
         if json.loads(same)["dataset_sha256"] == digest:
             self._storage.write("dataset.json", same)
             return RepairStep("dataset.json", "restored, to the same bytes")
-        source = {"kind": source_kind(config), "root": config.source.root or None}
+        source = source_facts(config) if config.source.place else {"kind": source_kind(config), "root": None}
         lost = dict.fromkeys(("not_matched", "skipped_links", "run", "versions"))
         self._storage.write("dataset.json", dataset_text(known | lost | {"source": source}))
         return RepairStep("dataset.json", "rebuilt from the other files; host, time and versions of the run are lost")

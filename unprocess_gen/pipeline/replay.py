@@ -9,17 +9,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.config.schema import SourceConfig, at_place
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_errors
-from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.output_paths import check_output_folder
-from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.records import parse_record
+from unprocess_gen.core.roots import Root, is_remote, root_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
@@ -30,6 +31,7 @@ from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkFolder, DarkPlaces
+from unprocess_gen.sources.listing import place_text
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import source_file
@@ -85,9 +87,17 @@ def _recorded_places(manifest: AnyPath) -> _Places:
         return _Places()
 
 
-def source_root(manifest: AnyPath, root: str | None) -> str | None:
-    """Find the folder of the sources: the given one, or the one that ``dataset.json`` records."""
-    return root if root is not None else _recorded_places(manifest).source.root
+def source_root(manifest: AnyPath, root: str | None) -> Root | None:
+    """Find the place of the sources: the given one, or the one that ``dataset.json`` records."""
+    recorded = _recorded_places(manifest).source
+    return root if root is not None else recorded.roots or recorded.root
+
+
+def source_changes(root: Root | None, folder: AnyPath) -> dict[str, Any]:
+    """Return the settings that give the place of the sources, and the list that ``dataset.json`` records."""
+    recorded = _recorded_places(folder / "manifest.csv").source.list
+    places = at_place(root) | {"list": recorded if root else None}
+    return {f"source.{key}": value for key, value in places.items()}
 
 
 def dark_places(manifest: AnyPath, frames: str | None = None, shading: str | None = None) -> DarkPlaces:
@@ -99,7 +109,7 @@ def dark_places(manifest: AnyPath, frames: str | None = None, shading: str | Non
     )
 
 
-def check_source_sizes(manifest: AnyPath, root: str) -> None:
+def check_source_sizes(manifest: AnyPath, root: Root) -> None:
     """Compare the sizes of the source files with those that a manifest records; opens no source.
 
     Raises SourceChangedError if a file is missing or has another size; names the first one; DamageError if the manifest
@@ -107,8 +117,7 @@ def check_source_sizes(manifest: AnyPath, root: str) -> None:
     """
     last = ""
     # one listing instead of a request for each object
-    place = any_path(root)
-    sizes = {entry.path: entry.size for entry in place.walk_entries()} if isinstance(place, ObjectPath) else None
+    sizes = {entry.path: entry.size for entry in root_path(root).walk_entries()} if is_remote(root) else None
     for row in read_rows(manifest):
         name, recorded = str(row["source"]), row["source_bytes"]
         if name == last or not recorded:  # built-in scenes and unreadable files have no size
@@ -118,10 +127,10 @@ def check_source_sizes(manifest: AnyPath, root: str) -> None:
         try:
             size = sizes[path] if sizes else source_file(root, path).stat().st_size
         except (OSError, ValueError, KeyError, SourceError):
-            raise SourceChangedError(f"source {name}: is missing from {root}; {ADVICE}") from None
+            raise SourceChangedError(f"source {name}: is missing from {place_text(root)}; {ADVICE}") from None
         if size != recorded:
             raise SourceChangedError(
-                f"source {name}: has {size} bytes in {root}; expected {recorded}, as recorded; {ADVICE}"
+                f"source {name}: has {size} bytes in {place_text(root)}; expected {recorded}, as recorded; {ADVICE}"
             )
 
 
@@ -148,7 +157,7 @@ def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
 
 
 def replay(
-    rows: Iterable[Row], root: str | None, to: Path | None = None, dark: DarkPlaces = NO_DARK_FRAMES
+    rows: Iterable[Row], root: Root | None, to: Path | None = None, dark: DarkPlaces = NO_DARK_FRAMES
 ) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
@@ -183,7 +192,7 @@ class PairRegenerator:
     rows of one image are consecutive.
     """
 
-    def __init__(self, root: str | None, dark: DarkPlaces = NO_DARK_FRAMES) -> None:
+    def __init__(self, root: Root | None, dark: DarkPlaces = NO_DARK_FRAMES) -> None:
         self._root, self._dark = root, dark
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
@@ -257,7 +266,7 @@ class PairRegenerator:
 
     def _load(self, source: Source, downscale: int) -> tuple[str, Photograph]:
         root = None if source.size_bytes == 0 else self._root  # built-in scenes have no bytes
-        config = SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=downscale)
+        config = SourceConfig(**at_place(root), max_pixels=NO_LIMIT, downscale=downscale)
         if self._kept is None or self._kept[:2] != (config, source):
             self._kept = None  # frees the last photograph first: two at a time would take twice the memory
             self._kept = config, source, *load_source(config, source)

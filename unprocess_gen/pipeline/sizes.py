@@ -214,7 +214,7 @@ def _sampled_bytes(config: Config, sources: Sequence[Source], count: int) -> lis
     sizes: list[int] = []
     frame_size = None
     sample = evenly_spaced(sources, count)
-    with reading_ahead(config.source.root, read_bytes, sample) as read:
+    with reading_ahead(config.source.place, read_bytes, sample) as read:
         for source in sample:
             size = frame_size if source.is_video else None
             if size is None:
@@ -228,13 +228,13 @@ def _sampled_bytes(config: Config, sources: Sequence[Source], count: int) -> lis
 
 def _size_in_shard(config: Config, source: Source, read: Read) -> int:
     side, bits = config.source.downscale, 8
-    if config.source.root is None:
+    if config.source.place is None:
         height, width = synthetic.SIZES.get(source.path, synthetic.DEFAULT_SIZE)
     elif source.is_video:
         height, width = load_source(config.source, replace(source, frame=0))[1].srgb.shape[:2]
         side = 1
     else:
-        header = probe(read(config.source.root, source))
+        header = probe(read(config.source.place, source))
         if header.missing or header.width * header.height > config.source.max_pixels:
             return 0
         height, width, bits = header.height, header.width, header.bits

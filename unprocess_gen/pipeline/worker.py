@@ -34,6 +34,7 @@ from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
+from unprocess_gen.sources.listing import place_setting
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.read_ahead import Read, reading_ahead
 from unprocess_gen.sources.reading import read_bytes, source_file
@@ -96,7 +97,7 @@ def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source:
         with (
             _one_opencv_thread(),
             ShardWriter(path, threaded=context.core_to_spare) as writer,
-            reading_ahead(context.config.source.root, read_bytes, task.sources) as read,
+            reading_ahead(context.config.source.place, read_bytes, task.sources) as read,
         ):
             for source in task.sources:
                 busy.write_text(str(source.index))
@@ -133,7 +134,7 @@ def make_image(
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
     with log.times.adding("simulate_s"):
         image = plan_pixels(context.settings, photograph.srgb, source, sha256)
-        noise_dn = None if config.source.root is None else source_noise_dn(photograph.srgb, image.plans[0])
+        noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
     log.failures.update(dict.fromkeys(_self_test(context, image.plans)))
     is_cut = patch_rule(config.source) is not None
     rows: list[Row] = []
@@ -164,10 +165,10 @@ def _check_not_deleted(config: Config, source: Source, error: SourceError) -> No
     """Raise MachineError if a source cannot be read because it was deleted after the listing."""
     if error.reason != "unreadable" or source.reason is not None:
         return
-    if not source_file(config.source.root or "", source.path).exists():
+    if not source_file(config.source.place or "", source.path).exists():
         raise MachineError(
-            f"source.root={config.source.root}: {source.name} was deleted or moved after listing; expected the "
-            "listed files; restore it and run the same command again"
+            f"{place_setting(config.source.place or '')}: {source.name} was deleted or moved after listing; expected "
+            "the listed files; restore it and run the same command again"
         ) from error
 
 

@@ -23,6 +23,7 @@ from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.random_streams import stream_key
+from unprocess_gen.core.roots import is_remote
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.targets import FRAME_TARGETS
 from unprocess_gen.core.types import Plan, Source, Srgb
@@ -190,7 +191,7 @@ def _drawn_entries(config: Config, sources: Sequence[Source]) -> tuple[int, ...]
 
 
 def _sha256(config: Config, source: Source) -> str:
-    root = config.source.root
+    root = config.source.place
     return load_source(config.source, source)[0] if root is None else content_sha256(root, source)
 
 
@@ -205,7 +206,7 @@ def _sample(sources: Sequence[Source], entries: Sequence[int] | None) -> list[So
 
 def _headers_read(config: Config, sources: Sequence[Source]) -> int:
     """Number of sources whose headers are read: all, as long as their files have `HEADER_BYTES`."""
-    if config.source.root is not None and not isinstance(any_path(config.source.root), Path):
+    if config.source.place is not None and is_remote(config.source.place):
         return SIZE_SAMPLE
     mean_bytes = sum(source.size_bytes or 0 for source in sources) // len(sources)
     return min(len(sources), max(SIZE_SAMPLE, HEADER_BYTES // max(mean_bytes, 1)))
@@ -261,7 +262,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         unused_pixels=pixels_in_none(image.patches, height, width),
         clean_levels=clean_levels,
         bands=empty_bands(photograph.srgb, levels[0]),
-        noise_ratio=None if config.source.root is None else noise_ratio(photograph.srgb, levels[0]),
+        noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, levels[0]),
     )
 
 

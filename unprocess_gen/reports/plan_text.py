@@ -22,7 +22,7 @@ from unprocess_gen.reports.estimate import RunEstimate, SourceEstimate
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.expectation import Site
-from unprocess_gen.sources.listing import unmatched_sentence
+from unprocess_gen.sources.listing import place_text, unmatched_sentence
 
 
 def format_estimate(estimate: RunEstimate) -> str:
@@ -31,8 +31,9 @@ def format_estimate(estimate: RunEstimate) -> str:
     about = "" if estimate.exact else "about "
     notes = unmatched_sentence(run.listing.unmatched), *run.listing.warnings, shards_warning(config, run.sources)
     basis = "" if estimate.exact else f", from {estimate.headers} headers (--all reads every source: exact)"
+    place = place_text(config.source.place or "the built-in scenes")
     lines = [
-        f"sources   {len(run.sources)} in {config.source.root or 'the built-in scenes'}; {len(read)} of them read",
+        f"sources   {len(run.sources)} in {config.source.list or place}; {len(read)} of them read",
         *(f"          {note}" for note in notes if note),
         f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}",
         *_labelled("splits", [_split_sentence(config, len(run.sources))]),

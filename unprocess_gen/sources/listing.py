@@ -13,18 +13,23 @@ these paths have, so that the same photographs give the same dataset.
 
 from __future__ import annotations
 
+import csv
 import fnmatch
 import itertools
 import os
+import posixpath
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import PurePosixPath
 
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import Entry, EntryKind, StoreAccessError
-from unprocess_gen.core.paths import any_path
+from unprocess_gen.core.paths import absolute_text, any_path
+from unprocess_gen.core.roots import Root, root_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.names import encode_name
 
@@ -41,6 +46,10 @@ CONVERTIBLE_SUFFIXES = frozenset(
     )
 )
 """Suffixes of photographs that cannot be decoded; `unmatched_sentence` advises to convert them."""
+
+
+MAX_LISTED = 4096
+"""Characters of the longest path in a list."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +80,7 @@ class Listing:
 
 
 def list_folder(
-    root: str, include: Sequence[str], recursive: bool, limit: int | None, video: Sequence[str] = ()
+    root: Root, include: Sequence[str], recursive: bool, limit: int | None, video: Sequence[str] = ()
 ) -> Listing:
     """List the files below ``root`` that the globs match, ordered by the bytes of their relative paths.
 
@@ -105,7 +114,7 @@ def list_folder(
     matched: list[Entry] = []
     suffixes, skipped_links, has_video = Counter[str](), 0, False
     try:
-        for entry in any_path(root).walk_entries(recursive):
+        for entry in root_path(root).walk_entries(recursive):
             if matches(entry.path):
                 matched.append(entry)
             elif entry.kind is EntryKind.FILE:
@@ -115,13 +124,15 @@ def list_folder(
                 raise _unreadable_folder(root, entry.path, entry.problem)
             skipped_links += recursive and entry.kind is EntryKind.LOOP
     except OSError as error:
-        raise _unreadable_folder(root, os.path.relpath(error.filename, root), error.strerror or str(error)) from None
+        raise _unreadable_folder(
+            root, os.path.relpath(error.filename, str(root)), error.strerror or str(error)
+        ) from None
     unmatched = dict(sorted(suffixes.items(), key=lambda item: (-item[1], item[0])))
     if not matched:
         advice = f"{unmatched_sentence(unmatched)}; " if unmatched else ""
         advice += "choose a folder of photographs or other globs"
         raise ConfigError(
-            f"source.root={root}: no file matches source.include={list(include)} "
+            f"{place_setting(root)}: no file matches source.include={list(include)} "
             f"({'with' if recursive else 'without'} sub-folders); "
             + ("set source.clips=true to read videos as clips" if has_video else advice)
         )
@@ -130,7 +141,76 @@ def list_folder(
     return Listing(sources, skipped_links, unmatched, _video_warnings(sources, is_video))
 
 
-def check_root(root: str) -> None:
+def list_file(root: Root, file: str, limit: int | None) -> Listing:
+    """List the sources that a text or CSV file names, ordered by the bytes of their paths below ``root``.
+
+    A path that is no regular file becomes a source that fails. ConfigError for paths outside of ``root`` and repeated
+    ones, and for a file that names none.
+    """
+    lines: dict[str, int] = {}
+    for number, text in _listed_paths(file):
+        path = _path_below(root, text)
+        problem = f"is repeated from line {lines[path]}; expected each path once" if path in lines else ""
+        if leads_outside(path) or "\0" in path or len(path) > MAX_LISTED:
+            problem = f"is no path below {place_text(root)}; expected files in it"
+        if problem:
+            raise ConfigError(f"source.list={file}: line {number}: {encode_name(text)[:200]} {problem}")
+        lines[path] = number
+    if not lines:
+        raise ConfigError(f"source.list={file}: names no file; expected a path in each line")
+    in_order = sorted(lines, key=os.fsencode)[:limit]
+    entries = root_path(root).each(partial(_listed_entry, root), in_order)
+    return Listing(tuple(_source(index, entry) for index, entry in enumerate(entries)))
+
+
+def _listed_paths(file: str) -> Iterator[tuple[int, str]]:
+    """Yield the paths in a list with the numbers of their lines."""
+    try:
+        with any_path(file).open("rb") as stream:
+            lines = stream.read().decode("utf-8-sig", "surrogateescape").split("\n")
+        if not file.lower().endswith(".csv"):
+            yield from ((number, line.rstrip("\r")) for number, line in enumerate(lines, start=1) if line.strip())
+            return
+        table = csv.reader(lines, strict=True)
+        header = next(table, [])
+        column = header.index("file") if "file" in header else 0
+        yield from ((table.line_num, row[column]) for row in table if row)
+    except IndexError:
+        raise ConfigError(f"source.list={file}: line {table.line_num}: lacks the column file") from None
+    except (OSError, csv.Error) as error:
+        raise ConfigError(f"source.list={file}: cannot be read ({error}); expected a text or CSV file") from None
+
+
+def _path_below(root: Root, text: str) -> str:
+    """Return the path of a listed file below the root, with ``/`` between its segments; others stay as they are."""
+    numbered = [(f"{number}/", one) for number, one in enumerate(root)] if isinstance(root, tuple) else [("", root)]
+    for prefix, folder in numbered:
+        start = f"{absolute_text(folder)}".rstrip("/") + "/"
+        if text.startswith(start):
+            return prefix + posixpath.normpath(text.removeprefix(start))
+    return text if text.startswith("/") else posixpath.normpath(text.replace(os.sep, "/"))
+
+
+def _listed_entry(root: Root, path: str) -> Entry:
+    try:
+        return (root_path(root) / path).entry()._replace(path=path)
+    except StoreAccessError as error:
+        raise ConfigError(f"source.list={error}") from None
+    except OSError:
+        return Entry(path, None, EntryKind.BROKEN_LINK)
+
+
+def place_text(root: Root) -> str:
+    """Return a place for a message."""
+    return ", ".join(root) if isinstance(root, tuple) else root
+
+
+def place_setting(root: Root) -> str:
+    """Return a place as the setting that gives it, for a message."""
+    return f"source.root{'s' * isinstance(root, tuple)}={place_text(root)}"
+
+
+def check_root(root: Root) -> None:
     """Raise ConfigError unless a source root is a folder, a regular file, or the URL of a prefix or object."""
     _single_file(root)
 
@@ -165,19 +245,19 @@ def matcher(include: Iterable[str]) -> Callable[[str], bool]:
     return lambda path: of_name(path.rpartition("/")[2]) is not None or of_path(path) is not None
 
 
-def _unreadable_folder(root: str, folder: str, reason: str) -> ConfigError:
+def _unreadable_folder(root: Root, folder: str, reason: str) -> ConfigError:
     name = "" if folder == os.curdir else encode_name(folder)
     ways_out = "change its permissions, move it, or set source.recursive=false" if name else "change its permissions"
     return ConfigError(
-        f"source.root={root}: {name or 'the folder itself'} cannot be read ({reason}); expected readable folders; "
+        f"{place_setting(root)}: {name or 'the folder itself'} cannot be read ({reason}); expected readable folders; "
         f"{ways_out}"
     )
 
 
-def _single_file(root: str) -> Entry | None:
+def _single_file(root: Root) -> Entry | None:
     """Return the file or object that a root is, or None if it is a folder or prefix."""
     try:
-        entry = any_path(root).entry()
+        entry = root_path(root).entry()
     except StoreAccessError as error:
         raise ConfigError(f"source.root={error}") from None
     except (OSError, ValueError) as error:

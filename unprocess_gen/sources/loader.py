@@ -12,14 +12,14 @@ import numpy as np
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
-from unprocess_gen.core.errors import FilteredError, MachineError, SourceError
+from unprocess_gen.core.errors import ConfigError, FilteredError, MachineError, SourceError
 from unprocess_gen.core.libraries import require
-from unprocess_gen.core.paths import local_path
+from unprocess_gen.core.roots import Root, is_remote
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
 from unprocess_gen.sources import reading
 from unprocess_gen.sources.clips import clip_warnings, number_clips
 from unprocess_gen.sources.image import decode
-from unprocess_gen.sources.listing import Listing, list_folder, matcher
+from unprocess_gen.sources.listing import Listing, list_file, list_folder, matcher, place_setting
 from unprocess_gen.sources.read_ahead import Read
 from unprocess_gen.sources.scenes import synthetic
 from unprocess_gen.sources.twins import number_twins
@@ -43,17 +43,21 @@ def list_photographs(config: SourceConfig) -> Listing:
     MachineError
         If a file changes while it is hashed.
     """
-    if config.root is None:
+    place = config.place
+    if place is None:
         scenes = synthetic.listing(config.limit)
         return Listing(tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(scenes)))
     include = [*config.include, *(config.video if config.clips else ())]
-    listed = list_folder(config.root, include, config.recursive, config.limit, () if config.clips else config.video)
-    numbered = number_twins(config.root, listed.sources)
+    if config.list is None:
+        listed = list_folder(place, include, config.recursive, config.limit, () if config.clips else config.video)
+    else:
+        listed = list_file(place, config.list, config.limit)
+    numbered = number_twins(place, listed.sources)
     if not config.clips:
         return replace(listed, sources=numbered)
-    _refuse_remote_videos(config, config.root, numbered)
+    _refuse_remote_videos(config, place, numbered)
     framed = itertools.islice(_framed(config, numbered), config.limit)
-    numbered = number_clips(config.root, [replace(source, index=index) for index, source in enumerate(framed)])
+    numbered = number_clips(place, [replace(source, index=index) for index, source in enumerate(framed)])
     return replace(listed, sources=numbered, warnings=clip_warnings(numbered))
 
 
@@ -109,15 +113,16 @@ def downscaled(srgb: Srgb, side: int) -> Srgb:
 
 
 def _decoded(config: SourceConfig, source: Source, read: Read) -> tuple[str, Photograph]:
-    if config.root is None:
+    place = config.place
+    if place is None:
         try:
             pixels = synthetic.scene(source.path)
         except ValueError as error:  # only the row of an edited manifest can name a scene that does not exist
             raise SourceError("unreadable", str(error)) from error
         return hashlib.sha256(pixels.data).hexdigest(), Photograph(pixels, orientation=1)
     if source.is_video:
-        return _frame(config, config.root, source)
-    content = read(config.root, source)
+        return _frame(config, place, source)
+    content = read(place, source)
     digest = hashlib.sha256(content).hexdigest()
     _check_digest(source, digest)
     try:
@@ -137,16 +142,17 @@ def _check_digest(source: Source, digest: str) -> None:
 # ------------------------------------------------------------------------------------------------------------ videos
 
 
-def _refuse_remote_videos(config: SourceConfig, root: str, sources: Iterable[Source]) -> None:
+def _refuse_remote_videos(config: SourceConfig, root: Root, sources: Iterable[Source]) -> None:
     """Refuse videos in an object store: each worker would download every video once."""
     is_video = matcher(config.video)
     video = next((source for source in sources if is_video(source.path)), None)
     if video is not None:
         refusal = (
-            f"source.root={root}: {video.name} is a video in an object store; expected folders of frames; copy "
+            f"{place_setting(root)}: {video.name} is a video in an object store; expected folders of frames; copy "
             "the videos to a local folder, or omit them with source.video=[]"
         )
-        local_path(root, refusal)
+        if is_remote(root):
+            raise ConfigError(refusal)
 
 
 def _framed(config: SourceConfig, sources: Iterable[Source]) -> Iterator[Source]:
@@ -163,16 +169,16 @@ def _framed(config: SourceConfig, sources: Iterable[Source]) -> Iterator[Source]
 
 def _frames(config: SourceConfig, source: Source) -> tuple[str | None, int]:
     """Return a video's digest and its number of sources: its frames, or one that fails if it cannot be read."""
-    assert config.root is not None
+    assert config.place is not None
     try:
-        digest, video = _video(config.root, source)
+        digest, video = _video(config.place, source)
         video.refuse(config.max_pixels, config.icc)
     except SourceError as error:
         return error.sha256, 1
     return digest, len(video)
 
 
-def _frame(config: SourceConfig, root: str, source: Source) -> tuple[str, Photograph]:
+def _frame(config: SourceConfig, root: Root, source: Source) -> tuple[str, Photograph]:
     digest, video = _video(root, source)
     _check_digest(source, digest)
     try:
@@ -182,7 +188,7 @@ def _frame(config: SourceConfig, root: str, source: Source) -> tuple[str, Photog
     return digest, Photograph(decode.upright(stored, orientation), orientation)
 
 
-def _video(root: str, source: Source) -> tuple[str, Video]:
+def _video(root: Root, source: Source) -> tuple[str, Video]:
     """Return a video's digest and the open video; both are cached until the file changes."""
     needs = f"source.video: {source.name} is a video, which needs PyAV"
     require("av", needs, "video", ", or omit videos with source.video=[]")
@@ -191,7 +197,7 @@ def _video(root: str, source: Source) -> tuple[str, Video]:
 
 
 @lru_cache(maxsize=OPEN_VIDEOS)
-def _open_video(root: str, source: Source, stamp: reading.Stamp) -> tuple[str, Video]:
+def _open_video(root: Root, source: Source, stamp: reading.Stamp) -> tuple[str, Video]:
     if source.size_bytes == 0:
         raise SourceError("empty", f"{source.name} has 0 bytes")
     file = reading.keep_open(root, source)

@@ -11,7 +11,8 @@ from typing import BinaryIO
 from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import ObjectChangedError, ObjectPath
-from unprocess_gen.core.paths import LocalPath, NotAFileError, any_path
+from unprocess_gen.core.paths import LocalPath, NotAFileError
+from unprocess_gen.core.roots import Root, SourceRoots, root_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.names import encode_name
 
@@ -24,13 +25,13 @@ Stamp = tuple[int, int, int, int]
 _RESTORE = "restore it, or choose another out when nothing writes to source.root"
 
 
-def source_file(root: str, path: str) -> LocalPath | ObjectPath:
+def source_file(root: Root, path: str) -> LocalPath | ObjectPath:
     """Return the file of a source.
 
     Parameters
     ----------
-    root : str
-        Value of ``source.root``: a folder, or the single picture.
+    root : Root
+        Place of the sources: a folder or several, or the single picture.
     path : str
         `Source.path`.
 
@@ -42,12 +43,14 @@ def source_file(root: str, path: str) -> LocalPath | ObjectPath:
     """
     if leads_outside(path):
         raise SourceError("unreadable", f"{encode_name(path)} leads outside source.root")
-    folder = any_path(root)
+    folder = root_path(root)
+    if isinstance(folder, SourceRoots):
+        return folder / path
     return folder if folder.name == path and not folder.is_dir() else folder / path
 
 
 @contextmanager
-def opened(root: str, source: Source, has_limit: bool = True) -> Iterator[BinaryIO]:
+def opened(root: Root, source: Source, has_limit: bool = True) -> Iterator[BinaryIO]:
     """Open a source, unless it is not, or no longer, the regular file that was listed.
 
     Raises
@@ -75,7 +78,7 @@ def opened(root: str, source: Source, has_limit: bool = True) -> Iterator[Binary
         raise SourceError("unreadable", f"{source.name}: {why}") from None
 
 
-def read_bytes(root: str, source: Source) -> bytes:
+def read_bytes(root: Root, source: Source) -> bytes:
     """Return the content of a photograph; raise as `opened`, or SourceError ``empty``."""
     with opened(root, source) as file:
         if source.size_bytes == 0:  # files below /proc grow while they are read
@@ -92,7 +95,7 @@ def _check_size(source: Source, size_bytes: int, when: str) -> None:
         )
 
 
-def content_sha256(root: str, source: Source) -> str:
+def content_sha256(root: Root, source: Source) -> str:
     """SHA-256 of a source's file, known or computed; that of its name if the file cannot be read."""
     if source.sha256 is not None:
         return source.sha256
@@ -102,14 +105,14 @@ def content_sha256(root: str, source: Source) -> str:
         return hashlib.sha256(source.name.encode()).hexdigest()
 
 
-def stamp(root: str, source: Source) -> Stamp:
+def stamp(root: Root, source: Source) -> Stamp:
     """Device, inode, size and modification time of a local file, to detect a replaced file; raise as `opened`."""
     with opened(root, source, has_limit=False) as file:
         status = os.fstat(file.fileno())
         return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def keep_open(root: str, source: Source) -> BinaryIO:
+def keep_open(root: Root, source: Source) -> BinaryIO:
     """Open a local file that the caller closes; raise as `opened`."""
     with opened(root, source, has_limit=False) as file:
         return os.fdopen(os.dup(file.fileno()), "rb", buffering=0)

@@ -128,16 +128,16 @@ def _select(config: Config, sizes: SampleSizes, folder: Path) -> RunFiles:
         pixels.append(0)
         with suppress(SourceError):
             pixels[-1] = load_source(source_config, source, config.output.layout)[1].srgb[..., 0].size
-            if source_config.root is None:
+            if source_config.place is None:
                 _write_scene(source_config, source, scenes)
         if sum(map(bool, pixels)) >= sizes.run_files or sum(pixels) >= sizes.run_pixels:
             break
     if not any(pixels):
         raise ConfigError(
-            f"source.root={source_config.root}: none of {len(pixels)} photographs can be read with "
+            f"source.root={source_config.place}: none of {len(pixels)} photographs can be read with "
             f"output.layout={config.output.layout}; expected at least one"
         )
-    if source_config.root is None:
+    if source_config.place is None:
         source_config = replace(source_config, root=str(scenes), include=("*.jpg",), clips=False)
     return RunFiles(source_config, tuple(pixels), folder).at_most(sizes.run_pixels)
 

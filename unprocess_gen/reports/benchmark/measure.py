@@ -187,7 +187,7 @@ def _conditions(session: BenchmarkSession, files: RunFiles, command: str) -> dic
         "date": time.strftime("%Y-%m-%d %H:%M %Z"),
         "machine": f"{processor()}; one thread of {os.cpu_count()}; {platform.system()} {platform.machine()}",
         "versions": f"Python {platform.python_version()}, {', '.join(versions)}",
-        "photographs": f"{names}, of {given.source.root or 'the built-in scenes'}; errors on {sites:,} of their sites",
+        "photographs": f"{names}, of {given.source.place or 'the built-in scenes'}; errors on {sites:,} of their sites",
         "complete runs": f"the first photographs with {files.pixels / 1e6:.1f} megapixels",
         "rounds": str(session.sizes.rounds),
         "noise at 14 bits": f"{noise_text(two_parameter)}; physical {noise_text(physical)}",

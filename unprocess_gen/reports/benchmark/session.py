@@ -231,7 +231,7 @@ def load_images(config: Config, sizes: SampleSizes) -> tuple[BenchmarkImage, ...
             images.append(cut_image(source.name, source.stream_identity(sha256), photograph.srgb, sizes))
     if not images:
         raise ConfigError(
-            f"source.root={config.source.root}: none of {len(sources)} photographs tried can be read; expected at "
+            f"source.root={config.source.place}: none of {len(sources)} photographs tried can be read; expected at "
             "least one"
         )
     return tuple(images)

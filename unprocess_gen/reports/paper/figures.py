@@ -144,7 +144,7 @@ def load_figure_source(config: Config, options: PaperOptions) -> FigureSource:
             saturation.after[name].append(make_pair(srgb, plan).counts.saturated)
     if subject is None:
         raise ConfigError(
-            f"source.root={config.source.root}: none of {len(sources)} photographs can be read; expected at least one"
+            f"source.root={config.source.place}: none of {len(sources)} photographs can be read; expected at least one"
         )
     return subject
 

@@ -6,9 +6,10 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.config.schema import SourceConfig, at_place
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.roots import Root
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Photograph, Plan, Row, Source, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
@@ -57,12 +58,14 @@ def selected_pairs(folder: AnyPath, keys: Sequence[str], source: AnyPath | None)
         yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_from_row(row), part, missing)
 
 
-def _load_part(row: Row, root: str | None, load: Load) -> tuple[Srgb | None, str]:
+def _load_part(row: Row, root: Root | None, load: Load) -> tuple[Srgb | None, str]:
     """Load the part of the source that a row's frames show; None and the reason if it is not available."""
     is_scene = row["source_bytes"] == 0
     if root is None and not is_scene:
         return None, "the dataset does not record where its photographs are; give --source ROOT"
-    config = SourceConfig(root=None if is_scene else root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1))
+    config = SourceConfig(
+        **at_place(None if is_scene else root), max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1)
+    )
     try:
         sha256, photograph = load(config, source_of(row))
     except (SourceError, MachineError, ConfigError) as error:  # the sheet is drawn without this photograph
