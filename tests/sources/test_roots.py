@@ -92,9 +92,15 @@ def test_lists_name_files_below_root_or_roots(places: tuple[Path, Path], tmp_pat
     assert listed(roots, f"source.list={table}", "source.limit=1") == ["0/000.png"]
 
 
-def test_roots_may_be_in_an_object_store(places: tuple[Path, Path], bucket: ObjectPath, tmp_path: Path) -> None:
+def test_roots_may_be_in_an_object_store(
+    places: tuple[Path, Path], bucket: ObjectPath, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
+) -> None:
     servers.upload(places[1], bucket / "photos")
     roots = f"source.roots=['{places[0]}','{bucket / 'photos'}']"
+    assert run_main(roots, *MAKE, "out=ds").code == 0
+    assert run_main("source.roots=['the first',second]", *MAKE, "out=local").code == 0
+    assert tree_hash(Path("ds")) == tree_hash(Path("local"))
+    assert run_main("replay", "ds").code == 0
     found = listed(roots)
     assert found == listed(f"source.roots=['{places[0]}','{places[1]}']")
     (tmp_path / "list.txt").write_text(f"{bucket}/photos/sub/001.png\n0/001.png\n1/none.png\n", encoding="utf-8")
