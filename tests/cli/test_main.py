@@ -35,7 +35,7 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import SourceError, UnprocessGenError
 
 REFUSED = [
-    (["camera=nope"], r"camera=nope: no such option; expected one of choice, convex, custom, identity, nexus_6p, "),
+    (["camera=nope"], r"camera=nope: no such option; expected one of canon_5d4, canon_700d, "),
     (["source.rot=photos"], r"source.rot=photos: no such key; source has root, roots, list, include, "),
     (["~camera"], r"~camera: a setting cannot be removed"),
     (["+camera=convex"], r".*camera.*more than once"),
@@ -236,7 +236,7 @@ def test_cfg_job_prints_settings_and_writes_nothing(run_main: RunMain, tmp_path:
 def test_hydra_completes_options_and_writes_nothing(cli: Cli, tmp_path: Path) -> None:
     line = "gen-dataset camera=s"
     done = cli("-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
-    assert (done.returncode, done.stdout.split()) == (0, ["camera=sony_a7r", "camera=sony_rx100"])
+    assert (done.returncode, done.stdout.split()) == (0, ["camera=sony_a7r", "camera=sony_a7s2", "camera=sony_rx100"])
     assert list(tmp_path.iterdir()) == []
 
 

@@ -118,7 +118,7 @@ def test_all_forms_of_values_are_expanded(mine: Path) -> None:
     assert jobs("+sweep=forms", own=mine) == [
         f"camera={camera},noise.draws=2,seed={seed},source.recursive=True"
         for seed in (1, 2, 3)
-        for camera in ("sony_a7r", "sony_rx100")
+        for camera in ("sony_a7r", "sony_a7s2", "sony_rx100")
     ]
 
 

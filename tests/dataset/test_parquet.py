@@ -15,7 +15,6 @@ from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill
 from pyarrow import parquet as reader
 
-from unprocess_gen.config import validation
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset import parquet
@@ -134,7 +133,7 @@ def test_changed_parquet_is_not_certified_by_a_damaged_dataset_json(copy: Path, 
 
 
 def test_missing_pyarrow_is_refused(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(validation, "find_spec", lambda name: None)
+    monkeypatch.setattr("unprocess_gen.core.libraries.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"^output.parquet=true: needs pyarrow; .* pip install '\.\[parquet\]'"):
         validate_config(settings(PARQUET))
     validate_config(settings())

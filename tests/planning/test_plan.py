@@ -201,7 +201,9 @@ def test_custom_matrix_has_no_weights(settings: Settings) -> None:
 
 def test_counters_of_draws_never_change() -> None:
     names = "weight_0 weight_1 weight_2 weight_3 choice red blue inverse_rgb a b iso exposure_s temperature_c"
-    assert [draw.name.lower() for draw in sorted(Draw)] == [*names.split(), "exposure_ratio", "sensor_unit"]
+    assert [draw.name.lower() for draw in sorted(Draw)] == [
+        *names.split(), "exposure_ratio", "sensor_unit", "light", "cct", "light_distance",
+    ]  # fmt: skip
     assert {name: number.counter for name, number in NUMBERS.items() if number.counter >= 0} == {
         "read_shape": 14, "read_std_dn": 15, "row_std_dn": 16, "column_std_dn": 17, "column_temporal_std_dn": 19,
     }  # fmt: skip
