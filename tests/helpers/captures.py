@@ -43,7 +43,7 @@ class Camera:
         return ug.make_pair(codes, config, seed=self.seed, key=f"{self.iso} {light} {seconds} {number}")
 
     def _levels(self) -> list[str]:
-        noise = load(f"noise={self.profile}").noise
+        noise = load(f"noise={self.profile}", f"scene.iso={self.iso}").noise
         names = ("bits", "black_level_dn", "white_level_dn")
         return [f"sensor.{name}={getattr(noise, name)}" for name in names]
 

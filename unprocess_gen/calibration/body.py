@@ -161,6 +161,8 @@ def _hot(results: Sequence[IsoResult]) -> tuple[Estimate | None, Estimate | None
     The currents are exponentially distributed (the profile's law), so those above a threshold have the mean of all plus
     the threshold.
     """
+    from scipy.stats import chi2
+
     longest = [(result, result.darks[-1]) for result in results if result.darks[-1].exposure_s >= LEAST_HOT_EXPOSURE_S]
     if not longest:
         return None, None
@@ -174,8 +176,9 @@ def _hot(results: Sequence[IsoResult]) -> tuple[Estimate | None, Estimate | None
         return share_estimate(0, sites), None
     excess = dark.hot_dn / result.gain.sensor.value / dark.exposure_s
     mean = max(float(excess.mean()) - least, 1e-3 * least)
-    factor = math.exp(min(least / mean, 5.0))
-    return share_estimate(len(excess), sites).scaled(factor), estimate(mean, mean / math.sqrt(len(excess)), 0.0)
+    factor = math.exp(min(least / mean, 1.0))
+    total, (low, high) = 2 * mean * len(excess), chi2.ppf((0.025, 0.975), 2 * len(excess))
+    return share_estimate(len(excess), sites).scaled(factor), Estimate(mean, total / float(high), total / float(low))
 
 
 def share_estimate(count: int, sites: int) -> Estimate:

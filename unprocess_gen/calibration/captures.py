@@ -32,6 +32,8 @@ KINDS = {"dark": ("dark", "bias"), "flat": ("flat",)}
 EMVA_ISO = 100.0
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
 LEAST_SIDE = 32
+APART = 0.03
+"""Relative difference of signals from which flats without a stated level are of different levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +236,7 @@ def _from_names(folder: Path) -> Iterator[Capture]:
             problem = "its name has neither dark nor flat" if not kinds else "its name has dark and flat"
             problem = "it states no ISO" if len(kinds) == 1 else problem
             raise ConfigError(f"calibrate: {file}: {problem}; expected {LIST} in {folder}, with a line for each frame")
-        yield Capture(file, kinds[0], level=file.parent.name if kinds[0] == "flat" else "", **facts)
+        yield Capture(file, kinds[0], **facts)
 
 
 def _from_emva(folder: Path) -> Iterator[Capture]:
@@ -305,12 +307,12 @@ def _common(captures: Iterable[Capture], name: str) -> Any:
     return getattr(first, name)
 
 
-def with_measured_levels(captures: list[Capture], means: Mapping[Path, float], apart: float) -> list[Capture]:
-    """Return flats without a stated level, each with a level that frames of nearly the same mean share."""
+def with_measured_levels(captures: list[Capture], signals: Mapping[Path, float]) -> list[Capture]:
+    """Return flats without a stated level, each with a level that frames of nearly the same mean signal share."""
     result, before, number = [], -math.inf, 0
-    for capture in sorted(captures, key=lambda capture: means[capture.path]):
-        mean = means[capture.path]
-        number += mean > before * (1 + apart) if before > 0 else 1
-        before = mean
+    for capture in sorted(captures, key=lambda capture: signals[capture.path]):
+        signal = signals[capture.path]
+        number += signal > max(before * (1 + APART), 0.0)
+        before = signal
         result.append(replace(capture, level=f"{number}"))
     return result

@@ -15,7 +15,7 @@ LEAST_DARK_STD_DN = 0.4
 """Least noise of darks without rounding: below it, the variance of rounded values is no measure of the noise."""
 LEAST_DARK_STD_8_BITS_DN = 1.0
 """The same for 8 bits, whose curve is mostly rounding."""
-CLIPPED_SHARE = 0.02
+CLIPPED_SHARE = 0.005
 GAPS_REFUSED, GAPS_DOUBTFUL = 0.25, 0.02
 """Shares of values that never occur within the noise of a frame."""
 SMOOTHED_REFUSED, SMOOTHED_DOUBTFUL = 0.08, 0.025
@@ -47,15 +47,12 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
             f"{start}: the mean is {dark.mean_dn.mean():.1f} DN, and black is {sensor.black_dn:g} DN; expected frames "
             "without light; correct kind, or black_level_dn in captures.csv"
         )
-    for codes in dark.codes:
-        used = np.flatnonzero(codes)
-        lowest, total = int(used[0]), float(codes.sum())
-        peak = int(np.argmax(codes))
-        if codes[lowest] / total > CLIPPED_SHARE and int(used[-1]) - peak > 2 * (peak - lowest) + 2:
-            raise ConfigError(
-                f"{start}: {codes[lowest] / total:.0%} of the values are {lowest} DN, the lowest that occurs: black is "
-                "clipped, and half of the noise is missing; expected raw frames with an offset"
-            )
+    clipped = clipped_share(dark)
+    if clipped > CLIPPED_SHARE:
+        raise ConfigError(
+            f"{start}: {clipped:.1%} of the values are the lowest that occurs: black is clipped, and a part of the "
+            "noise is missing; expected raw frames with an offset"
+        )
     variances = dark.frame_variances
     if variances.max() > NOISE_CHANGE * variances.min():
         factor = math.sqrt(variances.max() / variances.min())
@@ -64,6 +61,16 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
             " expected frames of one ISO and exposure; remove those of another"
         )
     check_pixels(frames, dark, notes)
+
+
+def clipped_share(dark: Measured) -> float:
+    """Return the share of the lowest value, 0 if the histogram falls to both sides alike."""
+    shares = []
+    for codes in dark.codes:
+        used, peak = np.flatnonzero(codes), int(np.argmax(codes))
+        is_skewed = int(used[-1]) - peak > 2 * (peak - int(used[0])) + 2
+        shares.append(is_skewed * codes[used[0]] / float(codes.sum()))
+    return float(max(shares))
 
 
 def check_pixels(frames: Sequence[Capture], measured: Measured, notes: list[str]) -> None:

@@ -26,10 +26,22 @@ NEIGHBOURS = {
     "diagonal neighbours": ((2, 2), (2, -2)),
 }
 """Distances of the sites of pairs in rows and columns, by the name of the check of their correlation."""
+
+
+def plane_names(pattern: str) -> list[str]:
+    """Names of the planes in the order of the tile: R, B, and Gr or Gb for green next to red or blue."""
+    rows = pattern[:2], pattern[2:]
+    return [colour if colour != "G" else "Gr" if "R" in row else "Gb" for row in rows for colour in row]
+
+
 WINDOW = 11
 """Side of the squares of sites of a plane whose mean is subtracted before fixed patterns are measured."""
 FAR = 8.0
 """Distance of defects from the other pixels, in robust standard deviations."""
+FIXED = 3.0
+"""Least deviation of defects in standard errors of the mean of their frames."""
+STRUCK = 100.0
+"""Largest value of one frame in standard deviations; cosmic rays exceed it, heavy tails hardly ever."""
 ROBUST = 1.4826
 """Standard deviation of normal values over their median absolute deviation."""
 LARGEST_Z = 5.0
@@ -145,7 +157,7 @@ class FrameSums:
         own = (rows - means[..., None], columns - means[..., None])
         mean_frame = self.mean_frame()
         variances = (self._squares - self._sum.astype(np.float64) ** 2 / count) / (count - 1)
-        planes = [_plane(mean_frame[y::2, x::2], variances[y::2, x::2]) for y, x in TILE]
+        planes = [_plane(mean_frame[y::2, x::2], variances[y::2, x::2], count) for y, x in TILE]
         mean_dn, total, total_error, patterns, good = (np.array(values) for values in zip(*planes, strict=True))
         drift = means.var(axis=0, ddof=1)
         of_rows = rows.var(axis=0, ddof=1).mean(axis=1)
@@ -198,21 +210,26 @@ def high_passed(plane: Float) -> Float:
     return np.asarray((plane - uniform_filter(plane, WINDOW))[edge:-edge, edge:-edge])
 
 
-def _plane(mean: Float, variances: Float) -> tuple[float, float, float, float, float]:
-    """Return mean, variance, its error, and the variance of the fixed pattern, of sites that are no defects."""
+def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, float, float, float]:
+    """Return mean, variance, its error, variance of the fixed pattern, and number, of sites that are no defects.
+
+    A defect is far from its neighbours in all frames. A site with one far value, as heavy tails have it, is none.
+    """
     edge = WINDOW // 2
     pattern = high_passed(mean)
     deviation = np.abs(pattern - np.median(pattern))
-    is_good = deviation <= FAR * ROBUST * max(float(np.median(deviation)), 0.05)
-    count = float(is_good.sum())
-    inner = variances[edge:-edge, edge:-edge][is_good]
-    chosen = pattern[is_good]
+    inner = variances[edge:-edge, edge:-edge]
+    is_far = deviation > FAR * ROBUST * max(float(np.median(deviation)), 0.1)
+    is_good = (~is_far | (deviation**2 < FIXED**2 / count * inner)) & (
+        inner <= STRUCK**2 / count * max(np.median(inner), 1 / 12)
+    )
+    sites = float(is_good.sum())
     return (
         float(mean[edge:-edge, edge:-edge][is_good].mean()),
-        float(inner.mean()),
-        float(inner.std()) / math.sqrt(count),
-        float(chosen.var()),
-        count,
+        float(inner[is_good].mean()),
+        float(inner[is_good].std()) / math.sqrt(sites),
+        float(pattern[is_good].var()),
+        sites,
     )
 
 

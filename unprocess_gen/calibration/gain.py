@@ -52,9 +52,8 @@ def estimate(value: float, error: float, least: float = -math.inf) -> Estimate:
 
 def root_estimate(variance: float, error: float) -> Estimate:
     """Return the root of a variance with its standard error; 0 if it is less than 3 standard errors."""
-    value = math.sqrt(variance) if variance > SIGNIFICANT * error else 0.0
-    ends = (math.sqrt(max(variance + side * NORMAL_95 * error, 0.0)) for side in (-1, 1))
-    return Estimate(value, *ends)
+    value, positive = math.sqrt(variance) if variance > SIGNIFICANT * error else 0.0, max(variance, 0.0)
+    return Estimate(value, math.sqrt(max(positive - NORMAL_95 * error, 0.0)), math.sqrt(positive + NORMAL_95 * error))
 
 
 def combined(estimates: Sequence[Estimate]) -> Estimate:

@@ -6,13 +6,14 @@ ISOs before it therefore means that the sensor has switched its conversion gain:
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from unprocess_gen.calibration.gain import SIGNIFICANT, Estimate
+from unprocess_gen.calibration.gain import NORMAL_95, SIGNIFICANT, Estimate
 
 SWITCH = 0.85
 """Largest ratio of read noise to that of the same gain mode, from which it belongs to another mode."""
@@ -56,25 +57,23 @@ def std_law(isos: Sequence[float], stds: Sequence[Estimate]) -> Any:
     if len(isos) == 1 or not any(std.value for std in stds):
         return rounded(stds[0].value)
     values = [std.value for std in stds]
-    errors = [std.error * 2 * std.value for std in stds]
-    if all(values):
-        for powers in ((0,), (0, 2), (0, 1, 2)):
-            coefficients = _fitted(isos, [value**2 for value in values], errors, powers)
-            if coefficients is not None:
-                filled = dict(zip(powers, coefficients, strict=True))
-                return ["root", *(rounded(filled.get(power, 0.0)) for power in range(max(powers) + 1))]
+    errors = [(std.high**2 - std.low**2) / 2 / NORMAL_95 for std in stds]
+    for powers in ((0,), (0, 2), (0, 1, 2)):
+        coefficients = _fitted(isos, [value**2 for value in values], errors, powers)
+        if coefficients is not None:
+            filled = dict(zip(powers, coefficients, strict=True))
+            return ["root", *(rounded(filled.get(power, 0.0)) for power in range(max(powers) + 1))]
     least = 1e-3 * max(values)
-    return [
-        "by_iso",
-        *(number for iso, value in zip(isos, values, strict=True) for number in (iso, rounded(value or least))),
-    ]
+    pairs = ((iso, rounded(value or least)) for iso, value in zip(isos, values, strict=True))
+    return ["by_iso", *itertools.chain(*pairs)]
 
 
 def shape_law(isos: Sequence[float], shapes: Sequence[float]) -> Any:
     """Return shapes as a number or as a table ``by_iso``."""
     if len(isos) == 1:
         return round(shapes[0], 4)
-    return ["by_iso", *(number for iso, shape in zip(isos, shapes, strict=True) for number in (iso, round(shape, 4)))]
+    pairs = ((iso, round(shape, 4)) for iso, shape in zip(isos, shapes, strict=True))
+    return ["by_iso", *itertools.chain(*pairs)]
 
 
 def black_law(isos: Sequence[float], blacks: Sequence[Sequence[float]], by_colour: bool) -> Any:
@@ -108,7 +107,7 @@ def _fitted(isos: Sequence[float], values: Sequence[float], errors: Sequence[flo
     if len(powers) > len(isos):
         return None
     design = np.array([[float(iso) ** power for power in powers] for iso in isos])
-    weights = 1 / np.maximum(errors, 1e-9 * np.array(values))
+    weights = 1 / np.maximum(errors, 1e-9 * max(values))
     scale = design.max(axis=0)
     found, _ = nnls(design / scale * weights[:, None], np.array(values) * weights)
     coefficients = found / scale

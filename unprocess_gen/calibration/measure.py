@@ -13,7 +13,7 @@ from unprocess_gen.calibration import checks
 from unprocess_gen.calibration.captures import Capture, CaptureSet, Sensor, with_measured_levels
 from unprocess_gen.calibration.frame_sums import FAR, ROBUST, TILE, FrameSums, Measured, high_passed, summed
 from unprocess_gen.calibration.gain import Estimate, Gain, Transfer, emva_gain, estimate, fit_gain, root_estimate
-from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms
+from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms, joined
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
 
@@ -32,17 +32,20 @@ STILL_RISING = 0.9
 """Least variance of brighter levels that are not saturated, relative to the largest."""
 LARGEST_WELL = 0.97
 """Signal, as a fraction of white, from which the converter may end first."""
+LEAST_FITTED_DN2 = 0.04
+"""Variance without rounding below which nearly all values are equal, so that no distribution is fitted."""
 DEAD_RESPONSE, DEAD_SIGNAL = 0.2, 0.05
 """Largest response of dead pixels, and least signal at which they are counted, as a fraction of white."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dark:
-    """Darks of one exposure: frames, noise, and high values of their fixed pattern."""
+    """Darks of one exposure: frames, noise, mean by block of sites, and high values of their fixed pattern."""
 
     frames: list[Capture]
     measured: Measured
     columns: Float
+    shading: Float
     hot_dn: Float
     hot_threshold_dn: float
 
@@ -97,11 +100,20 @@ class IsoResult:
 def measure_iso(captures: CaptureSet, iso: float, quick: bool, watch: Watch) -> IsoResult:
     """Measure the captures of one ISO; ConfigError if they are too few, or do not pass a check."""
     sensor, notes = captures.sensor, list[str]()
-    darks = [_dark(frames, sensor, watch, notes) for frames in _groups(captures, "dark", iso, notes)]
+    darks = list[Dark]()
+    for frames in _groups(captures, "dark", iso, notes):  # in ascending order of exposures
+        dark = _dark(frames, sensor, watch)
+        if darks and checks.clipped_share(dark.measured) > checks.CLIPPED_SHARE:
+            notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
+            continue
+        checks.check_dark(frames, sensor, dark.measured, notes)
+        darks.append(dark)
     if not darks:
         raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
-    darks.sort(key=lambda dark: dark.exposure_s)
     reference = max(range(len(darks)), key=lambda number: (darks[number].measured.count, -number))
+    moment = float(darks[reference].measured.variance.mean()) - ROUNDING_DN2
+    if moment < LEAST_FITTED_DN2:
+        checks.check_dark_noise(darks[reference].frames, sensor, math.sqrt(max(moment, 0.0)))
     shapes, histogram = _shapes(darks[reference], watch)
     flats = _flats(captures, iso, darks, watch, notes)
     checks.check_dark_noise(darks[reference].frames, sensor, _rounded_std(darks[reference].measured, shapes[0]))
@@ -157,16 +169,22 @@ def _add(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSums:
     return summed(pixels(), sensor.white_dn)
 
 
-def _dark(frames: list[Capture], sensor: Sensor, watch: Watch, notes: list[str]) -> Dark:
+def _dark(frames: list[Capture], sensor: Sensor, watch: Watch) -> Dark:
     sums = _add(frames, sensor, watch)
     measured = sums.measure()
-    checks.check_dark(frames, sensor, measured, notes)
     mean = sums.mean_frame()
     patterns = [high_passed(mean[y::2, x::2]) for y, x in TILE]
     spread = [ROBUST * float(np.median(np.abs(pattern - np.median(pattern)))) for pattern in patterns]
     threshold = FAR * max(*spread, 0.05)
     hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
-    return Dark(frames, measured, sums.column_offsets(), hot, threshold)
+    return Dark(frames, measured, sums.column_offsets(), _block_means(mean), hot, threshold)
+
+
+def _block_means(frame: Float) -> Float:
+    """Return the means of up to 64 x 64 blocks of a frame."""
+    side = max(2, min(frame.shape) // 64 * 2)
+    height, width = (length // side for length in frame.shape)
+    return np.asarray(frame[: height * side, : width * side].reshape(height, side, width, side).mean(axis=(1, 3)))
 
 
 def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch, notes: list[str]) -> list[Flat]:
@@ -200,7 +218,9 @@ def _levels(captures: CaptureSet, iso: float, notes: list[str]) -> Iterable[list
         if frames[0].level or len(frames) <= LEAST_FRAMES:
             groups.append(frames)
             continue
-        named = with_measured_levels(frames, {frame.path: float(frame.pixels().mean()) for frame in frames}, 0.03)
+        black_dn = captures.sensor.black_dn
+        signals = {frame.path: float(frame.pixels().mean()) - black_dn for frame in frames}
+        named = with_measured_levels(frames, signals)
         groups += [[one for one in named if one.level == level] for level in sorted({one.level for one in named})]
     for frames in groups:
         if len(frames) < LEAST_FRAMES:
@@ -235,9 +255,7 @@ def _shapes(dark: Dark, watch: Watch) -> tuple[list[Shape], Histogram]:
     """Fit the distribution of the read noise: that of all planes, then that of each plane."""
     std = math.sqrt(float(dark.measured.variance.mean()))
     counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.columns, std)
-    together = counts[0]
-    for histogram in counts[1:]:
-        together = together.plus(histogram)
+    together = joined(counts)
     first = fit_shape(together)
     return [first, *(fit_shape(histogram, first) for histogram in counts)], together
 
@@ -281,7 +299,8 @@ def _of_darks(dark: Dark, sensor: Sensor, shapes: Sequence[Shape]) -> dict[str, 
     per_line = max(measured.fixed_column[0], 0.0) / measured.shape[1] + max(measured.fixed.mean(), 0.0) / measured.sites
     own = (measured.variance / measured.sites + max(measured.row[0], 0.0) / measured.shape[0]) / measured.count
     ripple = math.exp(-2 * math.pi**2 * float(np.mean(variances))) / math.pi
-    errors = np.sqrt(np.maximum(drift, own) + per_line + ripple**2)
+    drifts = drift > own * (1 + 4 * math.sqrt(2 / (measured.count - 1)))  # the black level changes between frames
+    errors = np.sqrt(np.where(drifts, drift, own) + per_line + ripple**2)
     return {
         "read": read,
         "reads": reads,

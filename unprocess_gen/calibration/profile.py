@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from unprocess_gen.calibration.body import BodyResult
 from unprocess_gen.calibration.captures import CaptureSet, Sensor
+from unprocess_gen.calibration.frame_sums import plane_names
 from unprocess_gen.calibration.gain import Estimate, estimate
 from unprocess_gen.calibration.iso_laws import black_law, branches, gain_law, rounded, shape_law, std_law
 from unprocess_gen.calibration.measure import IsoResult
@@ -44,12 +45,6 @@ class Calibration:
         return self.captures.sensor
 
 
-def plane_names(pattern: str) -> list[str]:
-    """Names of the planes in the order of the tile: R, B, and Gr or Gb for green next to red or blue."""
-    rows = pattern[:2], pattern[2:]
-    return [colour if colour != "G" else "Gr" if "R" in row else "Gb" for row in rows for colour in row]
-
-
 def site_names(sensor: Sensor) -> list[str]:
     """Return the names of the planes of a sensor; none for a monochrome one, whose sites are equal."""
     return [] if sensor.pattern == "MONO" else plane_names(sensor.pattern)
@@ -66,7 +61,7 @@ def _of_iso(result: IsoResult, sites: Sequence[str]) -> Iterator[Named]:
     yield Named("dn_per_e", iso, None, result.gain.sensor, "DN/e")
     yield Named("dn_per_e_emva1288", iso, None, estimate(result.emva_gain, result.gain.sensor.error), "DN/e")
     yield Named("read_std_dn", iso, None, result.read, "DN")
-    yield Named("read_shape", iso, None, estimate(shape.shape, shape.shape_error), "")
+    yield Named("read_shape", iso, None, shape.interval, "")
     yield Named("row_std_dn", iso, None, result.row, "DN")
     yield Named("row_correlation", iso, None, result.row_correlation, "")
     yield Named("column_std_dn", iso, None, result.column, "DN")
@@ -79,7 +74,7 @@ def _of_iso(result: IsoResult, sites: Sequence[str]) -> Iterator[Named]:
     ):
         yield Named("dn_per_e", iso, site, gain, "DN/e")
         yield Named("read_std_dn", iso, site, read, "DN")
-        yield Named("read_shape", iso, site, estimate(one.shape, one.shape_error), "")
+        yield Named("read_shape", iso, site, one.interval, "")
         yield Named("black_error_dn", iso, site, error, "DN")
 
 
@@ -164,14 +159,14 @@ def profile_yaml(found: Calibration, name: str, two_parameter: bool) -> str:
         ]
         return "\n".join(lines) + "\n"
     lines.append("branches:")
-    for branch in _branches(found.isos):
+    for branch in iso_branches(found.isos):
         lines += _branch_lines([found.isos[place] for place in branch], sensor, two_parameter)
     if not two_parameter:
         lines += _body_lines(found)
     return "\n".join([*lines, *_provenance(found, two_parameter)]) + "\n"
 
 
-def _branches(isos: Sequence[IsoResult]) -> list[list[int]]:
+def iso_branches(isos: Sequence[IsoResult]) -> list[list[int]]:
     """Return the places of the ISOs of each branch: those of a gain mode whose gains follow one law."""
     result = []
     for mode in branches([one.iso for one in isos], [one.read for one in isos]):
@@ -202,7 +197,7 @@ def _branch_lines(results: Sequence[IsoResult], sensor: Sensor, two_parameter: b
         return [*lines, "    read_law: gaussian", f"    read_std_dn: {_text(law)}   # {_ranges(isos, reads)}"]
     if any(result.shape.is_tukey for result in results):
         shapes = [result.shape.shape if result.shape.is_tukey else NORMAL_SHAPE for result in results]
-        errors = [estimate(result.shape.shape, result.shape.shape_error) for result in results]
+        errors = [result.shape.interval for result in results]
         lines += ["    read_law: tukey_lambda"]
         lines += [f"    read_shape: {_text(shape_law(isos, shapes))}   # {_ranges(isos, errors)}"]
     else:

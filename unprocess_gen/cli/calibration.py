@@ -26,6 +26,11 @@ def calibrate(call: Call) -> int:
     to = Path(call.values["to"])
     darks = Path(call.values["keep_darks"]) if "keep_darks" in call.values else None
     check_outputs(to, darks)
+    page = Path(call.values["report"]) if "report" in call.values else None
+    if page is not None:
+        from unprocess_gen.reports.calibration_page import check_page, write_page
+
+        check_page(page)
     found = measure(folder, "quick" in call.values, partial(with_bar, unit="frame"))
     for note in found.notes:
         report(f"calibrate: {note.removeprefix('calibrate: ')}")
@@ -37,6 +42,9 @@ def calibrate(call: Call) -> int:
             f"{short_number(gain.high, 4)}), read noise {short_number(read.value, 4)} DN, row noise "
             f"{short_number(result.row.value, 3)} DN"
         )
+    if page is not None:
+        write_page(found, to.stem, f"gen-dataset calibrate {folder} --to {to}", page)
+        print_result(f"drawn in {page}")
     if darks is not None:
         kept = ", ".join(map(str, keep_darks(found, darks)))
         print_result(f"darks kept for noise.dark_frames: {kept}")

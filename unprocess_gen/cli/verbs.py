@@ -179,6 +179,14 @@ _VERBS = (
         "calibration.calibrate",
         (
             _to("write the profile to FILE.yaml, and all estimates to FILE.json", "FILE", required=True),
+            Argument(
+                ("--report",),
+                "draw curves, histograms and maps in PAGE (HTML)",
+                "PAGE",
+                _local_path,
+                "a local file",
+                "files",
+            ),
             Argument(("--quick",), "accept one level of two flats, and two darks; intervals are wider"),
             Argument(("--two-parameter",), "write gain and variance without light only: a and b"),
             Argument(

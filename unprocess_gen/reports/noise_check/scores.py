@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from unprocess_gen.calibration.frame_sums import NEIGHBOURS, plane_names
 from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, PlaneNoise
-from unprocess_gen.reports.noise_check.sums import LARGEST_SAMPLE, NEIGHBOURS, Plane, Sample, Sums
+from unprocess_gen.reports.noise_check.sums import LARGEST_SAMPLE, Plane, Sample, Sums
 
 LEAST_SITES = 64
 """Fewest sites of a pair that is checked."""
@@ -105,12 +106,6 @@ def scores_of(sums: Sums) -> Scores:
     scores["odd codes", ""], scores["pairs of codes", ""] = (_code_score(sums, bit) for bit in range(2))
     scores["outliers", ""], scores["defects", ""] = _outlier_score(sums), _defect_score(sums)
     return scores | _line_scores(sums, rounding_dn2)
-
-
-def plane_names(pattern: str) -> list[str]:
-    """Names of the planes in the order of the tile: R, B, and Gr or Gb for green next to red or blue."""
-    rows = pattern[:2], pattern[2:]
-    return [colour if colour != "G" else "Gr" if "R" in row else "Gb" for row in rows for colour in row]
 
 
 # ------------------------------------------------------------------------------------------------ mean and variance

@@ -8,24 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.calibration.frame_sums import NEIGHBOURS, TILE
 from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
 from unprocess_gen.reports.noise_check.expectation import FAR_Z, LARGEST_Z, Expectation, PlaneNoise, bin_width
 from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, Site
 
 Single = NDArray[np.float32]
 
-TILE = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""Places of the CFA tile; a plane is the set of all sites at one of them."""
-
 SEGMENTS = 8
 """Parts into which lines are divided."""
-NEIGHBOURS = {
-    "adjacent sites": ((0, 1), (1, 0)),
-    "diagonal sites": ((1, 1), (1, -1)),
-    "neighbours": ((0, 2), (2, 0)),
-    "diagonal neighbours": ((2, 2), (2, -2)),
-}
-"""Distances of the sites of pairs in rows and columns, by the name of the check of their correlation."""
 SAMPLED = 3
 """Distance of the rows and of the columns that are compared with those of the pair before."""
 LARGEST_SAMPLE = 3.0
