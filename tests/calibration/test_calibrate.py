@@ -40,7 +40,9 @@ def test_simulated_camera_is_measured(calibrated: Any, run_main: RunMain, tmp_pa
     """Tolerances: 4 standard errors of the numbers of frames and sites."""
     camera = Camera("sony_a7s2", 3200, side=256)
     folder = record(tmp_path / "captures", camera, darks=8, long_s=(2.0, 8.0))
-    profile = calibrated(folder, "--keep-darks", str(tmp_path / "darks"))
+    page = tmp_path / "page.html"
+    profile = calibrated(folder, "--keep-darks", str(tmp_path / "darks"), "--report", str(page))
+    assert "Next to known sensors" in page.read_text(encoding="utf-8")
     found, truth = estimates(profile), camera.truth
 
     def relative(name: str, true: float, iso: float | None = 3200) -> float:
