@@ -114,10 +114,10 @@ def measure_iso(captures: CaptureSet, iso: float, quick: bool, watch: Watch) -> 
     moment = float(darks[reference].measured.variance.mean()) - ROUNDING_DN2
     if moment < LEAST_FITTED_DN2:
         checks.check_dark_noise(darks[reference].frames, sensor, math.sqrt(max(moment, 0.0)))
-    shapes, histogram = _shapes(darks[reference], watch)
     flats = _flats(captures, iso, darks, watch, notes)
-    checks.check_dark_noise(darks[reference].frames, sensor, _rounded_std(darks[reference].measured, shapes[0]))
     _check_levels(iso, flats, sensor, quick)
+    shapes, histogram = _shapes(darks[reference], watch)
+    checks.check_dark_noise(darks[reference].frames, sensor, _rounded_std(darks[reference].measured, shapes[0]))
     curves = [_curve(plane, darks, usable(flats), shapes[0]) for plane in range(4)]
     gain = fit_gain(curves, sensor.span_dn)
     return IsoResult(
