@@ -14,7 +14,7 @@ from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import row_json, write_rows
 from unprocess_gen.dataset.reader import Sample
-from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
+from unprocess_gen.dataset.shards import ShardWriter, member_of, shard_name
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text
 
 PEAK = """
@@ -46,8 +46,8 @@ def _rows(sample: Sample, folder: Path, pairs: int, per_shard: int, shards: list
         rows = [{**sample.row, "key": key_text(index), "shard": number} for index in indices]
         with ShardWriter(folder / "shards" / shard_name(number)) as writer:
             for row in rows:
-                writer.add_frame(row["key"], CLEAN, sample.clean)
-                writer.add_frame(row["key"], noisy_member(0, 0), sample.noisy)
+                writer.add_frame(row["key"], member_of("clean", 0, 0), sample.clean)
+                writer.add_frame(row["key"], member_of("noisy", 0, 0), sample.noisy)
                 writer.add_rows(row["key"], row_json([row]))
         file = f"shards/{shard_name(number)}"
         entry = {"file": file, "pairs": len(rows), "failed": 0, "bytes": writer.bytes, "sha256": writer.sha256}

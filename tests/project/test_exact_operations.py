@@ -14,7 +14,20 @@ PACKAGE = Path(__file__).parents[2] / "unprocess_gen"
 
 EXACT_FUNCTIONS = {
     *("abs", "add", "subtract", "multiply", "divide", "sqrt", "square", "rint", "floor", "ceil", "trunc"),
-    *("minimum", "maximum", "copysign", "isfinite", "isnan", "fabs", "frexp", "ldexp", "gcd", "nextafter", "prod"),
+    *(
+        "minimum",
+        "maximum",
+        "copysign",
+        "isfinite",
+        "isnan",
+        "fabs",
+        "frexp",
+        "ldexp",
+        "gcd",
+        "lcm",
+        "nextafter",
+        "prod",
+    ),
 }
 """Functions of NumPy and `math` whose results IEEE 754 or integer arithmetic determines."""
 
@@ -29,7 +42,7 @@ OUTSIDE_OUTPUT = {
     *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
     "simulation/effects/expectation.py",  # the noise check compares datasets with it
     "config/noise_validation.py",  # a logarithm decides only whether a config is refused
-    *("dataset/dng.py", "reports"),
+    *("dataset/dng.py", "reports", "calibration", "torch.py"),
 }
 """Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables
 with a checked SHA-256, the formulas of the reference, its inverse, measurements, drawings and exports."""
