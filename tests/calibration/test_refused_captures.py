@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.captures import Camera, record
 from helpers.commands import RunMain
 
 HEADER = "file,kind,iso,exposure_s,level,black_level_dn,white_level_dn,bits,pattern"
@@ -155,3 +156,10 @@ def test_wrong_line_of_list_is_refused(line: str, run_main: RunMain, tmp_path: P
     text, reason = LINES[line]
     (folder / "captures.csv").write_text(f"file,kind,iso,exposure_s,level\n{text}\n")
     refused(run_main, folder, reason)
+
+
+def test_list_that_contradicts_metadata_is_refused(run_main: RunMain, tmp_path: Path) -> None:
+    folder = record(tmp_path / "captures", Camera("sony_a7s2", 1600, 64), darks=1, levels=(0.1,), flats=1)
+    text = (folder / "captures.csv").read_text()
+    (folder / "captures.csv").write_text(text.replace("dark,1600", "dark,800"))
+    refused(run_main, folder, "iso=800: the metadata")

@@ -32,6 +32,8 @@ KINDS = {"dark": ("dark", "bias"), "flat": ("flat",)}
 EMVA_ISO = 100.0
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
 LEAST_SIDE = 32
+CLOSE = 0.05
+"""Relative difference of ISO and exposure from metadata, which cameras round."""
 APART = 0.03
 """Relative difference of signals from which flats without a stated level are of different levels."""
 
@@ -183,6 +185,10 @@ def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
     }
     given |= {"pattern": pattern or None, "level": row.get("level", "").strip()}
     stated = _metadata(file) if file.suffix.lower() in RAW_FILES else {}
+    for name in ("iso", "exposure_s"):
+        if given.get(name) and stated.get(name) and not math.isclose(given[name], stated[name], rel_tol=CLOSE):
+            problem = f"the metadata of {file.name} state {stated[name]:g}; expected frames that are listed as recorded"
+            raise ConfigError(f"{place}: {name}={given[name]:g}: {problem}")
     facts = stated | {name: value for name, value in given.items() if value is not None}
     if facts.get("iso") is None:
         raise ConfigError(f"{place}: iso is empty, and {file.name} does not state it; expected an ISO")
