@@ -40,7 +40,8 @@ class BodyResult:
 
 def measure_body(results: Sequence[IsoResult], black_dn: float) -> BodyResult:
     """Combine the results of all ISOs."""
-    prnus = tuple(_prnu(results, (plane,)) for plane in range(4))
+    has_flats = any(usable(result.flats) for result in results)
+    prnus = tuple(_prnu(results, (plane,)) for plane in range(4)) if has_flats else ()
     currents = _dark_currents(results)
     doubling = _doubling(currents)
     warmest = max(currents, default=None)
@@ -56,7 +57,7 @@ def measure_body(results: Sequence[IsoResult], black_dn: float) -> BodyResult:
     ]
     dsnu = [result.dsnu_dn.scaled(1 / result.gain.sensor.value) for result in results if result.dsnu_dn.value]
     return BodyResult(
-        prnu=_positive(_prnu(results, range(4))),
+        prnu=_positive(_prnu(results, range(4))) if has_flats else None,
         prnus=prnus,
         dsnu_e=combined(dsnu) if dsnu else None,
         dark_e_per_s=current,

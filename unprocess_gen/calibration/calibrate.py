@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from unprocess_gen.calibration.body import measure_body, without_dark_current
-from unprocess_gen.calibration.captures import read_captures
+from unprocess_gen.calibration.captures import CaptureSet, read_captures
+from unprocess_gen.calibration.gain import Estimate
+from unprocess_gen.calibration.known_gain import known_gain
 from unprocess_gen.calibration.measure import Watch, measure_iso
 from unprocess_gen.calibration.profile import (
     MARK,
     Calibration,
+    KnownGain,
     estimates,
     estimates_json,
     profile_yaml,
     unknown_numbers,
 )
+from unprocess_gen.calibration.stated_noise import STATED, StatedNoise, stated_estimates, stated_profile
 from unprocess_gen.config.limits import NAME
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
@@ -43,13 +48,36 @@ def calibrate(folder: Path, quick: bool = False, watch: Watch = lambda frames: f
 
     Raises ConfigError or MachineError.
     """
-    captures = read_captures(folder)
-    results = [measure_iso(captures, iso, quick, watch) for iso in captures.isos]
+    return _measured(read_captures(folder), quick, watch, None)
+
+
+def calibrate_darks(
+    folder: Path, profile: str | None, stated: str | None, watch: Watch = lambda frames: frames
+) -> Calibration:
+    """Measure the darks of a folder; the gain is that of a profile, stated, or that of NoiseProfile tags.
+
+    Raises ConfigError or MachineError.
+    """
+    captures = read_captures(folder, "dark")
+    darks = [capture for capture in captures.captures if capture.kind == "dark"]
+    if flats := len(captures.captures) - len(darks):
+        captures.notes.append(f"{folder}: --from darks leaves out {flats} flats")
+    captures = captures._replace(captures=darks)
+    return _measured(captures, False, watch, known_gain(captures, profile, stated))
+
+
+def _measured(captures: CaptureSet, quick: bool, watch: Watch, known: KnownGain | None) -> Calibration:
+    """Measure each ISO, and what all ISOs show together."""
+    gains = dict(known.by_iso) if known else {}
+    for iso, gain in gains.items():
+        if not gain.low > 0:  # not known: as if exact, in electrons
+            gains[iso] = Estimate(gain.value, gain.value, gain.value)
+    results = [measure_iso(captures, iso, quick, watch, gains.get(iso)) for iso in captures.isos]
     body = measure_body(results, captures.sensor.black_dn)
     results = [without_dark_current(result, body) for result in results]
-    found = Calibration(captures, results, body, [])
+    found = Calibration(captures, results, body, [], known)
     notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(found)]
-    return Calibration(captures, results, body, _merged(notes))
+    return replace(found, notes=_merged(notes))
 
 
 def _merged(notes: Iterable[str]) -> list[str]:
@@ -64,8 +92,16 @@ def _merged(notes: Iterable[str]) -> list[str]:
 
 def write_profile(found: Calibration, to: Path, two_parameter: bool = False) -> None:
     """Write the profile and, with the suffix .json, the list of all estimates."""
-    texts = {to: profile_yaml(found, to.stem, two_parameter), to.with_suffix(".json"): estimates_json(estimates(found))}
-    for path, text in texts.items():
+    _write(to, profile_yaml(found, to.stem, two_parameter), estimates_json(estimates(found)))
+
+
+def write_stated_profile(stated: StatedNoise, to: Path) -> None:
+    """Write the profile of NoiseProfile tags and, with the suffix .json, the list of all estimates."""
+    _write(to, stated_profile(stated, to.stem), estimates_json(stated_estimates(stated), STATED.digits))
+
+
+def _write(to: Path, profile: str, listed: str) -> None:
+    for path, text in {to: profile, to.with_suffix(".json"): listed}.items():
         with machine_errors(path):
             path.write_text(text, encoding="utf-8")
 

@@ -113,8 +113,8 @@ class CaptureSet(NamedTuple):
         return sorted({capture.iso for capture in self.captures})
 
 
-def read_captures(folder: Path) -> CaptureSet:
-    """List the frames of a folder.
+def read_captures(folder: Path, kind: str | None = None) -> CaptureSet:
+    """List the frames of a folder; ``kind`` is that of raw files whose names state none.
 
     Raises ConfigError or MachineError.
     """
@@ -126,7 +126,7 @@ def read_captures(folder: Path) -> CaptureSet:
         elif (folder / EMVA).is_file():
             captures = list(_from_emva(folder))
         else:
-            captures = list(_from_names(folder))
+            captures = list(_from_names(folder, kind))
         if not captures:
             raise ConfigError(
                 f"calibrate: {folder}: contains no raw frame; expected darks and flats as {', '.join(SUFFIXES)}"
@@ -227,7 +227,7 @@ def _metadata(file: Path) -> dict[str, Any]:
     return {name: value for name, value in stated.items() if value is not None}
 
 
-def _from_names(folder: Path) -> Iterator[Capture]:
+def _from_names(folder: Path, default: str | None = None) -> Iterator[Capture]:
     """Yield the raw files of a folder; their names, or those of their folders, state the kind."""
     for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
         if file.suffix.lower() not in RAW_FILES:
@@ -237,6 +237,7 @@ def _from_names(folder: Path) -> Iterator[Capture]:
             )
         name = str(file.relative_to(folder)).lower()
         kinds = [kind for kind, words in KINDS.items() if any(word in name for word in words)]
+        kinds = [default] if default and not kinds else kinds
         facts = _metadata(file)
         if len(kinds) != 1 or "iso" not in facts:
             problem = "its name has neither dark nor flat" if not kinds else "its name has dark and flat"

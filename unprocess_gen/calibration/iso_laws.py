@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,16 @@ SWITCH = 0.85
 CLOSE = 1e-3
 """Relative residual up to which a law is good enough, whatever the standard errors."""
 DIGITS = 7
+
+
+class Precision(NamedTuple):
+    """Relative residual up to which a law is good enough, and digits of its numbers."""
+
+    close: float = CLOSE
+    digits: int = DIGITS
+
+
+MEASURED = Precision()
 
 
 def branches(isos: Sequence[float], reads: Sequence[Estimate]) -> list[list[int]]:
@@ -41,30 +51,32 @@ def branches(isos: Sequence[float], reads: Sequence[Estimate]) -> list[list[int]
     return modes
 
 
-def gain_law(isos: Sequence[float], gains: Sequence[Estimate]) -> Any:
+def gain_law(isos: Sequence[float], gains: Sequence[Estimate], precision: Precision = MEASURED) -> Any:
     """Return ``dn_per_e`` as a number or as ``per_iso``; None if no line fits."""
     if len(isos) == 1:
-        return rounded(gains[0].value)
+        return rounded(gains[0].value, precision.digits)
     for powers in ((1,), (0, 1)):
-        coefficients = _fitted(isos, [gain.value for gain in gains], [gain.error for gain in gains], powers)
+        errors = [gain.error for gain in gains]
+        coefficients = _fitted(isos, [gain.value for gain in gains], errors, powers, precision.close)
         if coefficients is not None:
-            return ["per_iso", *(rounded(number) for number in reversed(coefficients))]
+            return ["per_iso", *(rounded(number, precision.digits) for number in reversed(coefficients))]
     return None
 
 
-def std_law(isos: Sequence[float], stds: Sequence[Estimate]) -> Any:
+def std_law(isos: Sequence[float], stds: Sequence[Estimate], precision: Precision = MEASURED) -> Any:
     """Return a standard deviation as a number, as ``root``, or as a table ``by_iso``."""
+    close, digits = precision
     if len(isos) == 1 or not any(std.value for std in stds):
-        return rounded(stds[0].value)
+        return rounded(stds[0].value, digits)
     values = [std.value for std in stds]
     errors = [(std.high**2 - std.low**2) / 2 / NORMAL_95 for std in stds]
     for powers in ((0,), (0, 2), (0, 1, 2)):
-        coefficients = _fitted(isos, [value**2 for value in values], errors, powers)
+        coefficients = _fitted(isos, [value**2 for value in values], errors, powers, close)
         if coefficients is not None:
             filled = dict(zip(powers, coefficients, strict=True))
-            return ["root", *(rounded(filled.get(power, 0.0)) for power in range(max(powers) + 1))]
+            return ["root", *(rounded(filled.get(power, 0.0), digits) for power in range(max(powers) + 1))]
     least = 1e-3 * max(values)
-    pairs = ((iso, rounded(value or least)) for iso, value in zip(isos, values, strict=True))
+    pairs = ((iso, rounded(value or least, digits)) for iso, value in zip(isos, values, strict=True))
     return ["by_iso", *itertools.chain(*pairs)]
 
 
@@ -95,12 +107,14 @@ def black_law(isos: Sequence[float], blacks: Sequence[Sequence[float]], by_colou
     return [*words, "by_log_iso", *fours]
 
 
-def rounded(value: float) -> float:
+def rounded(value: float, digits: int = DIGITS) -> float:
     """Return a number with the digits that a profile has."""
-    return float(f"{value:.{DIGITS}g}")
+    return float(f"{value:.{digits}g}")
 
 
-def _fitted(isos: Sequence[float], values: Sequence[float], errors: Sequence[float], powers: Sequence[int]) -> Any:
+def _fitted(
+    isos: Sequence[float], values: Sequence[float], errors: Sequence[float], powers: Sequence[int], close: float
+) -> Any:
     """Return coefficients of 0 or more of a polynomial in ISO; None if it misses a value."""
     from scipy.optimize import nnls
 
@@ -112,5 +126,5 @@ def _fitted(isos: Sequence[float], values: Sequence[float], errors: Sequence[flo
     found, _ = nnls(design / scale * weights[:, None], np.array(values) * weights)
     coefficients = found / scale
     residual = np.abs(design @ coefficients - values)
-    allowed = np.maximum(SIGNIFICANT * np.array(errors), CLOSE * np.array(values))
+    allowed = np.maximum(SIGNIFICANT * np.array(errors), close * np.array(values))
     return coefficients.tolist() if np.all(residual <= allowed) else None

@@ -97,33 +97,30 @@ class IsoResult:
         return self.darks[self.reference]
 
 
-def measure_iso(captures: CaptureSet, iso: float, quick: bool, watch: Watch) -> IsoResult:
-    """Measure the captures of one ISO; ConfigError if they are too few, or do not pass a check."""
+def measure_iso(
+    captures: CaptureSet, iso: float, quick: bool, watch: Watch, known: Estimate | None = None
+) -> IsoResult:
+    """Measure the captures of one ISO; ConfigError if they are too few, or do not pass a check.
+
+    With a ``known`` gain, only darks are measured.
+    """
     sensor, notes = captures.sensor, list[str]()
-    darks = list[Dark]()
-    for frames in _groups(captures, "dark", iso, notes):  # in ascending order of exposures
-        dark = _dark(frames, sensor, watch)
-        if darks and checks.clipped_share(dark.measured) > checks.CLIPPED_SHARE:
-            notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
-            continue
-        checks.check_dark(frames, sensor, dark.measured, notes)
-        darks.append(dark)
-    if not darks:
-        raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
+    darks = measure_darks(captures, iso, notes, watch)
     reference = max(range(len(darks)), key=lambda number: (darks[number].measured.count, -number))
     moment = float(darks[reference].measured.variance.mean()) - ROUNDING_DN2
     if moment < LEAST_FITTED_DN2:
         checks.check_dark_noise(darks[reference].frames, sensor, math.sqrt(max(moment, 0.0)))
-    flats = _flats(captures, iso, darks, watch, notes)
-    _check_levels(iso, flats, sensor, quick)
+    flats = list[Flat]()
+    if known is None:
+        flats = _flats(captures, iso, darks, watch, notes)
+        _check_levels(iso, flats, sensor, quick)
     shapes, histogram = _shapes(darks[reference], watch)
     checks.check_dark_noise(darks[reference].frames, sensor, _rounded_std(darks[reference].measured, shapes[0]))
-    curves = [_curve(plane, darks, usable(flats), shapes[0]) for plane in range(4)]
-    gain = fit_gain(curves, sensor.span_dn)
+    curves = [_curve(plane, darks, usable(flats), shapes[0]) for plane in range(4)] if flats else []
     return IsoResult(
         iso=iso,
-        gain=gain,
-        emva_gain=float(np.mean([emva_gain(curve) for curve in curves])),
+        gain=Gain(known, [], 0.0, 0.0, False, False) if known else fit_gain(curves, sensor.span_dn),
+        emva_gain=float(np.mean([emva_gain(curve) for curve in curves])) if curves else math.nan,
         curves=curves,
         darks=darks,
         flats=flats,
@@ -131,10 +128,25 @@ def measure_iso(captures: CaptureSet, iso: float, quick: bool, watch: Watch) -> 
         shape=shapes[0],
         shapes=shapes[1:],
         histogram=histogram,
-        full_well_dn=_full_well(flats, sensor),
+        full_well_dn=_full_well(flats, sensor) if flats else None,
         notes=notes,
         **_of_darks(darks[reference], sensor, shapes),
     )
+
+
+def measure_darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> list[Dark]:
+    """Measure the darks of one ISO, in ascending order of exposures; ConfigError if there are none."""
+    darks = list[Dark]()
+    for frames in _groups(captures, "dark", iso, notes):
+        dark = _dark(frames, captures.sensor, watch)
+        if darks and checks.clipped_share(dark.measured) > checks.CLIPPED_SHARE:
+            notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
+            continue
+        checks.check_dark(frames, captures.sensor, dark.measured, notes)
+        darks.append(dark)
+    if not darks:
+        raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
+    return darks
 
 
 def _groups(captures: CaptureSet, kind: str, iso: float, notes: list[str]) -> list[list[Capture]]:

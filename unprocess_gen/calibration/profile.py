@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,12 +12,12 @@ from unprocess_gen.calibration.body import BodyResult
 from unprocess_gen.calibration.captures import CaptureSet, Sensor
 from unprocess_gen.calibration.frame_sums import plane_names
 from unprocess_gen.calibration.gain import Estimate, estimate
-from unprocess_gen.calibration.iso_laws import black_law, branches, gain_law, rounded, shape_law, std_law
+from unprocess_gen.calibration.iso_laws import DIGITS, black_law, branches, gain_law, rounded, shape_law, std_law
 from unprocess_gen.calibration.measure import IsoResult
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 
-MARK = "Measured by gen-dataset calibrate"
-"""Beginning of the first line of a profile, by which a later run recognises it."""
+MARK = "by gen-dataset calibrate"
+"""Part of the first line of a profile, by which a later run recognises it."""
 
 
 class Named(NamedTuple):
@@ -30,14 +30,23 @@ class Named(NamedTuple):
     unit: str
 
 
+class KnownGain(NamedTuple):
+    """Gains by ISO of a calibration without flats, with their source and what is known of their error."""
+
+    source: str
+    uncertainty: str
+    by_iso: Mapping[float, Estimate]
+
+
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Everything measured on a folder of captures."""
+    """Everything measured on a folder of captures; ``known`` is the gain if they are darks alone."""
 
     captures: CaptureSet
     isos: list[IsoResult]
     body: BodyResult
     notes: list[str]
+    known: KnownGain | None = None
 
     @property
     def sensor(self) -> Sensor:
@@ -52,14 +61,16 @@ def site_names(sensor: Sensor) -> list[str]:
 
 def estimates(found: Calibration) -> list[Named]:
     """Return the list of all estimates."""
-    return [*_of_body(found), *(one for result in found.isos for one in _of_iso(result, site_names(found.sensor)))]
+    sites = site_names(found.sensor)
+    return [*_of_body(found), *(one for result in found.isos for one in _of_iso(result, found.known, sites))]
 
 
-def _of_iso(result: IsoResult, sites: Sequence[str]) -> Iterator[Named]:
+def _of_iso(result: IsoResult, known: KnownGain | None, sites: Sequence[str]) -> Iterator[Named]:
     """Yield the estimates of one ISO."""
     iso, shape = result.iso, result.shape
-    yield Named("dn_per_e", iso, None, result.gain.sensor, "DN/e")
-    yield Named("dn_per_e_emva1288", iso, None, estimate(result.emva_gain, result.gain.sensor.error), "DN/e")
+    yield Named("dn_per_e", iso, None, known.by_iso[iso] if known else result.gain.sensor, "DN/e")
+    if known is None:
+        yield Named("dn_per_e_emva1288", iso, None, estimate(result.emva_gain, result.gain.sensor.error), "DN/e")
     yield Named("read_std_dn", iso, None, result.read, "DN")
     yield Named("read_shape", iso, None, shape.interval, "")
     yield Named("row_std_dn", iso, None, result.row, "DN")
@@ -69,10 +80,9 @@ def _of_iso(result: IsoResult, sites: Sequence[str]) -> Iterator[Named]:
     yield Named("dsnu_std_dn", iso, None, result.dsnu_dn, "DN")
     black = Estimate(*(sum(getattr(one, end) for one in result.black) / 4 for end in ("value", "low", "high")))
     yield Named("black_error_dn", iso, None, black, "DN")
-    for site, gain, read, one, error in zip(
-        sites, result.gain.planes, result.reads, result.shapes, result.black, strict=False
-    ):
+    for site, gain in zip(sites, result.gain.planes, strict=False):
         yield Named("dn_per_e", iso, site, gain, "DN/e")
+    for site, read, one, error in zip(sites, result.reads, result.shapes, result.black, strict=False):
         yield Named("read_std_dn", iso, site, read, "DN")
         yield Named("read_shape", iso, site, one.interval, "")
         yield Named("black_error_dn", iso, site, error, "DN")
@@ -94,13 +104,11 @@ def _of_body(found: Calibration) -> Iterator[Named]:
     yield Named("full_well_e", None, None, body.full_well_e, "e")
 
 
-def estimates_json(named: Sequence[Named]) -> str:
+def estimates_json(named: Sequence[Named], digits: int = DIGITS) -> str:
     """Return the list of estimates as JSON, an object a line; null where the captures do not show a number."""
     lines = []
     for one in named:
-        ends = {
-            end: None if one.number is None else rounded(getattr(one.number, end)) for end in ("value", "low", "high")
-        }
+        ends = {end: None if one.number is None else rounded(getattr(one.number, end), digits) for end in ENDS}
         ends = {end: value if value is None or math.isfinite(value) else None for end, value in ends.items()}
         lines.append(json.dumps({"name": one.name, "iso": one.iso, "site": one.site, **ends, "unit": one.unit}))
     return "[\n" + ",\n".join(lines) + "\n]\n"
@@ -131,16 +139,14 @@ def unknown_numbers(found: Calibration) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------- YAML
 
 
-def profile_yaml(found: Calibration, name: str, two_parameter: bool) -> str:
-    """Return the noise profile, with uncertainties and the digest of the captures in comments."""
-    sensor, isos = found.sensor, [result.iso for result in found.isos]
-    frames = len(found.captures.captures)
-    lines = [
-        f"# {MARK} on {frames} raw frames, ISO {', '.join(f'{iso:g}' for iso in isos)}.",
+def head(start: str, isos: Sequence[float], sha256: str, notes: Sequence[str], name: str, sensor: Sensor) -> list[str]:
+    """Return the comments and the first keys of a profile."""
+    return [
+        f"# {start}, ISO {', '.join(f'{iso:g}' for iso in isos)}.",
         "# SHA-256 of the list of their SHA-256, one a line in ascending order:",
-        f"# {found.captures.sha256}",
+        f"# {sha256}",
         "# Ranges in comments are 95 % intervals, systematic errors included. The JSON file of this name has all.",
-        *(f"# Note: {note}" for note in found.notes),
+        *(f"# Note: {note}" for note in notes),
         f"name: {name}",
         'scatter: "off"',
         "units: dn",
@@ -149,18 +155,25 @@ def profile_yaml(found: Calibration, name: str, two_parameter: bool) -> str:
         f"black_level_dn: {sensor.black_dn:.0f}",
         f"white_level_dn: {sensor.white_dn:.0f}",
     ]
+
+
+def profile_yaml(found: Calibration, name: str, two_parameter: bool) -> str:
+    """Return the noise profile, with uncertainties and the digest of the captures in comments."""
+    sensor, isos = found.sensor, [result.iso for result in found.isos]
+    start = f"Measured {MARK} on {len(found.captures.captures)} raw frames"
+    lines = head(start, isos, found.captures.sha256, found.notes, name, sensor)
     if two_parameter and len(isos) == 1:
         result = found.isos[0]
         b = _dark_variance(result)
         lines += [
-            f"a: {_text(rounded(result.gain.sensor.value))}   # {_range(result.gain.sensor)} DN per electron",
-            f"b: {_text(rounded(b.value))}   # {_range(b)} DN², without rounding",
+            f"a: {yaml_text(rounded(result.gain.sensor.value))}   # {_range(result.gain.sensor)} DN per electron",
+            f"b: {yaml_text(rounded(b.value))}   # {_range(b)} DN², without rounding",
             "negative_variance: refuse",
         ]
         return "\n".join(lines) + "\n"
     lines.append("branches:")
     for branch in iso_branches(found.isos):
-        lines += _branch_lines([found.isos[place] for place in branch], sensor, two_parameter)
+        lines += _branch_lines([found.isos[place] for place in branch], sensor, two_parameter, found.known)
     if not two_parameter:
         lines += _body_lines(found)
     return "\n".join([*lines, *_provenance(found, two_parameter)]) + "\n"
@@ -184,25 +197,28 @@ def _dark_variance(result: IsoResult) -> Estimate:
     return estimate(value, error, 0.0)
 
 
-def _branch_lines(results: Sequence[IsoResult], sensor: Sensor, two_parameter: bool) -> list[str]:
+def _branch_lines(
+    results: Sequence[IsoResult], sensor: Sensor, two_parameter: bool, known: KnownGain | None
+) -> list[str]:
     """Return the lines of a branch."""
     isos = [result.iso for result in results]
     gains, reads = [one.gain.sensor for one in results], [one.read for one in results]
     gain_law_ = gain_law(isos, gains)
-    lines = [f"  - iso: [{isos[0]:g}, {isos[-1]:g}]", f"    dn_per_e: {_text(gain_law_)}   # {_ranges(isos, gains)}"]
+    origin = known.source if known else _ranges(isos, gains)
+    lines = [f"  - iso: [{isos[0]:g}, {isos[-1]:g}]", f"    dn_per_e: {yaml_text(gain_law_)}   # {origin}"]
     if two_parameter:
         variances = [_dark_variance(result) for result in results]
         reads = [estimate(math.sqrt(b.value), b.error / 2 / math.sqrt(b.value)) for b in variances]
         law = std_law(isos, reads)
-        return [*lines, "    read_law: gaussian", f"    read_std_dn: {_text(law)}   # {_ranges(isos, reads)}"]
+        return [*lines, "    read_law: gaussian", f"    read_std_dn: {yaml_text(law)}   # {_ranges(isos, reads)}"]
     if any(result.shape.is_tukey for result in results):
         shapes = [result.shape.shape if result.shape.is_tukey else NORMAL_SHAPE for result in results]
         errors = [result.shape.interval for result in results]
         lines += ["    read_law: tukey_lambda"]
-        lines += [f"    read_shape: {_text(shape_law(isos, shapes))}   # {_ranges(isos, errors)}"]
+        lines += [f"    read_shape: {yaml_text(shape_law(isos, shapes))}   # {_ranges(isos, errors)}"]
     else:
         lines += ["    read_law: gaussian"]
-    lines.append(f"    read_std_dn: {_text(std_law(isos, reads))}   # {_ranges(isos, reads)}")
+    lines.append(f"    read_std_dn: {yaml_text(std_law(isos, reads))}   # {_ranges(isos, reads)}")
     for name, values in (
         ("row_std_dn", [one.row for one in results]),
         ("column_std_dn", [one.column for one in results]),
@@ -215,9 +231,9 @@ def _branch_lines(results: Sequence[IsoResult], sensor: Sensor, two_parameter: b
             )
             if not any(value.value for value in values):
                 continue
-        lines.append(f"    {name}: {_text(law)}   # {_ranges(isos, values)}")
+        lines.append(f"    {name}: {yaml_text(law)}   # {_ranges(isos, values)}")
     blacks = [_by_colour([one.value for one in result.black], sensor) for result in results]
-    lines.append(f"    black_error_dn: {_text(black_law(isos, blacks, bool(site_names(sensor))))}")
+    lines.append(f"    black_error_dn: {yaml_text(black_law(isos, blacks, bool(site_names(sensor))))}")
     return lines
 
 
@@ -235,15 +251,15 @@ def _body_lines(found: Calibration) -> list[str]:
     lines = []
     gains = _gains_by_colour(found)
     if gains is not None:
-        lines.append(f"gain_by_colour: {_text(gains)}   # red, green, blue, relative to dn_per_e")
+        lines.append(f"gain_by_colour: {yaml_text(gains)}   # red, green, blue, relative to dn_per_e")
     row = max((result.row_correlation for result in found.isos), key=lambda one: abs(one.value) / max(one.error, 1e-9))
     if abs(row.value) > 4 * row.error and abs(row.value) > 0.02:
-        lines.append(f"row_correlation: {_text(rounded(max(min(row.value, 0.95), -0.95)))}   # {_range(row)}")
+        lines.append(f"row_correlation: {yaml_text(rounded(max(min(row.value, 0.95), -0.95)))}   # {_range(row)}")
     for name, number in known.items():
         if name in ("dark_doubling_c", "dead_pixel_level", "dsnu_std_e", "hot_pixel_e_per_s") and number is None:
             continue
         comment = "not known" if number is None else _range(number)
-        lines.append(f"{name}: {'null' if number is None else _text(rounded(number.value))}   # {comment}")
+        lines.append(f"{name}: {'null' if number is None else yaml_text(rounded(number.value))}   # {comment}")
     if known["dark_e_per_s"] is not None:
         celsius = found.body.dark_reference_c
         comment = "of the captures" if celsius else "assumed: the captures do not state their temperature"
@@ -269,18 +285,29 @@ def _gains_by_colour(found: Calibration) -> list[float] | None:
 
 
 def _provenance(found: Calibration, two_parameter: bool) -> list[str]:
-    """Return the statements of sources, which `plan` prints."""
-    isos = [result.iso for result in found.isos]
-    numbers = ["dn_per_e", "read_std_dn"] + ([] if two_parameter else ["row_std_dn", "column_std_dn", "black_error_dn"])
+    """Return the statements of sources, which `plan` prints: the form of the calibration, and its uncertainty."""
+    isos, known = [result.iso for result in found.isos], found.known
+    numbers = ["read_std_dn"] + ([] if two_parameter else ["row_std_dn", "column_std_dn", "black_error_dn"])
     gain = max((one.gain.sensor.high - one.gain.sensor.low) / 2 / one.gain.sensor.value for one in found.isos)
     read = max((one.read.high - one.read.low) / 2 / max(one.read.value, 1e-9) for one in found.isos)
-    frames = f"own captures, {len(found.captures.captures)} frames, SHA-256 {found.captures.sha256[:16]}"
+    form = "calibrate --from darks, own darks" if known else "calibrate, own flats and darks"
+    frames = f"{form}, {len(found.captures.captures)} frames, SHA-256 {found.captures.sha256[:16]}"
+    measured = f"read noise {read:.2%} (95 %, systematic errors included)"
+    statements = [(numbers, frames, measured)]
+    if known:
+        statements.insert(0, (["dn_per_e"], known.source, known.uncertainty))
+    else:
+        statements = [(["dn_per_e", *numbers], frames, f"gain {gain:.2%}, {measured}")]
+    return ["provenance:", *(line for one in statements for line in provenance_lines(*one, isos))]
+
+
+def provenance_lines(numbers: Sequence[str], source: str, uncertainty: str, isos: Sequence[float]) -> list[str]:
+    """Return the lines of a statement of the source of numbers."""
     return [
-        "provenance:",
         f"  - numbers: [{', '.join(numbers)}]",
         f"    iso: [{isos[0]:g}, {isos[-1]:g}]",
-        f"    source: {frames}",
-        f"    uncertainty: gain {gain:.2%}, read noise {read:.2%} (95 %, systematic errors included)",
+        f"    source: {json.dumps(source, ensure_ascii=False)}",
+        f"    uncertainty: {json.dumps(uncertainty, ensure_ascii=False)}",
     ]
 
 
@@ -295,10 +322,10 @@ def _range(number: Estimate) -> str:
     return f"{number.low:.4g} to {number.high:.4g}"
 
 
-def _text(value: Any) -> str:
+def yaml_text(value: Any) -> str:
     """Return a number or a list as YAML."""
     if isinstance(value, list):
-        return f"[{', '.join(map(_text, value))}]"
+        return f"[{', '.join(map(yaml_text, value))}]"
     if isinstance(value, float):
         text = repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
         mantissa, e, exponent = text.partition("e")  # YAML reads a number with an exponent only if it has a point

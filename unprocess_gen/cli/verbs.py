@@ -175,7 +175,7 @@ _VERBS = (
     ),
     Verb(
         "calibrate",
-        "measure the noise of a camera from raw flats and darks; write a noise profile",
+        "measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile",
         "calibration.calibrate",
         (
             _to("write the profile to FILE.yaml, and all estimates to FILE.json", "FILE", required=True),
@@ -186,6 +186,21 @@ _VERBS = (
                 _local_path,
                 "a local file",
                 "files",
+            ),
+            Argument(
+                ("--from",),
+                "make the profile from NoiseProfile tags of DNG files, or from darks alone",
+                "{noise_profile,darks}",
+                choices=("noise_profile", "darks"),
+            ),
+            Argument(
+                ("--gain",),
+                "with --from darks: take the gain from PROFILE, a YAML file or an option of noise",
+                "PROFILE",
+                completes="files",
+            ),
+            Argument(
+                ("--dn-per-e",), "with --from darks: state the gain, in DN per electron: 0.1@100,0.4@400", "GAINS"
             ),
             Argument(("--quick",), "accept one level of two flats, and two darks; intervals are wider"),
             Argument(("--two-parameter",), "write gain and variance without light only: a and b"),
@@ -198,7 +213,7 @@ _VERBS = (
                 "folders",
             ),
         ),
-        Place("CAPTURES", "the folder of the raw frames"),
+        Place("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
     ),
     Verb(
         "completion",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
 
 import yaml
@@ -28,7 +29,7 @@ from unprocess_gen.config.schema import ENTRY_GROUPS, GROUPS, Config, MixtureEnt
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
-from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_text
+from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_mapping, read_yaml_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import AnyPath
 
@@ -228,12 +229,20 @@ def writable_node(group: type[Any]) -> DictConfig:
     return node
 
 
-def read_option(group: str, name: str) -> Any:
-    """Read an option of ``conf/`` into the dataclass of its group; keys that the file lacks have their defaults."""
-    from omegaconf import OmegaConf
+def read_option(group: str, name: str | Path) -> Any:
+    """Read an option of ``conf/``, or a file, into the dataclass of its group; missing keys have their defaults.
 
-    loaded = OmegaConf.load(conf_dir() / group / f"{name}.yaml")
-    return OmegaConf.to_object(OmegaConf.merge(writable_node(GROUPS[group]), loaded))
+    ConfigError in one line, with the file, if it is no option of the group.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    path = name if isinstance(name, Path) else conf_dir() / group / f"{name}.yaml"
+    loaded = read_yaml_mapping(path)
+    try:
+        return OmegaConf.to_object(OmegaConf.merge(writable_node(GROUPS[group]), loaded))
+    except (OmegaConfBaseException, ValueError) as error:
+        raise ConfigError(f"{path}: is no option of {group} ({error_in_one_line(error)})") from error
 
 
 def differences(config_yaml: str, other_yaml: str) -> list[str]:

@@ -53,17 +53,18 @@ def read_metadata(path: Path, key: str) -> RawMetadata:
 
     Raises ConfigError or MachineError.
     """
-    for library in ("tifffile", "rawpy"):
-        use = f"{key}: {path} is a raw file, which needs {library}"
-        require(library, use, "calibrate", ", or convert the frames to NPY")
-    tags, decoder = _from_tags(path), _from_decoder(path, key)
+    tags, decoder = read_tags(path, key), _from_decoder(path, key)
     stated = {name: value for name in RawMetadata.__slots__ if (value := getattr(tags, name)) is not None}
     facts = replace(decoder, **stated)
     return replace(facts, bits=None if facts.white_dn is None else int(facts.white_dn).bit_length())
 
 
-def _from_tags(path: Path) -> RawMetadata:
-    """Read the tags of TIFF, EXIF and DNG; no fact if the file is no TIFF."""
+def read_tags(path: Path, key: str) -> RawMetadata:
+    """Read the facts that tags of TIFF, EXIF and DNG state, whatever the compression; none if the file is no TIFF.
+
+    Raises ConfigError or MachineError.
+    """
+    _require("tifffile", path, key)
     import tifffile
 
     try:
@@ -78,6 +79,12 @@ def _from_tags(path: Path) -> RawMetadata:
         raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (tifffile.TiffFileError, ValueError, KeyError, IndexError, TypeError):
         return RawMetadata()
+
+
+def _require(library: str, path: Path, key: str) -> None:
+    """Refuse a raw file without the library that reads it."""
+    use = f"{key}: {path} is a raw file, which needs {library}"
+    require(library, use, "calibrate", ", or convert the frames to NPY")
 
 
 def _facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model: str) -> RawMetadata:
@@ -112,6 +119,7 @@ def _numbers(tag: Any) -> tuple[float, ...]:
 
 def _from_decoder(path: Path, key: str) -> RawMetadata:
     """Read levels, pattern, ISO and exposure with LibRaw."""
+    _require("rawpy", path, key)
     import rawpy
 
     try:

@@ -1,0 +1,198 @@
+"""Profiles without flats: from NoiseProfile tags of DNG files, and from darks with a gain from elsewhere."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.captures import Camera, record
+from helpers.commands import RunMain
+
+import unprocess_gen as ug
+from unprocess_gen.dataset.dng import encode
+from unprocess_gen.simulation.effects import dark_variance_dn2
+
+ISOS = (100, 200, 400, 1600, 3200, 25600)
+FLOAT32 = 2.0**-24
+SAMPLES = Path(os.environ.get("DNGPY_SAMPLES", "dngpy-0.1.3/extern/sample_files"))
+"""Folder of the unpacked source package of dngpy 0.1.3 (package index)."""
+A7R4 = SAMPLES / "03_jxl_bayer_raw_integer.dng"
+WHITE, BLACK = 4095, 256
+Law = dict[int, tuple[float, float]]
+
+
+def stated(folder: Path, law: Law) -> Path:
+    """Write DNG files without pixels worth reading, each with an ISO and S, O of its NoiseProfile."""
+    import tifffile
+
+    folder.mkdir()
+    for iso, numbers in law.items():
+        tags = [
+            (50706, "B", 4, (1, 4, 0, 0)), (50714, "I", 1, BLACK), (50717, "I", 1, WHITE),
+            (34855, "H", 1, iso), (51041, "d", len(numbers), numbers),
+        ]  # fmt: skip
+        tifffile.imwrite(folder / f"{iso}.dng", np.zeros((32, 32), np.uint16), photometric=32803, extratags=tags)
+    return folder
+
+
+def profile_of(tmp_path: Path) -> Path:
+    path = tmp_path / "mine" / "noise" / "mine.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def listed(profile: Path) -> dict[tuple[str, float | None, str | None], dict[str, Any]]:
+    return {(row["name"], row["iso"], row["site"]): row for row in json.loads(profile.with_suffix(".json").read_text())}
+
+
+def numbers_at(profile: Path, *isos: float) -> list[tuple[float, float]]:
+    """Return gain and read noise at some ISOs, in DN of the profile."""
+    config = ug.load_config(["noise=mine", f"scene.iso={isos[0]}", "sensor=generic_14bit"], profile.parents[1])
+    sensor, noise, numbers = config.sensor, config.noise, []
+    scale = (noise.white_level_dn - noise.black_level_dn) / (sensor.white_level_dn - sensor.black_level_dn)
+    for iso in isos:
+        scene = dataclasses.replace(config.scene, iso=iso)
+        plan = ug.plan_image(np.zeros((32, 32, 3), np.uint8), dataclasses.replace(config, scene=scene))
+        numbers.append((plan.noise.physics.dn_per_e * scale, plan.noise.physics.read_std_dn * scale))
+    return numbers
+
+
+def test_tags_of_own_files_give_back_their_numbers(run_main: RunMain, tmp_path: Path) -> None:
+    folder, profile, expected = tmp_path / "dng", profile_of(tmp_path), {}
+    folder.mkdir()
+    for iso in ISOS:
+        pair = Camera("sony_a7s2", iso, side=32).pair(0.2, 0.001, 0)
+        for name in ("noisy", "clean"):  # the clean frame has no noise, and no tag
+            (folder / f"{iso}.{name}.dng").write_bytes(encode(pair.noisy, pair.row, name))
+        expected[iso] = pair.plan.noise.physics.dn_per_e, dark_variance_dn2(pair.plan)
+    done = run_main("calibrate", folder, "--from", "noise_profile", "--to", profile)
+    assert done.code == 0, done.err
+    assert "6 of 12" in done.err
+    for (gain, read), (iso, (a, b)) in zip(numbers_at(profile, *ISOS), expected.items(), strict=True):
+        assert gain == pytest.approx(a, rel=FLOAT32)
+        assert read**2 == pytest.approx(b, rel=FLOAT32)
+        assert listed(profile)["b_dn2", iso, None]["value"] == pytest.approx(b, rel=FLOAT32)
+    done = run_main("plan", "--config-dir", profile.parents[1], "noise=mine", "scene.iso=100", "source.limit=1")
+    assert "calibrate --from noise_profile" in done.out
+    assert "the tags state none" in done.out
+    done = run_main("plan", "--config-dir", profile.parents[1], "noise=mine", "scene.iso=1800")  # the gain mode changes
+    assert (done.code, "100 to 1600, 3200 to 25600" in done.err) == (2, True)
+
+
+def test_gain_between_isos_is_interpolated(run_main: RunMain, tmp_path: Path) -> None:
+    """A slope that is no line of ISO has a branch for each pair of neighbours."""
+    folder = stated(tmp_path / "dng", {100: (1e-5, 1e-9), 200: (1.9e-5, 2e-9), 400: (4.5e-5, 5e-9)})
+    profile = profile_of(tmp_path)
+    assert run_main("calibrate", folder, "--from", "noise_profile", "--to", profile).code == 0
+    span = WHITE - BLACK
+    (first, _), (between, _) = numbers_at(profile, 200, 150)
+    assert first == pytest.approx(1.9e-5 * span, rel=FLOAT32)
+    assert between == pytest.approx(1.45e-5 * span, rel=FLOAT32)
+
+
+@pytest.mark.skipif(not A7R4.is_file(), reason="DNGPY_SAMPLES names no folder with sample files of dngpy 0.1.3")
+def test_tags_of_a_real_file_are_read(run_main: RunMain, tmp_path: Path) -> None:
+    profile = profile_of(tmp_path)
+    done = run_main("calibrate", A7R4, "--from", "noise_profile", "--to", profile)
+    assert "planes differ" in done.err
+    found = listed(profile)
+    assert found["dn_per_e", 100, None]["value"] == pytest.approx(0.420, abs=5e-4)
+    assert found["b_dn2", 100, None]["value"] == pytest.approx(2.24, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("law", "problem"),
+    [
+        ({100: (2e-5, 1e-9), 200: (1e-5, 2e-9)}, "200.dng: NoiseProfile at ISO 200: the variance of R has"),
+        ({100: (2e-5, 1e-9), 200: (2e-5, 2e-9)}, "200.dng: NoiseProfile at ISO 200: the variance of R has"),
+        ({100: (1e-5, 3e-9), 200: (2e-5, 2e-9), 400: (4e-5, 1e-9)}, "400.dng: NoiseProfile at ISO 400: again less"),
+        ({100: (-1e-5, 1e-9)}, "100.dng: NoiseProfile of R: variance = -1e-05"),
+        ({100: (1e-5, -1e-9)}, "100.dng: NoiseProfile of R: variance = 1e-05"),
+        ({100: (1e-5, 1e-9, 1e-5)}, "100.dng: NoiseProfile has 3 values"),
+        ({100: ()}, "none of 1 raw files has a NoiseProfile tag"),
+    ],
+)  # fmt: skip
+def test_implausible_laws_are_refused(law: Any, problem: str, run_main: RunMain, tmp_path: Path) -> None:
+    profile = profile_of(tmp_path)
+    if not law[100]:
+        law = {}
+        stated(tmp_path / "dng", {})
+        (tmp_path / "dng" / "100.dng").write_bytes(b"no TIFF")
+    else:
+        stated(tmp_path / "dng", law)
+    done = run_main("calibrate", tmp_path / "dng", "--from", "noise_profile", "--to", profile)
+    assert (done.code, problem in done.err, done.err.count("\n"), profile.exists()) == (2, True, 1, False), done.err
+
+
+TOLERANCES = {"read_std_dn": 0.005, "row_std_dn": 0.03}
+
+
+def check_darks(run_main: RunMain, tmp_path: Path, camera: Camera, *flags: str, darks: int = 16) -> Path:
+    """Calibrate darks of a camera, and compare with what was simulated."""
+    folder, profile = tmp_path / f"{camera.profile}_{camera.iso:g}", profile_of(tmp_path)
+    if not folder.exists():
+        record(folder, camera, darks=darks, flats=0, long_s=(4.0, 16.0))
+    done = run_main("calibrate", folder, "--from", "darks", "--to", profile, *flags)
+    assert done.code == 0, done.err
+    found, truth = listed(profile), camera.truth
+    for name, tolerance in TOLERANCES.items():
+        assert found[name, camera.iso, None]["value"] == pytest.approx(truth[name], rel=tolerance), (camera, name)
+    assert found["dn_per_e", camera.iso, None]["value"] == pytest.approx(truth["dn_per_e"], rel=1e-6)
+    if camera.iso >= 800:  # below, read noise hides some electrons
+        assert found["dark_e_per_s", None, None]["value"] == pytest.approx(truth["dark_e"], rel=0.05)
+    assert found["prnu_std", None, None]["value"] is None
+    return profile
+
+
+def test_darks_alone_give_a_profile(run_main: RunMain, tmp_path: Path) -> None:
+    """The gain is that of the tags or stated, and `plan` shows which."""
+    camera = Camera("sony_a7s2", 3200, side=256)
+    gain = camera.truth["dn_per_e"]
+    ways = {
+        "NoiseProfile tags of the darks": (),
+        "gain stated by --dn-per-e": ("--dn-per-e", f"0.1@100,{gain}@3200"),
+    }
+    for source, flags in ways.items():
+        profile = check_darks(run_main, tmp_path, camera, *flags)
+        assert source in profile.read_text(encoding="utf-8")
+    done = run_main("plan", "--config-dir", profile.parents[1], "noise=mine", "scene.iso=3200", "source.limit=1")
+    shown = " ".join(done.out.split())
+    assert all(text in shown for text in (source, "calibrate --from darks", "uncertainty: read noise 0."))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("profile", ["sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x"])
+@pytest.mark.parametrize("iso", [100, 800, 6400])
+def test_darks_of_every_profile(profile: str, iso: float, run_main: RunMain, tmp_path: Path) -> None:
+    check_darks(run_main, tmp_path, Camera(profile, iso), "--gain", profile)
+
+
+@pytest.mark.parametrize(
+    ("flags", "problem"),
+    [
+        (("--from", "darks", "--dn-per-e", "0.1@200"), "has no gain for ISO 100"),
+        (("--from", "darks", "--dn-per-e", "0.1"), "expected DN per electron @ ISO"),
+        (("--from", "darks"), "no dark of ISO 100 has a NoiseProfile tag"),
+        (("--from", "darks", "--gain", "sony_a7s3"), "no such noise profile"),
+        (("--from", "darks", "--gain", "canon_70d", "--dn-per-e", "1@100"), "both state the gain"),
+        (("--from", "darks", "--gain", "imx385_iso1600"), "expected a physical profile"),
+        (("--from", "darks", "--gain", "darks/captures.csv"), "captures.csv"),
+        (("--from", "darks", "--quick"), "--quick: not for --from darks"),
+        (("--gain", "canon_70d"), "--gain: not for captures with flats"),
+        (("--from", "photographs"), "invalid choice"),
+    ],
+)
+def test_wrong_forms_are_refused(flags: Any, problem: str, run_main: RunMain, tmp_path: Path) -> None:
+    folder, profile = tmp_path / "darks", profile_of(tmp_path)
+    folder.mkdir()
+    for number in range(2):
+        np.save(folder / f"{number}.npy", np.full((32, 32), 200 + number, np.uint16))
+    rows = "".join(f"{number}.npy,dark,100,0.1,100,4095,12\n" for number in range(2))
+    (folder / "captures.csv").write_text("file,kind,iso,exposure_s,black_level_dn,white_level_dn,bits\n" + rows)
+    done = run_main("calibrate", folder, "--to", profile, *flags)
+    assert (done.code, problem in done.err, profile.exists()) == (2, True, False), done.err

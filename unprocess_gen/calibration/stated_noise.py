@@ -1,0 +1,233 @@
+"""Turn the NoiseProfile tags of DNG files into a two-number noise profile: variance = a·signal + b at each ISO.
+
+With W - B = white - black, the tag's S and O of a colour give a = S·(W - B) DN and b = O·(W - B)² DN² (DNG
+Specification 1.4). The profile has those of green; red and blue follow by their relative gains. Between two ISOs of one
+gain mode a is interpolated; nothing is extrapolated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from unprocess_gen.calibration.captures import Sensor
+from unprocess_gen.calibration.gain import Estimate
+from unprocess_gen.calibration.iso_laws import Precision, gain_law, rounded, std_law
+from unprocess_gen.calibration.profile import MARK, Named, head, provenance_lines, yaml_text
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.files import file_sha256
+from unprocess_gen.sources.mosaics import RAW_FILES
+from unprocess_gen.sources.raw_metadata import RawMetadata, read_tags
+
+FORM = "calibrate --from noise_profile"
+STATED = Precision(close=3e-8, digits=12)
+"""Laws give the values of the tags within half the precision of float32."""
+COLOURS = ("R", "G", "B")
+SAME = 1e-6
+"""Relative difference up to which two tags are equal."""
+MOST_SWITCHES = 2
+"""Most changes of the gain mode of a sensor, where the variance without light falls."""
+
+
+class StatedIso(NamedTuple):
+    """Variance of one ISO by colour (R, G, B), a in DN and b in DN², and the first file that states it."""
+
+    iso: float
+    a: tuple[float, ...]
+    b: tuple[float, ...]
+    path: Path
+
+
+class StatedNoise(NamedTuple):
+    """Variances that the files of a folder state, in ascending order of ISO."""
+
+    isos: list[StatedIso]
+    sensor: Sensor
+    camera: str
+    sha256: str
+    files: int
+    notes: list[str]
+
+
+def read_stated_noise(folder: Path) -> StatedNoise:
+    """Read the NoiseProfile tags of the DNG files below a folder, or of one file.
+
+    Raises ConfigError or MachineError.
+    """
+    files = [folder] if folder.is_file() else sorted(path for path in folder.rglob("*") if is_raw(path))
+    try:
+        facts = {path: read_tags(path, "calibrate") for path in files}
+        stated = {path: one for path, one in facts.items() if one.noise_profile is not None}
+        digests = sorted(file_sha256(path) for path in stated)
+    except OSError as error:
+        raise MachineError(f"{error.filename or folder}: cannot be read ({error.strerror or error})") from error
+    if not stated:
+        problem = f"none of {len(files)} raw files has a NoiseProfile tag"
+        raise ConfigError(f"calibrate: {folder}: {problem}; expected DNG files, such as those of Adobe's DNG Converter")
+    notes = []
+    if without := [path for path in files if path not in stated]:
+        notes.append(f"{without[0]}: has no NoiseProfile tag; left out ({len(without)} of {len(files)} raw files)")
+    first, *others = stated
+    for path in others:
+        for name in ("model", "black_dn", "white_dn"):
+            own, expected = getattr(stated[path], name), getattr(stated[first], name)
+            if own != expected:
+                raise ConfigError(f"calibrate: {path}: {name}={own}: {first.name} has {expected}; expected one camera")
+    isos = _by_iso([_stated_iso(path, one) for path, one in stated.items()])
+    _check_law(isos)
+    black, white = _levels(first, stated[first])
+    sensor = Sensor(int(white).bit_length(), round(black), round(white), stated[first].pattern or "RGGB", (0, 0))
+    sha256 = hashlib.sha256("\n".join(digests).encode()).hexdigest()
+    if (spread := max(_spreads(isos).values())) > SAME:
+        notes.append(
+            f"NoiseProfile: the planes differ by up to {spread:.1%}; the profile has the variance of green, and the "
+            "gains of red and blue relative to it"
+        )
+    return StatedNoise(isos, sensor, stated[first].model or "an unknown camera", sha256, len(stated), notes)
+
+
+def is_raw(path: Path) -> bool:
+    """Return whether the name of a file is that of a raw file."""
+    return path.suffix.lower() in RAW_FILES
+
+
+def _levels(path: Path, facts: RawMetadata) -> tuple[float, float]:
+    """Return the black and the white level of a file."""
+    if facts.black_dn is None or facts.white_dn is None or not sum(facts.black_dn) / 4 < facts.white_dn:
+        raise ConfigError(f"calibrate: {path}: BlackLevel={facts.black_dn}, WhiteLevel={facts.white_dn}; expected both")
+    return sum(facts.black_dn) / 4, facts.white_dn
+
+
+def stated_variance(path: Path, facts: RawMetadata) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return a and b of red, green and blue from the NoiseProfile tag of a file; ConfigError if no sensor has them."""
+    black, white = _levels(path, facts)
+    numbers, span = facts.noise_profile or (), white - black
+    if len(numbers) not in (2, 6):
+        raise ConfigError(f"calibrate: {path}: NoiseProfile has {len(numbers)} values; expected 2, or 6 for 3 colours")
+    for name, scale, offset in zip(COLOURS, numbers[::2] * 3, numbers[1::2] * 3, strict=False):
+        if not 0 < scale < 1 or not 0 <= offset < 1:
+            raise ConfigError(
+                f"calibrate: {path}: NoiseProfile of {name}: variance = {scale:g}·x + {offset:g}; expected a slope "
+                "above 0 and a variance at black of 0 or more, both below 1; remove the file"
+            )
+    scales, offsets = (numbers[start::2] * (3 if len(numbers) == 2 else 1) for start in (0, 1))
+    return tuple(scale * span for scale in scales), tuple(offset * span**2 for offset in offsets)
+
+
+def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
+    if facts.iso is None:
+        raise ConfigError(f"calibrate: {path}: states no ISO; expected a DNG with its EXIF tags")
+    return StatedIso(facts.iso, *stated_variance(path, facts), path)
+
+
+def _by_iso(stated: Sequence[StatedIso]) -> list[StatedIso]:
+    """Return a record for each ISO; ConfigError names a file that differs from another one of its ISO."""
+    result: dict[float, StatedIso] = {}
+    for one in sorted(stated, key=lambda one: one.iso):
+        first = result.setdefault(one.iso, one)
+        for own, other in zip(one.a + one.b, first.a + first.b, strict=True):
+            if abs(own - other) > SAME * other:
+                raise ConfigError(
+                    f"calibrate: {one.path}: NoiseProfile differs from that of {first.path.name}, of the same ISO "
+                    f"{one.iso:g}; expected files of one camera and mode; remove those that differ"
+                )
+    return list(result.values())
+
+
+def _check_law(isos: Sequence[StatedIso]) -> None:
+    """Refuse variances that no sensor has: they rise with ISO, except without light where the gain mode changes."""
+    falls = []
+    for low, high in pairwise(isos):
+        where = f"calibrate: {high.path}: NoiseProfile at ISO {high.iso:g}"
+        expected = f"than at ISO {low.iso:g} ({low.path.name}); expected a rise with ISO; remove the wrong file"
+        for name, before, after in zip(COLOURS, low.a, high.a, strict=True):
+            if after <= before * (1 + SAME):
+                raise ConfigError(f"{where}: the variance of {name} has no larger slope {expected}")
+        if high.b[1] < low.b[1] * (1 - SAME):
+            falls.append(high.iso)
+            if len(falls) > MOST_SWITCHES or low.iso in falls:
+                raise ConfigError(f"{where}: again less variance without light {expected}")
+
+
+def _modes(isos: Sequence[StatedIso]) -> Iterator[list[StatedIso]]:
+    """Yield the ISOs of each gain mode; the variance without light falls where a mode begins."""
+    mode = [isos[0]]
+    for one in isos[1:]:
+        if one.b[1] < mode[-1].b[1] * (1 - SAME) or (one.b[1] > 0) != (mode[-1].b[1] > 0):
+            yield mode
+            mode = []
+        mode.append(one)
+    yield mode
+
+
+def _branches(isos: Sequence[StatedIso]) -> Iterator[list[StatedIso]]:
+    """Yield the ISOs of each branch: a mode on one line, or else pairs of neighbours, which share their ends."""
+    for mode in _modes(isos):
+        if _gain_law(mode) is not None:
+            yield mode
+            continue
+        pairs = [[*pair] for pair in pairwise(mode) if _gain_law([*pair]) is not None]
+        yield from sorted([*pairs, *([one] for one in mode if not any(one in pair for pair in pairs))])
+
+
+def _gain_law(isos: Sequence[StatedIso]) -> object:
+    return gain_law([one.iso for one in isos], [_exact(one.a[1]) for one in isos], STATED)
+
+
+def _exact(value: float) -> Estimate:
+    return Estimate(value, value, value)
+
+
+def _spreads(isos: Sequence[StatedIso]) -> dict[str, float]:
+    """Return the largest relative difference of a and of b from those of green."""
+    return {
+        "a": max(abs(value / one.a[1] - 1) for one in isos for value in one.a),
+        "b": max(abs(value - one.b[1]) / max(*one.b, 1e-300) for one in isos for value in one.b),
+    }
+
+
+def stated_estimates(stated: StatedNoise) -> list[Named]:
+    """Return the list of estimates; the tags state no intervals."""
+    named = []
+    for one in stated.isos:
+        for site, plane in ((None, 1), ("R", 0), ("Gr", 1), ("Gb", 1), ("B", 2)):
+            numbers = {"dn_per_e": (one.a, "DN/e"), "b_dn2": (one.b, "DN²")}
+            named += [
+                Named(name, one.iso, site, Estimate(values[plane], -math.inf, math.inf), unit)
+                for name, (values, unit) in numbers.items()
+            ]
+        named.append(Named("read_std_dn", one.iso, None, Estimate(math.sqrt(one.b[1]), -math.inf, math.inf), "DN"))
+    return named
+
+
+def stated_profile(stated: StatedNoise, name: str) -> str:
+    """Return the noise profile as YAML."""
+    isos = [one.iso for one in stated.isos]
+    lines = head(
+        f"Read {MARK} from the NoiseProfile tags of {stated.camera}, {stated.files} files",
+        isos, stated.sha256, stated.notes, name, stated.sensor,
+    )  # fmt: skip
+    lines.append("branches:")
+    for branch in _branches(stated.isos):
+        own = [one.iso for one in branch]
+        reads = [_exact(math.sqrt(one.b[1])) for one in branch]
+        lines += [
+            f"  - iso: [{own[0]:g}, {own[-1]:g}]",
+            f"    dn_per_e: {yaml_text(_gain_law(branch))}",
+            "    read_law: gaussian",
+            f"    read_std_dn: {yaml_text(std_law(own, reads, STATED))}",
+        ]
+    spreads = _spreads(stated.isos)
+    if spreads["a"] > SAME:
+        middle = stated.isos[len(isos) // 2]
+        relative = [rounded(value / middle.a[1], STATED.digits) for value in middle.a]
+        lines.append(f"gain_by_colour: {yaml_text(relative)}   # red, green, blue, at ISO {middle.iso:g}")
+    differ = ", ".join(f"{number} by {spread:.1%}" for number, spread in spreads.items())
+    source = f"{FORM}, tags of {stated.camera}, {stated.files} files, SHA-256 {stated.sha256[:16]}"
+    uncertainty = f"the tags state none; planes differ from green, {differ}"
+    lines += ["provenance:", *provenance_lines(["dn_per_e", "read_std_dn"], source, uncertainty, isos)]
+    return "\n".join(lines) + "\n"
