@@ -80,7 +80,7 @@ def test_every_clean_dn_follows_from_row_and_source(
     photographs: Path, tmp_path: Path, name: str, figure: Figure
 ) -> None:
     given = {"gains": GainsConfig(*BROOKS), "noise": NOISE, **SETTINGS[name]}
-    source = SourceConfig(str(photographs), ["*.jpg", "*.png"])
+    source = SourceConfig(str(photographs), include=["*.jpg", "*.png"])
 
     generate(Config(source=source, out=str(tmp_path / "ds"), n_jobs=1, **given))
 
@@ -93,7 +93,7 @@ def test_every_clean_dn_follows_from_row_and_source(
 @pytest.mark.skipif("PHOTOS" not in os.environ, reason="set PHOTOS to a folder of photographs")
 def test_every_clean_dn_of_real_photographs(tmp_path: Path, figure: Figure) -> None:
     root = Path(os.environ["PHOTOS"])
-    source = SourceConfig(str(root), ["*.jpg"])
+    source = SourceConfig(str(root), include=["*.jpg"])
 
     summary = generate(Config(source=source, gains=GainsConfig(*BROOKS), noise=NOISE, out=str(tmp_path / "ds")))
 
