@@ -9,7 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unprocess_gen.calibration.gain import NORMAL_95, SIGNIFICANT, Estimate, combined, estimate, root_estimate
+from unprocess_gen.calibration.gain import (
+    NORMAL_95,
+    SIGNIFICANT,
+    Estimate,
+    combined,
+    estimate,
+    root_estimate,
+    weighted_slope,
+)
 from unprocess_gen.calibration.measure import Dark, IsoResult, usable
 
 LEAST_EXPOSURE_RATIO = 2.0
@@ -123,11 +131,9 @@ def _dark_currents(results: Sequence[IsoResult]) -> dict[float, list[Estimate]]:
                 continue
             electrons = np.array([dark.measured.variance.mean() for dark in darks]) / result.gain.sensor.value**2
             errors = np.array([np.linalg.norm(dark.measured.error) / 4 for dark in darks]) / result.gain.sensor.value**2
-            design = np.stack([seconds, np.ones_like(seconds)])
-            covariance = np.linalg.inv((design / errors**2) @ design.T)
-            slope = float((covariance @ design / errors**2 @ electrons)[0])
+            slope, error = weighted_slope(seconds, electrons, errors)
             gain_error = 2 * slope * result.gain.sensor.error / result.gain.sensor.value
-            currents[temperature].append(estimate(slope, math.hypot(math.sqrt(covariance[0, 0]), gain_error)))
+            currents[temperature].append(estimate(slope, math.hypot(error, gain_error)))
     return dict(currents)
 
 
@@ -140,10 +146,8 @@ def _doubling(currents: dict[float, list[Estimate]]) -> Estimate | None:
     celsius = np.array([point[0] for point in points])
     logs = np.array([math.log2(point[1].value) for point in points])
     errors = np.array([point[1].error / point[1].value / math.log(2) for point in points])
-    design = np.stack([celsius, np.ones_like(celsius)])
-    covariance = np.linalg.inv((design / errors**2) @ design.T)
-    slope = float((covariance @ design / errors**2 @ logs)[0])
-    return estimate(1 / slope, math.sqrt(covariance[0, 0]) / slope**2) if slope > 0 else None
+    slope, error = weighted_slope(celsius, logs, errors)
+    return estimate(1 / slope, error / slope**2) if slope > 0 else None
 
 
 def _is_mean_removed(results: Sequence[IsoResult]) -> bool:

@@ -65,6 +65,13 @@ def combined(estimates: Sequence[Estimate]) -> Estimate:
     return estimate(mean, math.sqrt(max(excess, 1.0) if excess > 4 else 1.0) / math.sqrt(float(weights.sum())))
 
 
+def weighted_slope(x: Float, y: Float, errors: Float) -> tuple[float, float]:
+    """Return the slope of a line through values with standard errors, and its standard error."""
+    design = np.stack([x, np.ones_like(x)])
+    covariance = np.linalg.inv((design / errors**2) @ design.T)
+    return float((covariance @ design / errors**2 @ y)[0]), math.sqrt(covariance[0, 0])
+
+
 @dataclass(frozen=True, slots=True)
 class Transfer:
     """Points of a photon transfer curve of one plane: flats of one level each, and their darks.

@@ -203,9 +203,9 @@ def _branch_lines(
     """Return the lines of a branch."""
     isos = [result.iso for result in results]
     gains, reads = [one.gain.sensor for one in results], [one.read for one in results]
-    gain_law_ = gain_law(isos, gains)
+    gain_by_iso = gain_law(isos, gains)
     origin = known.source if known else _ranges(isos, gains)
-    lines = [f"  - iso: [{isos[0]:g}, {isos[-1]:g}]", f"    dn_per_e: {yaml_text(gain_law_)}   # {origin}"]
+    lines = [f"  - iso: [{isos[0]:g}, {isos[-1]:g}]", f"    dn_per_e: {yaml_text(gain_by_iso)}   # {origin}"]
     if two_parameter:
         variances = [_dark_variance(result) for result in results]
         reads = [estimate(math.sqrt(b.value), b.error / 2 / math.sqrt(b.value)) for b in variances]

@@ -25,12 +25,11 @@ from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_fol
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPairs, RecordedPairs
 from unprocess_gen.pipeline.pairs import PairSettings
-from unprocess_gen.pipeline.targets import kernels_for, targets_of
+from unprocess_gen.pipeline.targets import kernels_for, levels_of, noise_law, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.mixture import config_of_key
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.pair import make_crop
 from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
@@ -168,7 +167,7 @@ class LivePairs:
         pair = make_crop(crop_patch(srgb, patch), plan, patch.origin, epoch, source.settings.dark_folder)
         targets = {}
         if self._targets:
-            targets = targets_of(self._targets, srgb, plan, patch, pair, _law(plan), as_float=self._as_float)
+            targets = targets_of(self._targets, srgb, plan, patch, pair, noise_law(plan), as_float=self._as_float)
         clean, noisy = (self._frame(frame, plan) for frame in (pair.clean, pair.noisy))
         if self._arrays_only:
             return (clean, noisy, *targets.values())
@@ -192,7 +191,7 @@ class LivePairs:
         """Return a frame in DN, or as light."""
         if not self._as_float or frame.dtype != np.uint16:
             return frame
-        return to_light(frame, _levels(plan))
+        return to_light(frame, levels_of(plan))
 
 
 class LiveRow(Mapping[str, Value]):
@@ -259,13 +258,3 @@ def _crop(plan: Plan, epoch: int, patch: Patch, side: int, number: int) -> Patch
     words = crop_words(plan.stream_key, patch.number, noise.level, noise.draw, frame_word(noise.frame, epoch), number)
     y, x = even_corner(words, side, patch.height, patch.width)
     return Patch(patch.number, patch.y + y, patch.x + x, side, side)
-
-
-def _levels(plan: Plan) -> dict[str, Value]:
-    """Return the levels of a plan as columns of a row."""
-    return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
-
-
-def _law(plan: Plan) -> dict[str, Value]:
-    """Return the levels and the noise of a plan as columns of a row, without the others, which take longer."""
-    return {**_levels(plan), "a_dn": plan.noise.a_dn, "dark_variance_dn2": dark_variance_dn2(plan)}

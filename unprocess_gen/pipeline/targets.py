@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.targets import FRAME_TARGETS
-from unprocess_gen.core.types import FLOAT32, Array, Frame, Pair, Patch, Plan, Row, Srgb
+from unprocess_gen.core.types import FLOAT32, Array, Frame, Pair, Patch, Plan, Row, Srgb, Value
 from unprocess_gen.dataset.training import noise_std
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.pair import linear_rgb
 from unprocess_gen.sources.patches import crop_patch
 
@@ -44,6 +45,16 @@ def targets_of(
             pixels = crop_patch(srgb, patch)
             targets[name] = pixels.copy() if name == "srgb" else linear_rgb(pixels, plan, patch.origin)
     return targets
+
+
+def levels_of(plan: Plan) -> dict[str, Value]:
+    """Return the levels of a plan as columns of a row."""
+    return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
+
+
+def noise_law(plan: Plan) -> dict[str, Value]:
+    """Return the columns of a row that targets need; a complete row takes longer than a small pair."""
+    return {**levels_of(plan), "a_dn": plan.noise.a_dn, "dark_variance_dn2": dark_variance_dn2(plan)}
 
 
 def kernels_for(names: Sequence[str], plan: Plan) -> list[str]:

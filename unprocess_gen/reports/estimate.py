@@ -33,7 +33,7 @@ from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import SAMPLE as SIZE_SAMPLE
 from unprocess_gen.pipeline.sizes import estimate_shards, source_bytes
-from unprocess_gen.pipeline.targets import targets_of
+from unprocess_gen.pipeline.targets import noise_law, targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.mixture import entry_number, image_config
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
@@ -243,10 +243,8 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     for patch, plan, pair in image.pairs():
         if not clean_levels and pair.clean.dtype == np.uint16:
             clean_levels = int(np.count_nonzero(np.bincount(pair.clean.reshape(-1))))
-        numbers = {name: getattr(plan.sensor, name) for name in ("black_level_dn", "white_level_dn")}
-        numbers |= {"a_dn": plan.noise.a_dn, "b_dn2": plan.noise.b_dn2}
         names = [name for name in config.output.targets if plan is image.plans[0] or name in FRAME_TARGETS]
-        targets = targets_of(names, photograph.srgb, plan, patch, pair, numbers).values()
+        targets = targets_of(names, photograph.srgb, plan, patch, pair, noise_law(plan)).values()
         for frame in (*([pair.clean] if plan is image.plans[0] else []), pair.noisy, *targets):
             array_xxh3(frame)
             hashlib.sha256(frame.data)
