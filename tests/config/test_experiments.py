@@ -25,8 +25,6 @@ from unprocess_gen.sources.scenes import synthetic
 
 RECIPE = "experiment"
 RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml"))
-NO_CLIPS = {"crvd_like": ("source.clips=false",)}
-"""Overrides that an experiment needs with the built-in scenes, which are not clips."""
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -41,7 +39,7 @@ NO_CLIPS = {"crvd_like": ("source.clips=false",)}
 def test_experiment_is_valid_with_all_compatible_options(
     recipe: str, overrides: tuple[str, ...], settings: Settings
 ) -> None:
-    config = settings(f"+{RECIPE}={recipe}", *overrides, *NO_CLIPS.get(recipe, ()))
+    config = settings(f"+{RECIPE}={recipe}", *overrides)
     validate_config(config)
     if "noise=none" in overrides:
         assert config.noise.name == "none"
@@ -68,7 +66,7 @@ def test_experiment_runs_unmodified(recipe: str, clip: Path, run_main: RunMain, 
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_noise_of_an_experiment_matches_its_rows(recipe: str, run_main: RunMain) -> None:
-    overrides = (f"+{RECIPE}={recipe}", "source.limit=2", "n_jobs=1", *NO_CLIPS.get(recipe, ()))
+    overrides = (f"+{RECIPE}={recipe}", "source.limit=2", "n_jobs=1")
     assert run_main(*overrides, "out=ds").code == 0
     assert "noise of" in run_main("verify", "ds", "--noise").out
 
@@ -93,10 +91,6 @@ def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(
             "no such option; expected one of brooks2019_training, crvd_like, eld_body, eld_low_light, ipol",
         ),
         (f"+{RECIPE}=[ipol_demo,crvd_like]", "expected the name of an option: brooks2019_training"),
-        (
-            f"+{RECIPE}=crvd_like",
-            "source.clips=true: the built-in scenes are not clips; expected folders or videos; give source.root",
-        ),
     ],
 )
 def test_invalid_experiment_is_refused_in_one_line(

@@ -189,7 +189,6 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
             r"full_well_e=28300\.0 ends below white .*effects\.full_well=off",
         ),
         (("noise=nikon_d850", "noise.levels=2", "clean.includes_fixed_pattern=true"), r"depends on the ISO"),
-        (("source.clips=true",), r"source.clips=true: the built-in scenes are not clips"),
         (("source.downscale=0",), r"source.downscale=0: expected 1 to 64"),
         (("source.dequantize=yes",), r"source.dequantize=yes: expected one of off, dither"),
     ],

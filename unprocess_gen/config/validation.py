@@ -175,9 +175,6 @@ def _check_environment(config: Config) -> None:
     _check_places(source)
     if source.root is not None:
         _check_root(source.root)
-    elif source.clips and source.place is None:
-        problem = "the built-in scenes are not clips; expected folders or videos; give source.root=…"
-        raise refusal("source.clips", "true", problem)
     if source.icc == "refuse":
         require("PIL", "source.icc=refuse: needs Pillow", "icc", ", or set source.icc=ignore")
     if config.executor.kind == "dask":

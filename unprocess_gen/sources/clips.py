@@ -8,14 +8,14 @@ from dataclasses import replace
 
 from unprocess_gen.core.roots import Root
 from unprocess_gen.core.types import Source
-from unprocess_gen.sources.reading import content_sha256
+from unprocess_gen.sources.reading import content_sha256, name_sha256
 
 
-def number_clips(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
+def number_clips(root: Root | None, sources: Sequence[Source]) -> tuple[Source, ...]:
     """Make each folder a clip whose files are frames 0, 1, … in listing order; videos are clips already.
 
     The digest of a clip's first file identifies the clip, so that adding or removing other clips changes nothing. If
-    that file cannot be read, the digest of its name is used.
+    that file cannot be read, or is a built-in scene (no ``root``), the digest of its name is used.
     """
     clips: dict[str, list[Source]] = {}
     for source in sources:
@@ -23,7 +23,7 @@ def number_clips(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
     seen: Counter[str] = Counter()
     placed: dict[int, Source] = {}
     for clip, frames in clips.items():
-        digest = content_sha256(root, frames[0])
+        digest = name_sha256(frames[0]) if root is None else content_sha256(root, frames[0])
         for frame, source in enumerate(frames):
             placed[source.index] = replace(
                 source, clip=clip, frame=frame, clip_sha256=digest, clip_occurrence=seen[digest], frames=len(frames)

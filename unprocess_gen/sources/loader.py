@@ -45,8 +45,9 @@ def list_photographs(config: SourceConfig) -> Listing:
     """
     place = config.place
     if place is None:
-        scenes = synthetic.listing(config.limit)
-        return Listing(tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(scenes)))
+        names = (synthetic.clip_listing if config.clips else synthetic.listing)(config.limit)
+        scenes = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
+        return Listing(number_clips(None, scenes) if config.clips else scenes)
     include = [*config.include, *(config.video if config.clips else ())]
     if config.list is None:
         listed = list_folder(place, include, config.recursive, config.limit, () if config.clips else config.video)

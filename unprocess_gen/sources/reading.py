@@ -102,7 +102,12 @@ def content_sha256(root: Root, source: Source) -> str:
     try:
         return hashlib.sha256(read_bytes(root, source)).hexdigest()
     except SourceError:
-        return hashlib.sha256(source.name.encode()).hexdigest()
+        return name_sha256(source)
+
+
+def name_sha256(source: Source) -> str:
+    """SHA-256 of a source's name."""
+    return hashlib.sha256(source.name.encode()).hexdigest()
 
 
 def stamp(root: Root, source: Source) -> Stamp:

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from unprocess_gen.sources.scenes.synthetic import NAMES, listing, scene
+from unprocess_gen.sources.scenes.synthetic import CLIP_FRAMES, NAMES, PAN, clip_listing, listing, scene
 
 SLOW = pytest.mark.slow
 GOLDEN = {
@@ -54,6 +54,17 @@ def test_some_scenes_contain_black_and_blown_white(kind: str, pictures: dict[str
     picture = pictures[f"{kind}-0"]
     assert (picture.min(axis=2) == 255).any()
     assert (picture.max(axis=2) < 30).any()
+
+
+def test_frames_of_a_clip_are_windows_that_move_over_the_scene() -> None:
+    first, third = scene("gradients-1/0000"), scene("gradients-1/0002")
+    assert np.array_equal(first[2 * PAN[0] :, 2 * PAN[1] :], third[: -2 * PAN[0], : -2 * PAN[1]])
+    last = scene(f"gradients-1/{CLIP_FRAMES - 1:04}")
+    assert np.array_equal(last, scene("gradients-1")[-last.shape[0] :, -last.shape[1] :])
+    assert clip_listing(CLIP_FRAMES + 1)[-2:] == ("dead_leaves-0/0007", "colour_chart-0/0000")
+    for name in ("gradients-1/0008", "gradients-1/1", "gradients-1/"):
+        with pytest.raises(ValueError, match="expected 0000 to 0007"):
+            scene(name)
 
 
 def test_a_shorter_listing_begins_a_longer_one() -> None:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,19 @@ def listing(limit: int | None) -> tuple[str, ...]:
     return tuple(f"{KINDS[i % len(KINDS)]}-{i // len(KINDS)}" for i in range(count))
 
 
+CLIP_FRAMES = 8
+"""Frames of a scene that is a clip."""
+
+PAN = (2, 4)
+"""Rows and columns by which the camera moves on from frame to frame."""
+
+
+def clip_listing(limit: int | None) -> tuple[str, ...]:
+    """Return the names of the first ``limit`` frames (None: all of ten clips), ``<kind>-<number>/<frame>``."""
+    clips = listing(None if limit is None else -(-limit // CLIP_FRAMES))
+    return tuple(f"{clip}/{frame:04}" for clip in clips for frame in range(CLIP_FRAMES))[:limit]
+
+
 NAMES = listing(None)
 
 DEFAULT_SIZE = (512, 768)
@@ -50,7 +64,31 @@ SIZES = {
 
 
 def scene(name: str) -> NDArray[np.uint8]:
-    """Draw scene ``name`` (``<kind>-<number>``): uint8 ``[H, W, 3]``, display-referred R, G, B, C-contiguous."""
+    """Draw scene ``name`` (``<kind>-<number>``): uint8 ``[H, W, 3]``, display-referred R, G, B, C-contiguous.
+
+    A frame of a clip (``<kind>-<number>/<frame>``) is a window of the scene, which moves by `PAN`.
+    """
+    clip, slash, frame = name.partition("/")
+    if not slash:
+        return _draw(name)
+    if frame not in map("{:04}".format, range(CLIP_FRAMES)):
+        raise ValueError(f"frame {frame!r} of a synthetic scene: expected 0000 to {CLIP_FRAMES - 1:04}")
+    pixels = _drawn(clip)
+    first = (int(frame) * step for step in PAN)
+    rows, columns = (
+        slice(start, start + side - (CLIP_FRAMES - 1) * step)
+        for start, side, step in zip(first, pixels.shape, PAN, strict=False)
+    )
+    return np.ascontiguousarray(pixels[rows, columns])
+
+
+@lru_cache(maxsize=1)
+def _drawn(name: str) -> NDArray[np.uint8]:
+    """Draw a scene once for all frames of its clip."""
+    return _draw(name)
+
+
+def _draw(name: str) -> NDArray[np.uint8]:
     kind = _kind(name)
     draws = _Draws(name)
     height, width = SIZES.get(name, DEFAULT_SIZE)
