@@ -40,7 +40,7 @@ REFUSED = [
     (["~camera"], r"~camera: a setting cannot be removed"),
     (["+camera=convex"], r".*camera.*more than once"),
     (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
-    (["word"], r"word: no such verb; expected generate, prepare, .*again, calibrate, completion or settings key=value"),
+    (["word"], r"word: no such verb; expected generate, .*again, calibrate, completion or settings key=value"),
     (["camera=convex", "word"], r"generate: word: expected a setting key=value"),
     (["camera.name"], r"generate: camera.name: expected a setting key=value"),
     ([""], r"."),
@@ -57,7 +57,7 @@ REFUSED = [
     (["camera=my/own.yaml"], r"camera=my/own.yaml: .*; for a file of your own, put it in FOLDER/camera and write "),
     (["camera=/my/own.yaml"], r"camera=/my/own.yaml: .*; for a file of your own, .* --config-dir FOLDER camera=own"),
     (["--multirun=2"], r"generate: -m/--multirun: "),
-    (["verfy", "ds"], r"verfy: no such verb; expected generate, prepare, .*; did you mean verify\?"),
+    (["verfy", "ds"], r"verfy: no such verb; expected generate, manifest, prepare, .*; did you mean verify\?"),
     (["--multrun", "seed=1,2"], r"generate: --multrun: no such flag; .*; did you mean --multirun\?"),
     (["plan", "--al"], r"plan: --al: no such flag; expected --all, .*; did you mean --all\?"),
     (["sourc.root=p"], r"sourc.root=p: no such key; expected one of source, .*; did you mean source\?"),
@@ -321,7 +321,7 @@ def test_again_reports_columns_of_a_later_version(run_main: RunMain, make: Make,
     manifest.write_text("".join(f"{rest}\n" for rest, _, _ in lines))
     done = run_main("again", "old", "out=new", "n_jobs=1")
     assert done.code == 0, done.err
-    assert done.out.splitlines()[-1].startswith("the same rows as old, in its columns; new/manifest.csv has columns of")
+    assert done.out.splitlines()[-1].startswith("the same rows as old, in its cells; new/manifest.csv has more")
 
 
 def test_again_of_scenes_needs_no_source(

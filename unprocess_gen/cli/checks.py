@@ -148,16 +148,18 @@ def replay(call: Call) -> int:
     to = Path(call.values["to"]) if "to" in call.values else None
     failed: list[Row] = []
     rows = _ok_rows(select_rows(manifest, call.values.get("rows"), call.values.get("keys"), failed), failed)
-    codes, written = [], False
+    codes, written, unknown = [], False, 0
     for result in replay_rows(rows, source_root(manifest, given_root(call)), to, dark_frames_of(manifest, call)):
         codes.append(result.exit_code)
         written |= result.written
+        unknown += not result.compared
         if result.complaint:
             report(_complaint(result), logging.ERROR)
-    same = codes.count(0)
-    others = len(codes) - same
+    same = codes.count(0) - unknown
+    others = len(codes) - codes.count(0)
     print_result(
         f"{counted(same, 'pair')} {_are(same)} the same, bit for bit; {others} {_are(others)} not"
+        + (f"; {counted(unknown, 'row')} without digests" if unknown else "")
         + (f"; arrays in {to}" if written else "")
         + (f"; {counted(len(failed), 'failed row')} skipped" if failed else "")
     )

@@ -1,4 +1,4 @@
-"""Run the verbs that generate a dataset: generate and again."""
+"""Run the verbs that generate a dataset: generate, manifest and again."""
 
 from __future__ import annotations
 
@@ -22,6 +22,17 @@ def generate(call: Call) -> int:
     return compose(call, generate_dataset, sweep_csv=True)
 
 
+def manifest(call: Call) -> int:
+    """Write the manifest of a dataset, or one for each combination of a sweep, without making frames."""
+    return compose(call, _generate_manifest, sweep_csv=True)
+
+
+def _generate_manifest(config: Config, label: str = "") -> tuple[int, Summary, list[str]]:
+    from unprocess_gen.config.schema import replaced
+
+    return generate_dataset(replaced(config, {"output.frames": False}), label)
+
+
 def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary, list[str]]:
     """Generate one dataset; return the exit code, what was generated, and the lines to print."""
     from unprocess_gen.pipeline.generate import generate
@@ -42,6 +53,7 @@ def again(call: Call) -> int:
     folder = dataset_folder(call)
     changes = {"out": call.values["out"], "executor": _executor(call)}
     changes |= {"n_jobs": call.values["n_jobs"]} if "n_jobs" in call.values else {}
+    changes |= {"output.frames": call.values["frames"] == "true"} if "frames" in call.values else {}
     changes |= {"source.max_failed": call.values["max_failed"]} if "max_failed" in call.values else {}
     given = {name for name in ("dark_frames", "dark_shading") if name in call.values}
     dark = dark_frames_of(folder / "manifest.csv", call)

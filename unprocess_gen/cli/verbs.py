@@ -68,6 +68,12 @@ INPUTS = (
 _VERBS = (
     _composing("generate", "generate a dataset; the default verb", "runs.generate", resumes=True),
     _composing(
+        "manifest",
+        "write the manifest of a dataset without its frames, for ug.LivePairs",
+        "runs.manifest",
+        resumes=True,
+    ),
+    _composing(
         "prepare", "list the sources of a run and split it into parts, for separate jobs", "parts.prepare", PARTS
     ),
     Verb(
@@ -167,6 +173,12 @@ _VERBS = (
             OUT,
             _integer("n_jobs", "number of worker processes; -1: all cores"),
             Argument(("executor",), "what runs the workers: local or dask", "NAME"),
+            Argument(
+                ("output.frames",),
+                "false: only the manifest; true: also the frames of a manifest without frames",
+                "{true,false}",
+                choices=("true", "false"),
+            ),
             Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
             _integer("source.max_failed", "largest number of failed sources with exit code 0"),
         ),

@@ -621,6 +621,8 @@ class OutputConfig(Group):
     targets
         more arrays for a training: linear_rgb is the scene before the mosaic, srgb the photograph, variance that
         of the noise at each site, noise_std its standard deviation as estimated from the noisy frame
+    frames
+        store frames; false writes a manifest only, as the verb manifest does: ug.LivePairs makes the pairs of it
     """
 
     dtype: str = key("uint16", Choice("uint16", "float32"))
@@ -629,6 +631,7 @@ class OutputConfig(Group):
     pairs_per_shard: Any = key(8, NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"))
     parquet: bool = key(False, limits.BOOLEAN, since="0.2")
     targets: tuple[str, ...] = key((), limits.TARGET_NAMES, since="0.3")
+    frames: bool = key(True, limits.BOOLEAN, since="0.3")
 
     def __post_init__(self) -> None:
         """Convert the text of an integer, such as the value of an environment variable."""

@@ -140,6 +140,8 @@ TYPE_NAMES: Mapping[Any, str] = {int: "integer", float: "number", str: "text", n
 FAILED = "the source failed"
 """Condition under which the cells of most columns are empty."""
 
+NO_FRAMES = "the source failed, or output.frames is false"
+
 NO_DARK_FRAME = "there is no dark frame"
 
 NO_VIDEO = "the source failed, unless it is a frame of a video"
@@ -333,14 +335,19 @@ COLUMNS = (
            empty_if="no effect was skipped, or the source failed"),
     Column("accuracy", "name of the accuracy tier", ANY_TEXT, AccuracyPlan, "name"),
     Column("methods", "method of each stage, separated by ;", ANY_TEXT, AccuracyPlan, spelling=LIST),
-    Column("clean_xxh3", "XXH3-128 of the clean array's little-endian bytes", HEX_128),
-    Column("noisy_xxh3", "XXH3-128 of the noisy array's little-endian bytes", HEX_128),
-    Column("clean_clipped_low", "clean sites below black before clipping", COUNT, Counts, unit="sites"),
-    Column("clean_clipped_high", "clean sites above white before clipping", COUNT, Counts, unit="sites"),
-    Column("noisy_clipped_low", "noisy sites below the lowest DN before clipping", COUNT, Counts, unit="sites"),
-    Column("noisy_clipped_high", "noisy sites above the highest DN before clipping", COUNT, Counts, unit="sites"),
-    Column("saturated", "clean sites at the white level", COUNT, Counts, unit="sites"),
-    Column("zero_variance", "sites at which the noise has no variance", COUNT, Counts, unit="sites"),
+    Column("clean_xxh3", "XXH3-128 of the clean array's little-endian bytes", HEX_128, empty_if=NO_FRAMES),
+    Column("noisy_xxh3", "XXH3-128 of the noisy array's little-endian bytes", HEX_128, empty_if=NO_FRAMES),
+    *(
+        Column(name, meaning, COUNT, Counts, unit="sites", empty_if=NO_FRAMES)
+        for name, meaning in (
+            ("clean_clipped_low", "clean sites below black before clipping"),
+            ("clean_clipped_high", "clean sites above white before clipping"),
+            ("noisy_clipped_low", "noisy sites below the lowest DN before clipping"),
+            ("noisy_clipped_high", "noisy sites above the highest DN before clipping"),
+            ("saturated", "clean sites at the white level"),
+            ("zero_variance", "sites at which the noise has no variance"),
+        )
+    ),
     Column("law_distance", "largest accepted CDF distance of shot plus read noise", NOT_NEGATIVE, AccuracyPlan),
     Column("scene", "name of the scene", ANY_TEXT, ScenePlan, "name"),
     Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
@@ -409,14 +416,14 @@ COLUMNS = (
            "pixels and rounding; ug.noise_std uses it",
            FINITE, unit="DN²", since="0.3", in_json=False, empty_if="the source failed"),
     Column("light_clipped_high", "sites whose light is above white before the exposure ratio divides it", COUNT, Counts,
-           unit="sites", since="0.3", in_json=False, empty_if="exposure_ratio is 1"),
+           unit="sites", since="0.3", in_json=False, empty_if="exposure_ratio is 1, or output.frames is false"),
     *_columns_of_numbers(*(name for name, number in NUMBERS.items() if number.since not in ("", "0.2"))),
     Column("split", "part of the dataset that the image belongs to",
            Text(re.compile(r"[\w-]{1,32}", re.ASCII), "up to 32 letters, digits, _ and -"), Plan, since="0.3",
            empty_if="there are no splits, or the source failed"),
     Column("targets", "stored targets, each with dtype and XXH3-128 (srgb:uint8:…), separated by ;",
            Text(re.compile(f"({_TARGET}(;{_TARGET})*)?"), "targets as name:dtype:digest, separated by ;"), since="0.3",
-           empty_if="output.targets is empty, or the source failed"),
+           empty_if="output.targets is empty, output.frames is false, or the source failed"),
     Column("light", "light from which the white-balance gains follow", ANY_TEXT, CameraPlan, since="0.3", in_json=False,
            empty_if="the gains follow from no light (gains.light=null), or the source failed"),
     Column("cct_k", "correlated colour temperature of the light", Range(1000, 25000), CameraPlan, unit="K", since="0.3",

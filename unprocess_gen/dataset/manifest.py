@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, NamedTuple, TextIO, TypeVar
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.types import PARTS, DarkFramePlan, NoisePlan, Pair, Patch, Plan, Row, Source, Value
+from unprocess_gen.core.types import PARTS, Counts, DarkFramePlan, NoisePlan, Pair, Patch, Plan, Row, Source, Value
 from unprocess_gen.dataset.columns import COLUMNS, COLUMNS_OF, FIRST, HEADERS, NAMES, Column, Record
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.simulation.effects import Physics, dark_variance_dn2
@@ -59,7 +59,7 @@ def pair_row(
     orientation: int,
     shard: int,
     plan: Plan,
-    pair: Pair,
+    pair: Pair | None,
     digests: tuple[str, str],
     patch: Patch,
     source_noise_dn: float | None = None,
@@ -80,10 +80,10 @@ def pair_row(
         Number of the shard.
     plan : Plan
         All parameters of the pair.
-    pair : Pair
-        Frames and counts.
+    pair : Pair or None
+        Frames and counts; None in a manifest without frames.
     digests : tuple of str
-        XXH3-128 of the clean and of the noisy array, 32 hexadecimal digits each.
+        XXH3-128 of the clean and of the noisy array, 32 hexadecimal digits each; empty without frames.
     patch : Patch
         Part of the full frame that the pair shows.
     source_noise_dn : float or None
@@ -105,7 +105,7 @@ def pair_row(
         "dark_variance_dn2": dark_variance_dn2(plan),
         **_plan_cells(plan),
         **_cells(patch),
-        **_cells(pair.counts),
+        **({} if pair is None else _cells(pair.counts)),
     }
     return _row(source, sha256, shard, plan.seed, values)
 
@@ -351,7 +351,7 @@ def _check_together(row: Row) -> None:
         raise ValueError("status is empty")
     if row["status"] != "ok":
         return
-    for name in _NEEDED:
+    for name in _NEEDED if any(row[name] not in (None, "") for name in _OF_FRAMES) else _NEEDED_TO_PLAN:
         if row[name] is None or row[name] == "":
             raise ValueError(f"{name} is empty")
     largest = TARGET_BYTES if row["targets"] else 4 if "float32" in (row["dtype"], row["clean_dtype"]) else 2
@@ -362,11 +362,28 @@ def _check_together(row: Row) -> None:
         )
 
 
-_NEEDED = (
-    *("width", "height", "shard", "level", "draw", "frame"),
-    *("dtype", "layout", "pattern", "clean_xxh3", "noisy_xxh3"),
-)
+_NEEDED_TO_PLAN = "width", "height", "shard", "level", "draw", "frame", "dtype", "layout", "pattern"
+_NEEDED = *_NEEDED_TO_PLAN, "clean_xxh3", "noisy_xxh3"
 """Columns without which the members of a pair can neither be found nor checked."""
+
+_OF_FRAMES = "clean_xxh3", "noisy_xxh3", "targets", *(column.name for (column,) in COLUMNS_OF[Counts].values())
+"""Columns that depend on frames; all of them are empty in a manifest without frames."""
+
+
+def has_frames(row: Row) -> bool:
+    """Check whether the frames of a row are stored.
+
+    Parameters
+    ----------
+    row : Row
+        A row of a manifest.
+
+    Returns
+    -------
+    bool
+        False for failed sources, and in a manifest without frames (``output.frames=false``).
+    """
+    return row["status"] == "ok" and bool(row["clean_xxh3"])
 
 
 # ------------------------------------------------------------------------------------------------------------- CSV

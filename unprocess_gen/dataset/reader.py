@@ -18,7 +18,7 @@ from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
 from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row, Value
 from unprocess_gen.dataset.keys import sample_key
-from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
+from unprocess_gen.dataset.manifest import has_frames, read_columns, read_row, rows_with_offsets
 from unprocess_gen.dataset.shards import (
     ArrayFormat,
     Member,
@@ -232,6 +232,11 @@ class _Dataset:
     def _is_pair(self, row: Row, split: str | None) -> bool:
         if row["status"] != "ok":
             return False
+        if not has_frames(row):
+            raise ConfigError(
+                f"{self.path}: has a manifest without frames (output.frames=false); expected stored frames; read it "
+                f"with ug.LivePairs, or store them: gen-dataset again {self.path} out=FOLDER output.frames=true"
+            )
         clean, targets = row["clean_dtype"] or row["dtype"], ", ".join(target_names(row)) or "no"
         self.formats.add((row["dtype"], clean, row["layout"], targets))
         self.splits.add(str(row["split"]))

@@ -73,4 +73,4 @@ def compare(folder: AnyPath, new_folder: AnyPath) -> str:
         raise DamageError(f"{new}: differs from {old}; check that the sources are the same")
     if old.stat().st_size == new.stat().st_size:
         return f"the same as {folder}, bit for bit"
-    return f"the same rows as {folder}, in its columns; {new} has columns of a later version too"
+    return f"the same rows as {folder}, in its cells; {new} has more, of frames or of a later version"

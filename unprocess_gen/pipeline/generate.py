@@ -104,6 +104,11 @@ class Summary:
         )
 
     @property
+    def has_frames(self) -> bool:
+        """False for a manifest without frames."""
+        return self.bytes > 0 or not self.pairs
+
+    @property
     def rows(self) -> int:
         """Pairs, failures and filtered images together."""
         return self.pairs + sum(self.failed.values()) + self.filtered
@@ -112,7 +117,8 @@ class Summary:
         """Describe the outcome in one line, for the command line."""
         failed = sum(self.failed.values())
         reasons = ", ".join(f"{count} {reason}" for reason, count in self.failed.items())
-        size = f"{self.pairs} pair{'s' * (self.pairs != 1)}, {self.bytes / 1e6:,.1f} MB"
+        stored = f"{self.bytes / 1e6:,.1f} MB" if self.has_frames else "no frames"
+        size = f"{self.pairs} pair{'s' * (self.pairs != 1)}, {stored}"
         failures = f"{failed} failed" + (f" ({reasons}; see {self.out}/manifest.csv)" if failed else "")
         if failed > max_failed:
             failures += f", more than source.max_failed={max_failed}"
@@ -120,8 +126,9 @@ class Summary:
             failures += f", {self.filtered} filtered (source.min_side)"
         if not self.made:
             return f"{self.out} is complete: {size}, {failures}; nothing to do"
+        after = f"gen-dataset report {self.out}" if self.has_frames else f'ug.LivePairs("{self.out}")'
         part = f" ({self.made} in this run)" if self.made < self.rows else ""
-        return f"{self.out}: {size}{part}, {self.seconds:.1f} s, {failures}; next: gen-dataset report {self.out}"
+        return f"{self.out}: {size}{part}, {self.seconds:.1f} s, {failures}; next: {after}"
 
 
 def generate(config: Config, label: str = "") -> Summary:

@@ -36,7 +36,14 @@ from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.columns import HEADERS, NAMES
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
-from unprocess_gen.dataset.manifest import plan_from_row, read_rows, readable_rows, rows_of_json, write_rows
+from unprocess_gen.dataset.manifest import (
+    has_frames,
+    plan_from_row,
+    read_rows,
+    readable_rows,
+    rows_of_json,
+    write_rows,
+)
 from unprocess_gen.dataset.shards import (
     ExpectedSample,
     ShardWriter,
@@ -122,7 +129,7 @@ class _Repair:
         yield from self._restore_manifest(config)
         names = set()
         for number, rows in shard_rows(self._manifest_file):
-            if pairs := [row for row in rows if row["status"] == "ok"]:
+            if pairs := [*filter(has_frames, rows)]:
                 names.add(shard_name(number))
                 yield from self._restore_shard(self._folder / "shards" / shard_name(number), pairs)
         for name in sorted((self._storage / "shards").entries().keys() - names):

@@ -25,7 +25,14 @@ from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
-from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, read_rows, rows_with_offsets
+from unprocess_gen.dataset.manifest import (
+    has_frames,
+    patch_from_row,
+    plan_from_row,
+    read_row,
+    read_rows,
+    rows_with_offsets,
+)
 from unprocess_gen.dataset.shards import arrays_of, target_names
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
@@ -56,6 +63,8 @@ class ReplayResult:
         Whether the source was changed or deleted, so that the row could not be checked.
     written : bool
         Whether the arrays were written.
+    compared : bool
+        False if the row has no digests.
     """
 
     key: str
@@ -63,6 +72,7 @@ class ReplayResult:
     complaint: str = ""
     source_changed: bool = False
     written: bool = False
+    compared: bool = True
 
     @property
     def exit_code(self) -> int:
@@ -161,15 +171,21 @@ def replay(
 ) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
-    Raises ConfigError if a row was made from a file and ``root`` is None, or ``to`` is inside a dataset or no folder;
-    MachineError if the self-test fails, or the arrays cannot be written.
+    Raises ConfigError if a row was made from a file and ``root`` is None, ``to`` is inside a dataset or no folder, or a
+    row has no digests and ``to`` is None; MachineError if the self-test fails, or the arrays cannot be written.
     """
     if to is not None:
         check_output_folder(to, f"--to {to}")
     regenerator = PairRegenerator(root, dark)
     for row in rows:
-        if row["status"] == "ok":
-            yield _replay(row, regenerator, to)
+        if row["status"] != "ok":
+            continue
+        if to is None and not has_frames(row):
+            raise ConfigError(
+                f"row {row['key']}: has no digests to compare, because its dataset has no frames "
+                "(output.frames=false); expected a manifest with digests; add --to FOLDER to write the arrays"
+            )
+        yield _replay(row, regenerator, to)
 
 
 def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayResult:
@@ -182,7 +198,8 @@ def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayRe
         return ReplayResult(key, source, str(error))
     if to is not None:
         _save(arrays, to, key)
-    return ReplayResult(key, source, _difference(arrays, row), written=to is not None)
+    compared = has_frames(row)
+    return ReplayResult(key, source, _difference(arrays, row) if compared else "", False, to is not None, compared)
 
 
 class PairRegenerator:

@@ -100,7 +100,7 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask], headers: int = S
     The estimate is exact if there are no more sources and all of them are pictures that decode.
     """
     sources = [source for task in tasks for source in task.sources]
-    if not sources:
+    if not sources or not config.output.frames:
         return SizeEstimate(0, 0)
     sizes = _sampled_bytes(config, sources, headers)
     if len(sizes) < len(sources):

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import NO_CLIP, Counts, Row, Source, Value
 from unprocess_gen.dataset.keys import group_by_image
+from unprocess_gen.dataset.manifest import has_frames
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.pairs import PairSettings
 
@@ -291,6 +292,8 @@ class Tally:
             self.failed[str(row["reason"])] = self.failed.get(str(row["reason"]), 0) + 1
             return
         self.pairs += 1
+        if not has_frames(row):
+            return
         self.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
         for name in COUNTS:
             self.sites[name] += int(row[name] or 0)

@@ -25,7 +25,7 @@ from unprocess_gen.core.types import Row, Value
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
-from unprocess_gen.dataset.manifest import read_columns, read_rows, row_json
+from unprocess_gen.dataset.manifest import has_frames, read_columns, read_rows, row_json
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 from unprocess_gen.dataset.shards import (
     ExpectedFrame,
@@ -121,7 +121,8 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
 def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
     """Check whether a new manifest has the rows of an older one, in every column that the older one has.
 
-    The reason ``too_small`` was ``unsupported`` up to version 0.2. Raises DamageError if a manifest cannot be read.
+    Empty cells of an older manifest without frames are not compared. The reason ``too_small`` was ``unsupported`` up to
+    version 0.2. Raises DamageError if a manifest cannot be read.
     """
     with suppress(OSError):  # reported below
         if file_sha256(old) == file_sha256(new):
@@ -132,7 +133,9 @@ def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
     for row, other in itertools.zip_longest(read_rows(old), read_rows(new), fillvalue=no_row):
         reasons = row.get("reason"), other.get("reason")
         same_reason = reasons[0] == reasons[1] or reasons == ("unsupported", "too_small")
-        if not same_reason or any(row.get(name) != other.get(name) for name in names if name != "reason"):
+        planned = row.get("status") == "ok" and not has_frames(row)  # cells of frames are empty
+        known = [name for name in names if name != "reason" and not (planned and row.get(name) in (None, ""))]
+        if not same_reason or any(row.get(name) != other.get(name) for name in known):
             return False
     return True
 
@@ -192,7 +195,7 @@ def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifes
     first = next(of_manifest, None)
     shards = _merged(listed, itertools.chain([] if first is None else [first], of_manifest))
     for number, rows in with_bar(shards, "shard", len(listed)):
-        pairs = [row for row in rows if row["status"] == "ok"]
+        pairs = [*filter(has_frames, rows)]
         if not pairs and number not in listed:
             continue
         path = folder / "shards" / shard_name(number)

@@ -18,16 +18,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import RESUME, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error, machine_errors
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
-from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
+from unprocess_gen.dataset.manifest import failed_row, has_frames, pair_row, row_json
 from unprocess_gen.dataset.shards import PER_PAIR, ShardWriter, arrays_of, shard_name, targets_cell
-from unprocess_gen.pipeline.pairs import plan_pixels
+from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels
 from unprocess_gen.pipeline.run_records import LIMIT, Deaths, commit_shard
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
@@ -104,7 +103,7 @@ def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source:
                 mark(source)
                 rows += make_image(context, task.shard, source, writer, log, read)
         busy.unlink(missing_ok=True)
-        if any(row["status"] == "ok" for row in rows):
+        if any(map(has_frames, rows)):
             return ShardResult(task.shard, str(path), writer.bytes, writer.sha256, tuple(rows), log=log)
         path.unlink()
         return ShardResult(task.shard, None, 0, None, tuple(rows), log=log)
@@ -135,13 +134,15 @@ def make_image(
     with log.times.adding("simulate_s"):
         image = plan_pixels(context.settings, photograph.srgb, source, sha256)
         noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
+    if not config.output.frames:
+        identity = sha256, photograph.orientation, shard
+        return _planned_rows(image, source, identity, noise_dn, config.source.patch is not None)
     log.failures.update(dict.fromkeys(_self_test(context, image.plans)))
-    is_cut = patch_rule(config.source) is not None
     rows: list[Row] = []
     sample: list[Row] = []
     targets: Targets = {}
     for patch, plan, pair in log.times.each_simulated(image.pairs()):
-        key = patch_key(source.index, patch, several=is_cut)
+        key = patch_key(source.index, patch, several=config.source.patch is not None)
         if plan is image.plans[0]:
             sample, targets, clean_xxh3 = [], {}, array_xxh3(pair.clean)
         digests = clean_xxh3, array_xxh3(pair.noisy)
@@ -159,6 +160,20 @@ def make_image(
             writer.add_rows(key, row_json(sample))
             rows += sample
     return rows
+
+
+def _planned_rows(
+    image: PlannedImage, source: Source, identity: tuple[str, int, int], noise_dn: float | None, several: bool
+) -> list[Row]:
+    """Return the rows of an image whose frames are not made; identity is the SHA-256, orientation and shard."""
+    return [
+        pair_row(
+            pair_key(patch_key(source.index, patch, several=several), plan, several=len(image.plans) > 1),
+            *(source, *identity, plan, None, ("", ""), patch, noise_dn),
+        )
+        for patch in image.patches
+        for plan in image.plans
+    ]
 
 
 def _check_not_deleted(config: Config, source: Source, error: SourceError) -> None:

@@ -163,6 +163,7 @@ def estimate_run(
         headers = _headers_read(config, sources)
         size = estimate_shards(config, tasks, headers).total
         growth = size / sampled_bytes if sampled_bytes else len(sources) / len(sample)
+    size = size if config.output.frames else 0
     folder = any_path(config.out).scratch_place("")[0]
     return RunEstimate(
         run,
@@ -239,7 +240,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     planned = plan_levels(image_config(config, *identity), *identity, image.facts, settings.dark_frames)
     levels, predictions = zip(*planned, strict=True)
     height, width = photograph.srgb.shape[:2]
-    clean_levels = 0
+    clean_levels, planned_s = 0, time.perf_counter() - started
     for patch, plan, pair in image.pairs():
         if not clean_levels and pair.clean.dtype == np.uint16:
             clean_levels = int(np.count_nonzero(np.bincount(pair.clean.reshape(-1))))
@@ -250,7 +251,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
             hashlib.sha256(frame.data)
     return SourceEstimate(
         source,
-        time.perf_counter() - started,
+        time.perf_counter() - started if config.output.frames else planned_s,
         source_bytes(config, source.name, height, width, 8 * photograph.srgb.itemsize),
         levels,
         predictions=predictions,
