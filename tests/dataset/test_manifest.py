@@ -37,7 +37,7 @@ from unprocess_gen.core.types import (
     SourcePlan,
 )
 from unprocess_gen.dataset import columns
-from unprocess_gen.dataset.columns import COLUMNS, FIRST, NAMES, NO_VIDEO, Range
+from unprocess_gen.dataset.columns import COLUMNS, FIRST, NAMES, NO_FRAMES, NO_VIDEO, Range
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
     JSON_BYTES,
@@ -183,7 +183,7 @@ UNMIXED = "there is no mixture, or the source failed"
 BY_DEFAULT = {
     NO_LIGHT,
     UNMIXED,
-    "exposure_ratio is 1",
+    "exposure_ratio is 1, or output.frames is false",
     "it is 0",
     "all are 1",
     "all are 0",
@@ -203,10 +203,12 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     passed = {"the status is ok"}
     same = "the clean array has the dtype of the noisy one, or the source failed"
     unassumed, unsplit = "no effect uses one, or effects.assumed is off", "there are no splits, or the source failed"
-    untargeted = "output.targets is empty, or the source failed"
+    untargeted = "output.targets is empty, output.frames is false, or the source failed"
     absent = {unassumed, unsplit, untargeted, same, *BY_DEFAULT}
     measured = pair_row("0" * 8, SOURCE, SHA256, 1, 0, PHYSICAL, PAIR, ("1" * 32, "2" * 32), PATCH, 1.5)
+    planned = pair_row("0" * 8, SOURCE, SHA256, 1, 0, PHYSICAL, None, ("", ""), PATCH)
     holding = {
+        "planned": (planned, passed | absent | {NO_FRAMES}),
         "pair": (row_of(PHYSICAL), passed | absent),
         "measured": (measured, passed | absent - {UNMEASURED}),
         "split": (row_of(PHYSICAL.replace(split="val")), passed | absent - {unsplit}),

@@ -182,6 +182,18 @@ def _check_not_among_photographs(to: Path, root: Root | None) -> None:
             )
 
 
+def export(call: Call) -> int:
+    """Write a dataset, or those of a sweep, in another format."""
+    from unprocess_gen.dataset.export import export as export_pairs
+    from unprocess_gen.pipeline.progress import with_bar
+
+    folder, form = dataset_folder(call, sweeps=True), call.values["format"]
+    for place, done in export_pairs(folder, form, Path(call.values["to"]), partial(with_bar, unit="shard")):
+        before = f", {done.present} written before" if done.present else ""
+        print_result(f"{place}: {counted(done.written, 'pair')} written as {form}{before}; rows in manifest.csv")
+    return 0
+
+
 def dng(call: Call) -> int:
     """Write frames as DNG files."""
     from unprocess_gen.dataset.dng import FRAMES, export

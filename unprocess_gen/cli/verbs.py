@@ -165,6 +165,23 @@ _VERBS = (
         DATASET,
     ),
     Verb(
+        "export",
+        "write a dataset or sweep in another format; a killed export is continued",
+        "reports.export",
+        (
+            _to("write to FOLDER", "FOLDER", required=True),
+            Argument(
+                ("--format",),
+                "files of NumPy or TIFF, HDF5, or LMDB",
+                "{npy,tiff,hdf5,lmdb}",
+                choices=("npy", "tiff", "hdf5", "lmdb"),
+                required=True,
+            ),
+        ),
+        Place("DIR", "the folder of a dataset or of a sweep"),
+        resumes=True,
+    ),
+    Verb(
         "again",
         "regenerate a dataset from its config.yaml in another folder, and compare",
         "runs.again",
