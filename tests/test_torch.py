@@ -12,7 +12,7 @@ import unprocess_gen as ug
 from unprocess_gen.core.types import Plan
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.simulation.reference import isp
-from unprocess_gen.simulation.reference.cfa import PATTERNS
+from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed; it is no dependency")
 from torch.utils.data import default_collate  # noqa: E402
@@ -53,7 +53,7 @@ def light_of(frame: np.ndarray, plan: Plan) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", LIMIT, ids=str)
 def test_one_batch_of_all_kinds_equals_the_reference(dtype: Any, pair: ug.RawPair) -> None:
-    plans = [with_look(pair, *case, PATTERNS[number % 4]) for number, case in enumerate(CASES)]
+    plans = [with_look(pair, *case, (*PATTERNS, MONO)[number % 5]) for number, case in enumerate(CASES)]
     stacked = default_collate([development_parameters(plan) for plan in plans])
     expected = np.stack([reference(pair.noisy, plan) for plan in plans])
     light = torch.from_numpy(light_of(pair.noisy, pair.plan)).to(dtype).expand(len(plans), 1, -1, -1)
@@ -72,7 +72,7 @@ def test_one_batch_of_all_kinds_equals_the_reference(dtype: Any, pair: ug.RawPai
 
 
 @pytest.mark.parametrize("highlight", HIGHLIGHTS)
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", [*PATTERNS, MONO])
 def test_planes_and_camera_rgb_equal_the_reference(pattern: str, highlight: str, pair: ug.RawPair) -> None:
     plan = with_look(pair, "smoothstep_gamma22", highlight, pattern)
     even = pair.noisy[:32]

@@ -20,8 +20,10 @@ from torch import Tensor
 from unprocess_gen.core.types import Plan, Value
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.simulation.reference import isp
-from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites, tile
-from unprocess_gen.simulation.reference.colour import invert
+from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS, plane_sites, tile
+
+FILTERS = (*PATTERNS, MONO)
+"""Patterns by their positions in `DevelopmentParameters`."""
 
 SRGB = 0.0
 """Value of gamma that means the piecewise curve of sRGB."""
@@ -39,7 +41,7 @@ class DevelopmentParameters(NamedTuple):
     Attributes
     ----------
     pattern, highlight, tone : ndarray of int64, []
-        Positions in ``cfa.PATTERNS``, ``isp.HIGHLIGHTS`` and ``isp.TONES``.
+        Positions in `FILTERS`, ``isp.HIGHLIGHTS`` and ``isp.TONES``.
     gamma : ndarray of float64, []
         Exponent; 0 for the curve of sRGB.
     levels_dn : ndarray of float64, [2]
@@ -83,7 +85,7 @@ def development_parameters(row: Mapping[str, Value] | Plan) -> DevelopmentParame
     """
     plan = row if isinstance(row, Plan) else plan_from_row(row)
     values = (
-        PATTERNS.index(plan.sensor.pattern),
+        FILTERS.index(plan.sensor.pattern),
         list(isp.HIGHLIGHTS).index(plan.camera.highlight),
         list(isp.TONES).index(plan.isp.tone),
         SRGB if plan.isp.gamma == "srgb" else float(plan.isp.gamma),
@@ -91,7 +93,7 @@ def development_parameters(row: Mapping[str, Value] | Plan) -> DevelopmentParame
         float(plan.scene.exposure_ratio),
         float(plan.camera.highlight_threshold),
         np.array(plan.camera.inverse_gains),
-        np.array(invert(plan.camera.rgb2cam)).reshape(3, 3),
+        np.array(isp.cam2rgb(plan)).reshape(3, 3),
     )
     return DevelopmentParameters(*map(np.asarray, values))
 
@@ -192,7 +194,7 @@ def _develop(
 ) -> Tensor:
     """Develop frames of one kind, as `isp.develop` does."""
     light = light * exposure_ratio[:, None, None, None]
-    pattern, highlight = PATTERNS[kind.pattern], list(isp.HIGHLIGHTS)[kind.highlight]
+    pattern, highlight = FILTERS[kind.pattern], list(isp.HIGHLIGHTS)[kind.highlight]
     apply_gains, threshold, k = HIGHLIGHTS[highlight], threshold[:, None, None, None], inverse_gains[:, :, None, None]
     if light.shape[1] == 4:
         order = [plane_sites(pattern).index((y, x)) for y in (0, 1) for x in (0, 1)]
@@ -216,6 +218,8 @@ def _develop(
 def _demosaic(values: Tensor, pattern: str) -> Tensor:
     """Interpolate the missing channels, [N, 1, H, W] to [N, 3, H, W], as `isp.demosaic` does."""
     height, width = values.shape[2:]
+    if pattern == MONO:
+        return values.expand(-1, 3, -1, -1)
     padded = values[:, 0, _mirrored(height)][:, :, _mirrored(width)]
     image, sites = values.new_empty((len(values), 3, height, width)), tile(pattern)
     for y in (0, 1):

@@ -29,7 +29,12 @@ NEIGHBOURS = {
 
 
 def plane_names(pattern: str) -> list[str]:
-    """Names of the planes in the order of the tile: R, B, and Gr or Gb for green next to red or blue."""
+    """Names of the planes in the order of the tile: R, B, and Gr or Gb for green next to red or blue.
+
+    Without filters, row and column in the tile.
+    """
+    if pattern == "MONO":
+        return ["00", "01", "10", "11"]
     rows = pattern[:2], pattern[2:]
     return [colour if colour != "G" else "Gr" if "R" in row else "Gb" for row in rows for colour in row]
 

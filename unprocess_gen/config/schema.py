@@ -208,7 +208,7 @@ class SensorConfig(Group):
     white_level_dn
         white level, the value at saturation
     pattern
-        CFA pattern of the top-left 2x2 sites, row by row
+        CFA pattern of the top-left 2x2 sites, row by row; MONO has no filters: sites record the mean of the channels
     clip
         clipping of noisy frames: sensor at 0 and 2^bits - 1, black at the black level instead of 0, none only
         with float32
@@ -227,7 +227,7 @@ class SensorConfig(Group):
     bits: int = key(12, Integers(1, 16))
     black_level_dn: int = key(240, limits.BLACK_LEVEL, unit="DN")
     white_level_dn: int = key(4095, limits.WHITE_LEVEL, unit="DN")
-    pattern: str = key("RGGB", Choice("RGGB", "BGGR", "GRBG", "GBRG"))
+    pattern: str = key("RGGB", Choice("RGGB", "BGGR", "GRBG", "GBRG", "MONO"))
     clip: str = key("sensor", Choice("sensor", "black", "none"))
     saturated: str = key("noisy", Choice("noisy", "pinned", "white", "auto"))
     dark_offset: str = key("removed", Choice("removed", "kept"))

@@ -46,7 +46,7 @@ from unprocess_gen.dataset.manifest import plan_from_row, without_empty
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.simulation.effects import dark_variance_dn2
-from unprocess_gen.simulation.reference.cfa import CHANNELS
+from unprocess_gen.simulation.reference.cfa import CHANNELS, MONO
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 from unprocess_gen.simulation.reference.sensor import quantise
 
@@ -138,6 +138,9 @@ def _writable(row: Row) -> Row:
         raise ConfigError(
             f"--keys {key}: has {row['dtype']} values, which LibRaw would round; a DNG needs output.dtype={UINT16}"
         )
+    if row["pattern"] == MONO:
+        problem = "has no colour filters, and raw converters differ in what they open as such a DNG"
+        raise ConfigError(f"--keys {key}: pattern=MONO: {problem}; expected a Bayer pattern; use gen-dataset export")
     if min(width, height) < LEAST_SIDE_PX:
         raise ConfigError(
             f"--keys {key}: is {width} x {height}; LibRaw, which most raw converters read with, opens no DNG with a "

@@ -19,7 +19,8 @@ def pack(mosaic: Frame, pattern: str) -> Frame:
     mosaic : ndarray, [H, W]
         Frame or crop that begins at an even row and column; even height and width.
     pattern : str
-        CFA pattern of its first four sites: RGGB, BGGR, GRBG or GBRG; in a row, ``pattern``.
+        CFA pattern of its first four sites: RGGB, BGGR, GRBG or GBRG; in a row, ``pattern``. With MONO, the planes are
+        the four sites of each 2x2 tile, row by row.
 
     Returns
     -------

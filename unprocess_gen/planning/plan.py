@@ -32,6 +32,7 @@ from unprocess_gen.planning.effect_selection import (
 from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains, chromaticity
 from unprocess_gen.simulation.reference.sensor import noise_in_dn
 
@@ -232,7 +233,20 @@ class Planner:
         if self._lights:
             light, cct_k, (red, blue) = draw_light(self._lights, xyz2cam(self._camera, weights), uniforms)
         inverse_rgb = draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB])
-        return types.CameraPlan(name, weights, rgb2cam, red, blue, inverse_rgb, *self._highlight, light, cct_k)
+        camera = types.CameraPlan(name, weights, rgb2cam, red, blue, inverse_rgb, *self._highlight, light, cct_k)
+        return without_filters(camera) if self._sensor.pattern == MONO else camera
+
+
+def without_filters(camera: types.CameraPlan) -> types.CameraPlan:
+    """Return a camera whose channels are equal: each is the mean of the three, gains included.
+
+    Highlights are kept as those of the mean, whose gain is the mean of the three.
+    """
+    gains, rgb2cam = camera.inverse_gains, camera.rgb2cam
+    sums = [sum(gain * rgb2cam[3 * row + column] for row, gain in enumerate(gains)) for column in range(3)]
+    red, green, blue = (value / sum(sums) for value in sums)
+    rows = red, green, blue, red, green, blue, red, green, blue
+    return replace(camera, rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=sum(gains) / 3)
 
 
 NoiseAndSelection = tuple[types.NoisePlan, Selection | None]

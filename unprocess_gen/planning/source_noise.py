@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.simulation.reference.cfa import filters
 from unprocess_gen.simulation.reference.unprocess import camera_light
 
 TILE = 32
@@ -91,7 +92,7 @@ def noise_ratio(srgb: Srgb, plan: Plan) -> float | None:
 def _green_sites(srgb: Srgb, pattern: str) -> Srgb:
     """Return the pixels at the first green site of each 2x2 tile of the CFA, [N, TILE / 2, TILE / 2, 3]."""
     height, width = srgb.shape[:2]
-    top, left = divmod(pattern.index("G"), 2)
+    top, left = divmod(filters(pattern).index("G"), 2)
     inside = np.arange(0, TILE, 2)
     rows, columns = _starts(height)[:, None] + (inside + top), _starts(width)[:, None] + (inside + left)
     tiles: Srgb = srgb[rows[:, None, :, None], columns[None, :, None, :]].reshape(-1, TILE // 2, TILE // 2, 3)

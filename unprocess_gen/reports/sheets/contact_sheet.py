@@ -40,7 +40,7 @@ from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs
 from unprocess_gen.reports.sheets.panels import Mosaic, Picture, SheetPanel, Window
 from unprocess_gen.simulation.reference import unprocess
-from unprocess_gen.simulation.reference.cfa import mosaic
+from unprocess_gen.simulation.reference.cfa import MONO, mosaic
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
 
 PNG_HEADER_BYTES = 33
@@ -278,7 +278,7 @@ def _image_panel(title: str, note: str, overview: Float, detail: Float) -> Sheet
 
 def _mosaic_panel(title: str, plan: Plan, overview: Float, detail: Float) -> SheetPanel:
     """Panel of a mosaic, of which the overview has the mean of each colour ``[h, w, 3]``."""
-    shares = 0.25, 0.5, 0.25  # of the sites of a tile
+    shares = (1.0, 1.0, 1.0) if plan.sensor.pattern == MONO else (0.25, 0.5, 0.25)  # of the sites of a tile
     shown, sites = (np.sqrt(np.clip(light, 0, 1)) for light in (overview, detail))
     panel = _image_panel(title, plan.sensor.pattern, overview, detail)
     return panel._replace(overview=shown * shares, detail=panels.colour_sites(sites, plan.sensor.pattern))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float, Frame
-from unprocess_gen.simulation.reference.cfa import tile
+from unprocess_gen.simulation.reference.cfa import MONO, tile
 
 Picture = NDArray[np.uint8]
 
@@ -72,12 +72,16 @@ def planes_to_rgb(planes: Float, pattern: str) -> Float:
 
     Nothing is interpolated: a demosaicking filter would add colour to every edge.
     """
+    if pattern == MONO:
+        return np.repeat(planes.mean(axis=-1, keepdims=True), 3, axis=-1)
     filters = np.ravel(tile(pattern))
     return np.stack([planes[..., filters == channel].mean(axis=-1) for channel in range(3)], axis=-1)
 
 
 def colour_sites(values: Float, pattern: str) -> Float:
     """Put each value of a mosaic ``[H, W]`` into the channel of its filter, ``[H, W, 3]``; other channels are 0."""
+    if pattern == MONO:
+        return np.repeat(values[..., np.newaxis], 3, axis=-1)
     image = np.zeros((*values.shape, 3))
     for (y, x), channel in np.ndenumerate(np.array(tile(pattern))):
         image[y::2, x::2, channel] = values[y::2, x::2]

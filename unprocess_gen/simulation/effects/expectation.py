@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.exact_distributions import LOGISTIC, tukey_std
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
+from unprocess_gen.simulation.reference.cfa import tile
 from unprocess_gen.simulation.reference.noise import is_among
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ class Site(NamedTuple):
         if plan.noise.physics is None:
             return plan.noise.a_dn if plan.noise.counts_electrons else 0.0
         relative = plan.noise.physics.gain_by_colour if "gain_by_colour" in plan.noise.effects else (1.0, 1.0, 1.0)
-        return plan.noise.physics.dn_per_e * relative["RGB".index(plan.sensor.pattern[2 * y + x])]
+        return plan.noise.physics.dn_per_e * relative[tile(plan.sensor.pattern)[y][x]]
 
 
 @functools.lru_cache(maxsize=8)

@@ -8,6 +8,7 @@ from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.numbers import Numbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.reference.cfa import tile
 
 COLOURS = ("red", "green", "blue")
 
@@ -39,8 +40,8 @@ class GainByColour(Effect):
     since = "0.2"
 
     def plane_gains(self, plan: Plan) -> tuple[float, ...]:
-        """Return the gain of the colour of each site of the tile."""
-        return tuple(plan.physics.gain_by_colour["RGB".index(colour)] for colour in plan.sensor.pattern)
+        """Return the gain of the colour of each site of the tile; that of green for a sensor without filters."""
+        return tuple(plan.physics.gain_by_colour[channel] for row in tile(plan.sensor.pattern) for channel in row)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict a change of the shot noise: its standard deviation differs by a factor √gain."""

@@ -14,6 +14,9 @@ CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """Filters of the sites (0, 0), (0, 1), (1, 0), (1, 1), in the order of the DNG tag CFAPattern."""
 
+MONO = "MONO"
+"""The pattern of a sensor without colour filters: all sites record the mean of the channels (`planning.plan`)."""
+
 ONE_COLOUR = ("RRRR", "GGGG", "BBBB")
 """Patterns with the same filter at all sites; no sensor has them."""
 
@@ -24,21 +27,21 @@ def filters(pattern: str) -> str:
     Parameters
     ----------
     pattern : str
-        One of `PATTERNS` or `ONE_COLOUR`.
+        One of `PATTERNS` or `ONE_COLOUR`, or `MONO`.
 
     Returns
     -------
     str
-        Four letters.
+        Four letters; green for `MONO`, whose channels are equal.
 
     Raises
     ------
     ValueError
         If the pattern is unknown.
     """
-    if pattern not in PATTERNS + ONE_COLOUR:
-        raise ValueError(f"pattern={pattern}: unknown CFA pattern; expected one of {', '.join(PATTERNS)}")
-    return pattern
+    if pattern not in (*PATTERNS, *ONE_COLOUR, MONO):
+        raise ValueError(f"pattern={pattern}: unknown CFA pattern; expected one of {', '.join((*PATTERNS, MONO))}")
+    return "GGGG" if pattern == MONO else pattern
 
 
 def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -125,7 +128,7 @@ def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[i
     >>> plane_sites("GBRG")
     ((1, 0), (1, 1), (0, 0), (0, 1))
     """
-    if pattern in ONE_COLOUR:
+    if pattern in (*ONE_COLOUR, MONO):
         return (0, 0), (0, 1), (1, 0), (1, 1)
     sites = tile(pattern, origin)
     red = next((y, x) for y in (0, 1) for x in (0, 1) if sites[y][x] == 0)

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 
 from unprocess_gen.core.types import Float, Frame, Plan
-from unprocess_gen.simulation.reference.cfa import mosaic, tile
-from unprocess_gen.simulation.reference.colour import invert
+from unprocess_gen.simulation.reference.cfa import MONO, mosaic, tile
+from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert
 
 MAX_ITERATIONS = 200
 """Limit of the searches below, which need fewer: bisection ends after at most 64 steps, Newton's method at least halves
@@ -48,9 +48,25 @@ def process(camera_light: Float, plan: Plan) -> Float:
 
 def render(camera_rgb: Float, plan: Plan) -> Float:
     """Apply matrix, gamma and tone curve to white-balanced camera RGB, [H, W, 3]; returns values in [0, 1]."""
-    image = camera_rgb @ np.array(invert(plan.camera.rgb2cam)).reshape(3, 3).T
+    image = camera_rgb @ np.array(cam2rgb(plan)).reshape(3, 3).T
     image = compress_gamma(np.clip(image, 0, 1), plan.isp.gamma)
     return TONES[plan.isp.tone](image)
+
+
+def cam2rgb(plan: Plan) -> Matrix:
+    """Return the matrix from camera RGB to linear sRGB; the identity for a sensor without colour filters.
+
+    Parameters
+    ----------
+    plan : Plan
+        Parameters of the pair.
+
+    Returns
+    -------
+    tuple of nine floats
+        Matrix, row by row.
+    """
+    return IDENTITY if plan.sensor.pattern == MONO else invert(plan.camera.rgb2cam)
 
 
 def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
@@ -68,8 +84,9 @@ def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) ->
     Returns
     -------
     ndarray of float64, [H, W, 3]
-        Display-referred values in [0, 1]. Values below black and above white are preserved up to the colour matrix and
-        clipped after it. Saturated light, noise and fixed patterns are not restored.
+        Display-referred values in [0, 1]; equal channels with the pattern ``MONO``. Values below black and above white
+        are preserved up to the colour matrix and clipped after it. Saturated light, noise and fixed patterns are not
+        restored.
 
     Raises
     ------
@@ -151,7 +168,7 @@ def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> F
     values : ndarray of float64, [H, W]
         Mosaic of at least 2 x 2 sites.
     pattern : str
-        One of `cfa.PATTERNS`.
+        One of `cfa.PATTERNS`, or `cfa.MONO`, whose channels are all equal to the values.
     origin : (int, int)
         Row and column of ``values[0, 0]`` in the full frame.
 
@@ -169,6 +186,8 @@ def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> F
     """
     if min(values.shape) < 2:
         raise ValueError(f"mosaic={list(values.shape)}: channels are missing; expected at least 2 x 2 sites")
+    if pattern == MONO:
+        return np.repeat(values[..., np.newaxis], 3, axis=2)
     interpolated = {name: _filter(values, kernel) for name, kernel in KERNELS.items()}
     image = np.empty((*values.shape, 3))
     sites = tile(pattern, origin)
