@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.files import file_sha256
-from unprocess_gen.sources.mosaics import RAW_FILES, SUFFIXES, even_sides, read_mosaic
-from unprocess_gen.sources.raw_metadata import read_metadata
+from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES
+from unprocess_gen.sources.mosaics import even_sides, read_mosaic
+from unprocess_gen.sources.raw.metadata import read_metadata
 
 LIST, EMVA = "captures.csv", "EMVA1288_Data.txt"
 REQUIRED = ("file", "kind", "iso")

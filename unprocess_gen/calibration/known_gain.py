@@ -19,7 +19,7 @@ from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.suggestions import did_you_mean
 from unprocess_gen.planning.noise_profile import number
-from unprocess_gen.sources.raw_metadata import read_tags
+from unprocess_gen.sources.raw.metadata import read_tags
 
 UNKNOWN_INTERVAL = (-math.inf, math.inf)
 

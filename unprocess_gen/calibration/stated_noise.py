@@ -20,8 +20,8 @@ from unprocess_gen.calibration.iso_laws import Precision, gain_law, rounded, std
 from unprocess_gen.calibration.profile import MARK, Named, head, provenance_lines, yaml_text
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.files import file_sha256
-from unprocess_gen.sources.mosaics import RAW_FILES
-from unprocess_gen.sources.raw_metadata import RawMetadata, read_tags
+from unprocess_gen.core.raw_files import RAW_FILES
+from unprocess_gen.sources.raw.metadata import RawMetadata, read_tags
 
 FORM = "calibrate --from noise_profile"
 STATED = Precision(close=3e-8, digits=12)

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from unprocess_gen.config.interpretation import run_iso, shading_place, uses_dark_frames
 from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
+from unprocess_gen.core.raw_files import SUFFIXES
 from unprocess_gen.core.types import DarkFrame, DarkFrames, DarkShading, Raw
 from unprocess_gen.sources import dark_shading, mosaics
-from unprocess_gen.sources.mosaics import SUFFIXES, Mosaic, mosaic_sha256, read_mosaic
+from unprocess_gen.sources.mosaics import Mosaic, mosaic_sha256, read_mosaic
 
 KEY = "noise.dark_frames"
 

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
-from unprocess_gen.sources.mosaics import SUFFIXES, even_sides, map_mosaic, mosaic_sha256, read_mosaic
+from unprocess_gen.core.raw_files import SUFFIXES
+from unprocess_gen.sources.mosaics import even_sides, map_mosaic, mosaic_sha256, read_mosaic
 
 KEY = "noise.dark_shading"
 

@@ -12,14 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.libraries import require
-
-PICTURES = (".png", ".tif", ".tiff")
-RAW_FILES = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".raf", ".rw2")
-"""Suffixes that LibRaw decodes (extra ``raw``)."""
-SUFFIXES = (".npy", *PICTURES, *RAW_FILES)
+from unprocess_gen.core.raw_files import RAW_FILES
+from unprocess_gen.sources.raw.decode import decode_raw
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,25 +86,22 @@ def _check_array(path: Path, key: str, pixels: NDArray[Any], numbers: bool) -> N
 
 
 def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
-    """Decode a raw file with LibRaw: the visible part of the mosaic."""
+    """Decode a raw file: the visible part of the mosaic."""
     require("rawpy", f"{key}: {path} is a raw file, which needs rawpy", "raw", ", or convert the frames to NPY")
-    import rawpy
-
     try:
-        with rawpy.imread(io.BytesIO(content)) as raw:
-            pixels, colours = raw.raw_image_visible.copy(), raw.raw_colors_visible[:2, :2].ravel()
-            names = raw.color_desc.decode("ascii")
-            blacks = {int(raw.black_level_per_channel[colour]) for colour in colours}
-    except rawpy.LibRawError as error:
-        raise ConfigError(f"{key}: {path} cannot be decoded ({error})") from error
-    if pixels.ndim != 2 or pixels.dtype != np.uint16:
+        frame = decode_raw(content)
+    except SourceError as error:
+        raise ConfigError(f"{key}: {path} {error.text}") from error
+    facts = frame.metadata
+    blacks = set(facts.black_dn or ())
+    if frame.colours.shape != (2, 2) or not blacks:
         raise ConfigError(f"{key}: {path} holds no Bayer mosaic; expected one")
     if len(blacks) > 1:
         raise ConfigError(
-            f"{key}: {path} states the black levels {', '.join(map(str, sorted(blacks)))}; expected one; "
+            f"{key}: {path} states the black levels {', '.join(f'{one:g}' for one in sorted(blacks))}; expected one; "
             "convert the frames to NPY, and set noise.dark_frames_black_dn"
         )
-    return Mosaic(pixels, float(blacks.pop()), "".join(names[colour] for colour in colours))
+    return Mosaic(frame.pixels, blacks.pop(), facts.pattern)
 
 
 # ------------------------------------------------------------------------------------------------------------ digests

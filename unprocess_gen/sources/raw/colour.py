@@ -1,0 +1,144 @@
+"""Compute the matrix and the gains of a camera at the white point of a frame, as the DNG specification describes it.
+
+DNG Specification 1.4, chapter 6: XYZ → camera is AnalogBalance · CameraCalibration · ColorMatrix, in which the last two
+are interpolated between two lights by the reciprocal of the colour temperature. Where it is silent (temperature of a
+chromaticity, order of the search), Adobe's DNG SDK 1.4 is followed. Only + − × ÷ and √ are used: rows have the result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert, matrix, multiply
+
+XY = tuple[float, float]
+"""CIE 1931 chromaticity."""
+Neutral = tuple[float, float, float]
+"""Camera values of a neutral surface."""
+
+D50: XY = (0.3457, 0.3585)
+"""Chromaticity at which the search for the white point begins (dng_color_spec::NeutralToXY)."""
+STEPS, CLOSE = 30, 1e-7
+"""Most steps of the search, and the distance at which it ends."""
+
+LIGHT_K = {
+    **dict.fromkeys((3, 17), 2850.0), 24: 3200.0, 23: 5000.0, **dict.fromkeys((1, 4, 9, 18, 20), 5500.0),
+    **dict.fromkeys((10, 19, 21), 6500.0), **dict.fromkeys((11, 22), 7500.0), 12: 6400.0, 13: 5050.0,
+    **dict.fromkeys((2, 14), 4150.0), 15: 3525.0, 16: 2925.0,
+}  # fmt: skip
+"""Colour temperature of each EXIF LightSource (dng_camera_profile::IlluminantToTemperature)."""
+
+_ISOTHERMS = (
+    (0, 0.18006, 0.26352, -0.24341), (10, 0.18066, 0.26589, -0.25479), (20, 0.18133, 0.26846, -0.26876),
+    (30, 0.18208, 0.27119, -0.28539), (40, 0.18293, 0.27407, -0.30470), (50, 0.18388, 0.27709, -0.32675),
+    (60, 0.18494, 0.28021, -0.35156), (70, 0.18611, 0.28342, -0.37915), (80, 0.18740, 0.28668, -0.40955),
+    (90, 0.18880, 0.28997, -0.44278), (100, 0.19032, 0.29326, -0.47888), (125, 0.19462, 0.30141, -0.58204),
+    (150, 0.19962, 0.30921, -0.70471), (175, 0.20525, 0.31647, -0.84901), (200, 0.21142, 0.32312, -1.0182),
+    (225, 0.21807, 0.32909, -1.2168), (250, 0.22511, 0.33439, -1.4512), (275, 0.23247, 0.33904, -1.7298),
+    (300, 0.24010, 0.34308, -2.0637), (325, 0.24702, 0.34655, -2.4681), (350, 0.25591, 0.34951, -2.9641),
+    (375, 0.26400, 0.35200, -3.5814), (400, 0.27218, 0.35407, -4.3633), (425, 0.28039, 0.35577, -5.3762),
+    (450, 0.28863, 0.35714, -6.7262), (475, 0.29685, 0.35823, -8.5955), (500, 0.30505, 0.35907, -11.324),
+    (525, 0.31320, 0.35968, -15.628), (550, 0.32129, 0.36011, -23.325), (575, 0.32931, 0.36038, -40.770),
+    (600, 0.33724, 0.36051, -116.45),
+)  # fmt: skip
+"""Mired, u, v (CIE 1960) and slope of isotemperature lines (Robertson 1968; Wyszecki and Stiles, 2nd edition, p. 228).
+The u of 325 mired is 0.24702, as printed and as in the DNG SDK, so that readers agree."""
+
+
+@dataclass(frozen=True, slots=True)
+class DngColour:
+    """Colour tags of a DNG.
+
+    Attributes
+    ----------
+    matrices : tuple of Matrix
+        ColorMatrix1, and ColorMatrix2 if there is one.
+    lights_k : tuple of float
+        Colour temperatures of their CalibrationIlluminants; 0 if unknown.
+    calibrations : tuple of Matrix
+        CameraCalibration1 and 2.
+    balance : tuple of three floats
+        AnalogBalance.
+    neutral : Neutral or None
+        AsShotNeutral.
+    white_xy : XY or None
+        AsShotWhiteXY.
+    """
+
+    matrices: tuple[Matrix, ...]
+    lights_k: tuple[float, ...]
+    calibrations: tuple[Matrix, ...] = (IDENTITY, IDENTITY)
+    balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    neutral: Neutral | None = None
+    white_xy: XY | None = None
+
+    def matrix_at(self, white: XY) -> Matrix:
+        """Return the matrix from XYZ to the camera at a white point; the first one if only one light is known."""
+        if len(self.matrices) == 1 or not all(self.lights_k) or self.lights_k[0] == self.lights_k[1]:
+            mixed, calibration = self.matrices[0], self.calibrations[0]
+        else:
+            low, high = sorted(range(2), key=lambda n: self.lights_k[n])
+            mired, warm, cold = (1 / kelvin for kelvin in (temperature(white), self.lights_k[low], self.lights_k[high]))
+            share = min(max((mired - cold) / (warm - cold), 0.0), 1.0)
+            mixed, calibration = (
+                matrix([share * a + (1 - share) * b for a, b in zip(pair[low], pair[high], strict=True)])
+                for pair in (self.matrices, self.calibrations)
+            )
+        calibrated = multiply(calibration, mixed)
+        return matrix([self.balance[place // 3] * entry for place, entry in enumerate(calibrated)])
+
+    def white(self) -> XY:
+        """Return the white point of the frame: AsShotWhiteXY, that of AsShotNeutral, or D50 without both."""
+        if self.white_xy is not None or self.neutral is None:
+            return self.white_xy or D50
+        last = before = D50
+        for _ in range(STEPS):
+            before, last = last, _xy(_apply(invert(self.matrix_at(last)), self.neutral))
+            if abs(last[0] - before[0]) + abs(last[1] - before[1]) < CLOSE:
+                return last
+        return (last[0] + before[0]) / 2, (last[1] + before[1]) / 2
+
+    def gains(self) -> tuple[float, float] | None:
+        """Return the gains of red and blue that make the white point gray; None if no tag states it."""
+        neutral = self.neutral
+        if neutral is None:
+            if self.white_xy is None:
+                return None
+            x, y = self.white_xy
+            neutral = _apply(self.matrix_at(self.white_xy), (x / y, 1.0, (1 - x - y) / y))
+        return neutral[1] / neutral[0], neutral[1] / neutral[2]
+
+
+def temperature(white: XY) -> float:
+    """Return the correlated colour temperature of a chromaticity, kelvin, between 1667 and 100,000.
+
+    The reciprocal is interpolated between two isotemperature lines by the distances from them.
+    """
+    scale = 1.5 - white[0] + 6.0 * white[1]
+    u, v = 2.0 * white[0] / scale, 3.0 * white[1] / scale
+    last = 0.0
+    for number in range(1, len(_ISOTHERMS)):
+        mired, u0, v0, slope = _ISOTHERMS[number]
+        distance = ((v - v0) - slope * (u - u0)) / math.sqrt(1.0 + slope * slope)
+        if distance <= 0.0 or number == len(_ISOTHERMS) - 1:
+            below = -min(distance, 0.0)
+            share = 0.0 if number == 1 else below / (last + below)
+            return 1e6 / max(_ISOTHERMS[number - 1][0] * share + mired * (1 - share), 10.0)
+        last = distance
+    raise AssertionError("the last line returns")
+
+
+def _apply(entries: Matrix, vector: Sequence[float]) -> Neutral:
+    red, green, blue = (
+        entries[row] * vector[0] + entries[row + 1] * vector[1] + entries[row + 2] * vector[2] for row in (0, 3, 6)
+    )
+    return red, green, blue
+
+
+def _xy(xyz: Neutral) -> XY:
+    total = xyz[0] + xyz[1] + xyz[2]
+    if not (total > 0 and xyz[1] > 0):
+        raise ValueError("the white point has no chromaticity")
+    return xyz[0] / total, xyz[1] / total

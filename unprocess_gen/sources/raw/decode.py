@@ -1,0 +1,104 @@
+"""Decode the mosaic of a raw file: with LibRaw, or with tifffile where LibRaw lacks the compression (JPEG XL)."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.errors import SourceError
+from unprocess_gen.core.libraries import require
+from unprocess_gen.sources.raw.metadata import (
+    CFA,
+    JPEG_XL,
+    RawMetadata,
+    decoder_facts,
+    decoder_message,
+    tags_of,
+)
+
+MOST_PATTERN = 6
+"""Side of the largest CFA tile, that of X-Trans."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """Visible part of a mosaic, and what its file states.
+
+    Attributes
+    ----------
+    pixels : ndarray of uint16, [H, W]
+        DN, without masked borders.
+    colours : ndarray of uint8, [2, 2] or [6, 6]
+        Colour of the sites of the top-left tile: 0 red, 1 green, 2 blue, 3 the green of the blue rows.
+    metadata : RawMetadata
+        Facts; levels and pattern are those of the visible part.
+    """
+
+    pixels: NDArray[np.uint16]
+    colours: NDArray[np.uint8]
+    metadata: RawMetadata
+
+
+def decode_raw(content: bytes, max_pixels: int = 2**40) -> RawFrame:
+    """Decode the bytes of a raw file.
+
+    Raises SourceError if they are damaged or no mosaic, and ConfigError if a library is missing.
+    """
+    for library in ("tifffile", "rawpy"):
+        require(library, f"raw files need {library}", "raw", ", or convert the frames to NPY")
+    facts = tags_of(content)
+    decode = _decode_jpeg_xl if facts.compression == JPEG_XL else _decode_with_libraw
+    return decode(content, facts, max_pixels)
+
+
+def _decode_with_libraw(content: bytes, facts: RawMetadata, max_pixels: int) -> RawFrame:
+    import rawpy
+
+    try:
+        with rawpy.imread(io.BytesIO(content)) as raw:
+            _check_size(raw.sizes.width, raw.sizes.height, max_pixels)
+            if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
+                raise SourceError("unsupported", "contains no mosaic (LibRaw); expected red, green and blue sites")
+            side = len(raw.raw_pattern)
+            if side > MOST_PATTERN or raw.num_colors != 3:
+                raise SourceError("unsupported", f"has a CFA of {side} x {side} sites and {raw.num_colors} colours")
+            colours = raw.raw_colors_visible[:side, :side].copy()
+            return RawFrame(raw.raw_image_visible.copy(), colours, facts.completed(decoder_facts(raw)))
+    except rawpy.LibRawError as error:
+        raise SourceError("corrupt", f"cannot be decoded by LibRaw ({decoder_message(error)})") from error
+
+
+def _decode_jpeg_xl(content: bytes, facts: RawMetadata, max_pixels: int) -> RawFrame:
+    """Decode a DNG 1.7 whose mosaic is stored as interleaved fields, each compressed with JPEG XL."""
+    require("imagecodecs", "DNG files with JPEG XL need imagecodecs", "jxl", ", or convert them with another codec")
+    import tifffile
+
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        pages = (page for first in file.pages for page in (first, *(first.pages or ())))
+        page: Any = next(page for page in pages if page.tags.valueof(262) == CFA)
+        height, width = page.shape
+        _check_size(width, height, max_pixels)
+        rows, columns = (int(page.tags.valueof(code) or 1) for code in (50975, 52547))
+        try:
+            stored = page.asarray()
+        except Exception as error:  # imagecodecs has no common class of errors
+            raise SourceError("corrupt", f"its JPEG XL tiles cannot be decoded ({error})") from error
+        fields = stored.reshape(rows, height // rows, columns, width // columns)
+        top, left, bottom, right = page.tags.valueof(50829) or (0, 0, height, width)
+        pixels = fields.transpose(1, 0, 3, 2).reshape(height, width)[top:bottom, left:right]
+        tile = np.frombuffer(page.tags.valueof(33422), np.uint8)
+    if pixels.dtype != np.uint16 or tile.size != 4 or tile.max() > 2:
+        raise SourceError("unsupported", f"is a mosaic of {pixels.dtype} and {tile.size} sites; expected uint16 and 4")
+    colours = tile.reshape(2, 2)
+    # CFAPattern begins at the corner of the active area (DNG specification, ActiveArea)
+    pattern = "".join("RGB"[one] for one in tile)
+    return RawFrame(np.ascontiguousarray(pixels), colours, replace(facts, pattern=pattern).completed(RawMetadata()))
+
+
+def _check_size(width: int, height: int, max_pixels: int) -> None:
+    if width * height > max_pixels:
+        raise SourceError("too_large", f"has {width} x {height} pixels; expected source.max_pixels={max_pixels}")

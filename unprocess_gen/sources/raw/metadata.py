@@ -1,0 +1,224 @@
+"""Read what raw files state about themselves: levels, CFA pattern, ISO, exposure, noise and colours.
+
+Raw files with the structure of TIFF (DNG, ARW, CR2, NEF, PEF) are read with tifffile; LibRaw (rawpy) gives what tags do
+not. A fact that neither gives is None. The facts of tags take precedence, because LibRaw rounds black levels.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.libraries import require
+from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, matrix
+from unprocess_gen.sources.raw.colour import LIGHT_K, DngColour
+
+CFA, LINEAR = 32803, 34892
+"""Values of PhotometricInterpretation: mosaics (TIFF/EP), and demosaicked pixels (DNG)."""
+FLOATING_POINT = 3
+"""Value of SampleFormat."""
+RATIONALS = (5, 10)
+"""Types of fractions (TIFF 6.0, section 2)."""
+LOSSY = {34892: "lossy JPEG", 52546: "JPEG XL"}
+"""Compressions of DNG that remove noise (a few JPEG XL files are lossless, which no tag states)."""
+JPEG_XL = 52546
+
+
+@dataclass(frozen=True, slots=True)
+class RawMetadata:
+    """Facts of a raw file; None for those that it does not state.
+
+    Attributes
+    ----------
+    pattern
+        CFA pattern of the top-left 2x2 sites of the visible part, such as RGGB
+    black_dn
+        black levels of these four sites, row by row
+    white_dn, bits
+        white level, and bits that hold it
+    iso, exposure_s, model
+        ISO and exposure time of the frame, and name of the camera
+    noise_profile
+        S and O of each colour plane, variance = S·x + O with x = 0 at black and 1 at white (NoiseProfile of DNG)
+    colour
+        colour tags of a DNG
+    xyz2cam, gains
+        matrix of the camera in LibRaw's table, and gains of red and blue as LibRaw reads them
+    compression
+        value of the TIFF tag Compression
+    """
+
+    pattern: str | None = None
+    black_dn: tuple[float, ...] | None = None
+    white_dn: float | None = None
+    bits: int | None = None
+    iso: float | None = None
+    exposure_s: float | None = None
+    model: str | None = None
+    noise_profile: tuple[float, ...] | None = None
+    colour: DngColour | None = None
+    xyz2cam: Matrix | None = None
+    gains: tuple[float, float] | None = None
+    compression: int | None = None
+
+    def completed(self, other: RawMetadata) -> RawMetadata:
+        """Return these facts, completed by those of another reader."""
+        stated = {one.name: value for one in fields(self) if (value := getattr(self, one.name)) is not None}
+        facts = replace(other, **stated)
+        return replace(facts, bits=None if facts.white_dn is None else int(facts.white_dn).bit_length())
+
+
+def read_metadata(path: Path, key: str) -> RawMetadata:
+    """Read the facts of a raw file; ``key`` begins messages.
+
+    Raises ConfigError or MachineError.
+    """
+    return read_tags(path, key).completed(_from_decoder(path, key))
+
+
+def read_tags(path: Path, key: str) -> RawMetadata:
+    """Read the facts that tags of TIFF, EXIF and DNG state, whatever the compression; none if the file is no TIFF.
+
+    Raises ConfigError or MachineError.
+    """
+    _require("tifffile", path, key)
+    try:
+        return tags_of(path.read_bytes(), check=False)
+    except OSError as error:
+        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def tags_of(content: bytes, check: bool = True) -> RawMetadata:
+    """Read what `read_tags` does from the bytes of a file.
+
+    With ``check``, SourceError unless a TIFF is complete and its raw image is a mosaic of integers.
+    """
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(io.BytesIO(content)) as file:
+            pages = list(_pages(file))
+            raw = next((page for page in pages if page.tags.valueof(262) in (CFA, LINEAR)), pages[0])
+            if check:
+                _check_image(raw, len(content))
+            exif = pages[0].tags.valueof(34665)
+            tags = {tag.code: _numbers(tag) for page in (pages[0], raw) for tag in page.tags}
+            text = pages[0].tags.valueof(50708) or pages[0].tags.valueof(272) or ""
+            return _facts(tags, exif if isinstance(exif, Mapping) else {}, str(text).strip("\0 "))
+    except (tifffile.TiffFileError, ValueError, KeyError, IndexError, TypeError, ZeroDivisionError):
+        return RawMetadata()
+
+
+def _pages(file: Any) -> Any:
+    """Yield the images of a TIFF: those of its first directories, and of their SubIFDs."""
+    for first in file.pages:
+        yield from (first, *(getattr(first, "pages", ()) or ()))
+
+
+def _check_image(page: Any, size: int) -> None:
+    """Raise SourceError unless a page is a complete mosaic of integers."""
+    ends = [start + count for start, count in zip(page.dataoffsets, page.databytecounts, strict=False)]
+    if max(ends, default=0) > size:
+        raise SourceError("truncated", f"its pixels end at byte {max(ends)}, the file at byte {size}")
+    if page.tags.valueof(262) == LINEAR:
+        raise SourceError("unsupported", "is a linear DNG, whose pixels are demosaicked; expected a mosaic")
+    if page.tags.valueof(262) == CFA and page.tags.valueof(339) == FLOATING_POINT:
+        raise SourceError("unsupported", "has floating-point pixels; expected a mosaic of integers")
+    if page.tags.valueof(262) == 1 and 50706 in page.parent.pages[0].tags:
+        raise SourceError("unsupported", "is monochrome; expected a mosaic of red, green and blue sites")
+
+
+def _require(library: str, path: Path, key: str) -> None:
+    """Refuse a raw file without the library that reads it."""
+    use = f"{key}: {path} is a raw file, which needs {library}"
+    require(library, use, "calibrate", ", or convert the frames to NPY")
+
+
+def _facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model: str) -> RawMetadata:
+    """Collect facts from the tags of TIFF and DNG by code, and from those of EXIF by name."""
+    black, white = tags.get(50714, ()), tags.get(50717)
+    names = ("ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed", "RecommendedExposureIndex")
+    stated = [exif[name] for name in names if name in exif] + [*tags.get(34855, ()), *tags.get(34867, ())]
+    isos = [max(iso) if isinstance(iso, tuple) else iso for iso in stated]
+    seconds = exif.get("ExposureTime", tags.get(33434))
+    if isinstance(seconds, tuple):
+        seconds = seconds[0] / seconds[1] if len(seconds) == 2 else seconds[0]
+    is_tile = len(black) == 4 and tags.get(50713, (2, 2)) == (2, 2)
+    return RawMetadata(
+        black_dn=(black * 4)[:4] if black and len(set(black)) == 1 else black if is_tile else None,
+        white_dn=max(white) if 50706 in tags and white else None,
+        # the largest of 16 bits means that another tag has the ISO
+        iso=next((float(iso) for iso in isos if 0 < iso != 65535), None),
+        exposure_s=float(seconds) if seconds else None,
+        model=model or None,
+        noise_profile=tags.get(51041),
+        colour=_colour(tags) if 50721 in tags else None,
+        compression=int(tags[259][0]) if tags.get(259) else None,
+    )
+
+
+def _colour(tags: Mapping[int, tuple[float, ...]]) -> DngColour:
+    """Collect the colour tags of a DNG; ValueError if one has another number of values."""
+    codes = [code for code in (50721, 50722) if code in tags]
+    lights = (tags.get(code, (0.0,))[0] for code in (50778, 50779))
+    red, green, blue = tags.get(50727, (1.0, 1.0, 1.0))
+    neutral, white = tags.get(50728), tags.get(50729)
+    return DngColour(
+        tuple(matrix(tags[code]) for code in codes),
+        tuple(LIGHT_K.get(int(light), 0.0) for light in lights)[: len(codes)],
+        (matrix(tags.get(50723, IDENTITY)), matrix(tags.get(50724, IDENTITY))),
+        (red, green, blue),
+        None if neutral is None else (neutral[0], neutral[1], neutral[2]),
+        None if white is None else (white[0], white[1]),
+    )
+
+
+def _numbers(tag: Any) -> tuple[float, ...]:
+    """Return the values of a tag as numbers, rationals divided; none for text."""
+    values = tag.value if isinstance(tag.value, tuple) else (tag.value,)
+    if not all(isinstance(value, int | float) for value in values):
+        return ()
+    if tag.dtype in RATIONALS:
+        return tuple(top / bottom if bottom else 0.0 for top, bottom in zip(values[::2], values[1::2], strict=True))
+    return tuple(map(float, values))
+
+
+def _from_decoder(path: Path, key: str) -> RawMetadata:
+    """Read levels, pattern, ISO and exposure with LibRaw."""
+    _require("rawpy", path, key)
+    import rawpy
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None or raw.raw_pattern.shape != (2, 2):
+                raise ConfigError(f"{key}: {path} contains no Bayer mosaic; expected a raw file with a 2x2 CFA pattern")
+            return decoder_facts(raw)
+    except OSError as error:
+        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except rawpy.LibRawError as error:
+        raise ConfigError(f"{key}: {path} cannot be decoded ({decoder_message(error)})") from error
+
+
+def decoder_facts(raw: Any) -> RawMetadata:
+    """Return what LibRaw knows of an opened file with a mosaic; the pattern and the black levels of a Bayer tile."""
+    colours, names = raw.raw_colors_visible[:2, :2].ravel().tolist(), raw.color_desc.decode("ascii")
+    red, green, blue = (float(gain) for gain in raw.camera_whitebalance[:3])
+    entries = [float(f"{entry:.7g}") for entry in raw.rgb_xyz_matrix[:3].ravel()]  # LibRaw has float32
+    return RawMetadata(
+        pattern="".join(names[colour] for colour in colours),
+        black_dn=tuple(float(raw.black_level_per_channel[colour]) for colour in colours),
+        white_dn=float(raw.white_level),
+        iso=float(raw.other.iso_speed) or None,
+        exposure_s=float(raw.other.shutter_speed) or None,
+        xyz2cam=matrix(entries) if any(entries) else None,
+        gains=(red / green, blue / green) if min(red, green, blue) > 0 else None,
+    )
+
+
+def decoder_message(error: Exception) -> str:
+    """Return the message of an error of LibRaw."""
+    return error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
