@@ -17,17 +17,21 @@ from unprocess_gen.dataset.manifest import read_columns, read_rows, write_rows
 from unprocess_gen.pipeline.generate import generate
 
 PINNED = Path(__file__).parents[2] / "manifests"
+BUILDS = sorted(path.stem for path in PINNED.glob("*.yaml"))
+
 MANIFEST_OF_0_1 = {
     "scenes_brooks2019_14bit": "c3c7aa7b015b69af2a571ea4c3d60c710c1805ac977c8298c8c936970cce794d",
     "scenes_imx385_iso3200": "521bafa9a862935dce839aa54c6581c08d7240af0f06319412b3330e14923042",
 }
 """SHA-256 of each ``manifest.csv`` that version 0.1 wrote."""
 
-BUILDS = sorted(MANIFEST_OF_0_1)
-
 
 def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
+
+
+def test_every_build_has_a_manifest_of_version_0_1() -> None:
+    assert sorted(MANIFEST_OF_0_1) == BUILDS
 
 
 @pytest.mark.parametrize("name", BUILDS)

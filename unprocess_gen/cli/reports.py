@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import compose
-from unprocess_gen.cli.messages import print_result, print_results
+from unprocess_gen.cli.messages import print_result
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals
@@ -24,7 +24,6 @@ from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import AccuracyConfig, Config
-    from unprocess_gen.core.paths import AnyPath
     from unprocess_gen.core.roots import Root
     from unprocess_gen.reports.estimate import RunEstimate
 
@@ -130,8 +129,6 @@ def report(call: Call) -> int:
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
 
     folder = dataset_folder(call)
-    if "card" in call.values:
-        return _write_card(folder, call)
     to, root = call.values.get("to"), given_root(call)
     dark = dark_frames_of(folder / "manifest.csv", call)
     if {"dark_frames", "dark_shading"} & call.values.keys():
@@ -143,15 +140,6 @@ def report(call: Call) -> int:
         if to is None and isinstance(folder, Path) and not os.access(folder, os.W_OK):
             raise MachineError(f"{folder}: the page cannot be written to the dataset; give --to FILE") from error
         raise
-    return 0
-
-
-def _write_card(folder: AnyPath, call: Call) -> int:
-    from unprocess_gen.reports.card import write_card
-
-    if others := sorted(call.values.keys() & {"to", "source", "dark_frames", "dark_shading"}):
-        raise ConfigError(f"report: --card: a card is written to the dataset's folder; leave {others[0]} out")
-    print_results(map(str, write_card(folder)))
     return 0
 
 

@@ -1,26 +1,20 @@
-"""Run the verbs that generate a dataset: generate, manifest, build and again."""
+"""Run the verbs that generate a dataset: generate, manifest and again."""
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
 from unprocess_gen.cli.hydra_app import compose
-from unprocess_gen.cli.messages import print_result, print_results, report
+from unprocess_gen.cli.messages import print_result, print_results
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
-from unprocess_gen.config.option_files import build_names, group_options, manifests_dir
-from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.config.option_files import group_options
 from unprocess_gen.core.paths import any_path
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import Config, ExecutorConfig
     from unprocess_gen.pipeline.generate import Summary
-
-
-SHOWN = 20
-"""Differences of a build that are named."""
 
 
 def generate(call: Call) -> int:
@@ -69,34 +63,6 @@ def again(call: Call) -> int:
     print_results(lines)
     print_result(compare(folder, any_path(config.out)))
     return code
-
-
-def build(call: Call) -> int:
-    """Make a benchmark build and compare it, or list the builds."""
-    from unprocess_gen.config.values import one_of
-    from unprocess_gen.pipeline.builds import make_build, purpose
-
-    names = build_names()
-    if "list" in call.values:
-        if call.words or "to" in call.values:
-            raise ConfigError("build: --list: takes neither a name nor --to; remove it")
-        print_results(f"{name:<26}{purpose(name)}" for name in names)
-        return DONE
-    if len(call.words) != 1 or "to" not in call.values:
-        raise ConfigError(
-            f"build: expected one of {', '.join(names)}, and --to FOLDER; gen-dataset build --list explains them"
-        )
-    one_of("build", call.words[0], tuple(names))
-    name, to = call.words[0], call.values["to"]
-    damages = make_build(name, to, call.values.get("n_jobs", -1))
-    for damage in damages[:SHOWN]:
-        report(f"{to}: {damage}", logging.ERROR)
-    if damages:
-        rest = f"; {len(damages) - SHOWN} more differences" if len(damages) > SHOWN else ""
-        report(f"{to}: differs from the build {name}{rest}", logging.ERROR)
-        return DamageError.exit_code
-    print_result(f"{to} is the build {name}, bit for bit; card: {manifests_dir() / f'{name}.md'}")
-    return DONE
 
 
 def _executor(call: Call) -> ExecutorConfig:

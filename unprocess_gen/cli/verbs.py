@@ -135,13 +135,9 @@ _VERBS = (
     ),
     Verb(
         "report",
-        "write an HTML page about a dataset, or its card",
+        "write an HTML page about a dataset",
         "reports.report",
-        (
-            _to("write FILE instead of DIR/report.html", "FILE"),
-            *INPUTS,
-            Argument(("--card",), "write the card instead: README.md, and croissant.json for programs"),
-        ),
+        (_to("write FILE instead of DIR/report.html", "FILE"), *INPUTS),
         DATASET,
     ),
     Verb(
@@ -183,18 +179,6 @@ _VERBS = (
             ),
         ),
         Place("DIR", "the folder of a dataset or of a sweep"),
-        resumes=True,
-    ),
-    Verb(
-        "build",
-        "make a benchmark build and compare every byte with the recorded ones",
-        "runs.build",
-        (
-            _to("write the dataset to FOLDER", "FOLDER"),
-            Argument(("--list",), "list the builds and their purposes"),
-            _integer("n_jobs", "number of worker processes; -1: all cores"),
-        ),
-        words=("NAME",),
         resumes=True,
     ),
     Verb(

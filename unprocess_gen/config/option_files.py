@@ -40,25 +40,11 @@ def conf_dir() -> Path:
 
     An installed package contains it as ``unprocess_gen/conf``; in a source tree it is next to the package.
     """
-    return _data_folder("conf", "config.yaml")
-
-
-def manifests_dir() -> Path:
-    """Return the folder of the benchmark builds, which an installed package contains as well."""
-    return _data_folder("manifests", "README.md")
-
-
-def build_names() -> list[str]:
-    """Return the names of the benchmark builds."""
-    return sorted(path.stem for path in manifests_dir().glob("*.sha256"))
-
-
-def _data_folder(name: str, file: str) -> Path:
     package = Path(__file__).resolve().parents[1]
-    for folder in (package / name, package.parent / name):
-        if (folder / file).is_file():
+    for folder in (package / "conf", package.parent / "conf"):
+        if (folder / "config.yaml").is_file():
             return folder
-    raise ConfigError(f"{name}/{file}: not found in or next to {package}; reinstall unprocess_gen")
+    raise ConfigError(f"conf/config.yaml: not found in or next to {package}; reinstall unprocess_gen")
 
 
 def group_options(group: str, *folders: Path) -> list[str]:
