@@ -24,6 +24,7 @@ from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import AccuracyConfig, Config
+    from unprocess_gen.core.paths import AnyPath
     from unprocess_gen.core.roots import Root
     from unprocess_gen.reports.estimate import RunEstimate
 
@@ -125,10 +126,13 @@ def _report_folder(config: Config, verb: str) -> Path:
 
 
 def report(call: Call) -> int:
-    """Write the HTML page of a dataset."""
+    """Write the HTML page of a dataset, or its card."""
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
 
     folder = dataset_folder(call)
+    _check_card_arguments(call)
+    if "card" in call.values:
+        return _card(call, folder)
     to, root = call.values.get("to"), given_root(call)
     dark = dark_frames_of(folder / "manifest.csv", call)
     if {"dark_frames", "dark_shading"} & call.values.keys():
@@ -140,6 +144,33 @@ def report(call: Call) -> int:
         if to is None and isinstance(folder, Path) and not os.access(folder, os.W_OK):
             raise MachineError(f"{folder}: the page cannot be written to the dataset; give --to FILE") from error
         raise
+    return 0
+
+
+FOR_PAGE, FOR_CARD = ("source", "dark_frames", "dark_shading"), ("licence", "published")
+"""Arguments that only the page of a dataset, or only its card, uses."""
+
+
+def _check_card_arguments(call: Call) -> None:
+    unused, other = (FOR_PAGE, "without") if "card" in call.values else (FOR_CARD, "with")
+    for name in unused:
+        if name in call.values:
+            flag = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"report: {flag} {call.values[name]}: is used {other} --card only; leave one of both out")
+
+
+def _card(call: Call, folder: AnyPath) -> int:
+    """Write the card of a dataset, and name what is left to its author."""
+    from unprocess_gen.pipeline.workspace import CARD_FILES
+    from unprocess_gen.reports.card import Statements, write_card
+
+    to = Path(call.values["to"]) if "to" in call.values else None
+    statements = Statements(*(call.values.get(name, "") for name in FOR_CARD))
+    out = write_card(folder, to, statements)
+    left = (
+        f"; left to its author: {', '.join(f'--{name}' for name in statements.missing)}" if statements.missing else ""
+    )
+    print_result(f"{out}: {' and '.join(CARD_FILES)} written{left}")
     return 0
 
 

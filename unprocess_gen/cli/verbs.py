@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import date
 
 from unprocess_gen.cli.arguments import SOURCE, Argument, Place, Verb
 
@@ -26,8 +27,12 @@ def _local_path(text: str) -> str:
     return text
 
 
+def _date(text: str) -> str:
+    return date.fromisoformat(text).isoformat()
+
+
 def _to(text: str, metavar: str, *, required: bool = False) -> Argument:
-    kind = metavar.lower()
+    kind = "folder" if metavar == "DIR" else metavar.lower()
     return Argument(("--to",), text, metavar, _local_path, f"a local {kind}", f"{kind}s", required)
 
 
@@ -135,9 +140,15 @@ _VERBS = (
     ),
     Verb(
         "report",
-        "write an HTML page about a dataset",
+        "write an HTML page about a dataset, or its card: README.md and croissant.json",
         "reports.report",
-        (_to("write FILE instead of DIR/report.html", "FILE"), *INPUTS),
+        (
+            _to("write FILE instead of DIR/report.html; with --card, a folder", "FILE"),
+            Argument(("--card",), "write README.md and croissant.json (Croissant 1.1) instead of the page"),
+            Argument(("--licence", "--license"), "with --card: licence of the dataset, an SPDX name or URL", "LICENCE"),
+            Argument(("--published",), "with --card: date of publication", "DATE", _date, "a date, such as 2026-01-31"),
+            *INPUTS,
+        ),
         DATASET,
     ),
     Verb(

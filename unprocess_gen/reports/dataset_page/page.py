@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import ENTRY_GROUPS, Config
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.values import error_in_one_line, value_text
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
@@ -91,12 +91,11 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlace
     """Render the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
     from jinja2 import TemplateError  # optional library, extra "figures"
 
-    facts, config = _checked_facts(folder)
+    facts, config = checked_facts(folder)
     count = facts["pairs"] + sum(facts["failed"].values()) + facts.get("filtered", 0)
     rows = with_bar(read_rows(folder / "manifest.csv"), "row", count)
     statistics = read_statistics(rows, facts["pairs"])
     first, name = statistics.first_pair, folder_name(folder)
-    settings = {key: functools.reduce(getattr, key.split("."), config) for key in SETTINGS_SHOWN}
     try:
         return render_page(
             "dataset.html",
@@ -104,7 +103,7 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlace
             facts=facts,
             size=byte_size(sum(entry["bytes"] for entry in facts["shards"])),
             config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
-            settings={key: value_text(value) for key, value in settings.items() if value is not None},
+            settings=shown_settings(config),
             statistics=statistics,
             values_text=values_text,
             short_number=short_number,
@@ -120,7 +119,16 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlace
         raise DamageError(f"{folder / 'dataset.json'}: cannot be shown ({error_in_one_line(error)})") from error
 
 
-def _checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
+def shown_settings(config: Config) -> dict[str, str]:
+    """Return `SETTINGS_SHOWN` that are not null, as text; those that entries of a mixture differ in are left out."""
+    settings: dict[str, Any] = {key: functools.reduce(getattr, key.split("."), config) for key in SETTINGS_SHOWN}
+    if config.mixture is not None:
+        settings = {key: value for key, value in settings.items() if key.partition(".")[0] not in ENTRY_GROUPS}
+        settings["mixture"] = f"{len(config.mixture)} entries, in config.yaml"
+    return {key: value_text(value) for key, value in settings.items() if value is not None}
+
+
+def checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
     """Read ``dataset.json`` and the config, after comparing the digests of manifest and config."""
     if not (folder / "dataset.json").exists():
         raise DamageError(f"{folder}: dataset.json does not exist; expected a finished dataset")

@@ -1,0 +1,311 @@
+"""Write the card of a dataset: ``README.md`` for people and ``croissant.json`` (Croissant 1.1) for programs.
+
+The card describes ``dataset.json``, ``config.yaml`` and ``manifest.csv``. It is no part of the dataset: nothing reads
+it. What only the author knows, such as the licence of the photographs, is left to the author.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.libraries import require
+from unprocess_gen.core.output_paths import check_output_folder
+from unprocess_gen.core.paths import AnyPath, folder_name
+from unprocess_gen.dataset.columns import COLUMNS
+from unprocess_gen.dataset.manifest import read_columns, read_rows
+from unprocess_gen.pipeline.workspace import CARD_FILES
+from unprocess_gen.reports.dataset_page.page import checked_facts, shown_settings
+from unprocess_gen.reports.dataset_page.statistics import ManifestStatistics, read_statistics, values_text
+from unprocess_gen.reports.formatting import byte_size, counted
+from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.sources.names import encode_name
+
+CROISSANT = "http://mlcommons.org/croissant/1.1"
+
+CITATIONS = (
+    "Tim Brooks et al.: Unprocessing Images for Learned Raw Denoising. CVPR 2019, arXiv:1811.11127.",
+    "Image Unprocessing: A Pipeline to Recover Raw Data from sRGB Images. Image Processing On Line (IPOL), MLBriefs.",
+)
+
+SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
+"""Categories of Hugging Face: numbers of pairs below which each applies."""
+
+LEFT_TO_AUTHOR = "The author states here the licence of the source photographs, and of this dataset."
+
+
+@dataclass(frozen=True, slots=True)
+class Statements:
+    """Hold what the author of a dataset states: the licence, and the date of publication (ISO 8601)."""
+
+    licence: str = ""
+    published: str = ""
+
+    @property
+    def missing(self) -> list[str]:
+        """Names of what is not stated."""
+        return [name for name in ("licence", "published") if not getattr(self, name)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Described:
+    """Hold what a card describes: the dataset's name, facts, settings, columns and statistics of its rows."""
+
+    name: str
+    facts: dict[str, Any]
+    config: Config
+    columns: tuple[str, ...]
+    statistics: ManifestStatistics
+
+    @property
+    def summary(self) -> str:
+        """One sentence about the dataset."""
+        return (
+            f"{self.facts['pairs']:,} pairs of clean and noisy raw frames, simulated by unprocess_gen "
+            f"{self.version} from {self.sources}."
+        )
+
+    @property
+    def version(self) -> str:
+        """Version of unprocess_gen that finished the dataset."""
+        return str((self.facts.get("versions") or {}).get("unprocess_gen", "of an unknown version"))
+
+    @property
+    def sources(self) -> str:
+        """Number and kind of the sources."""
+        kind = "sRGB photographs" if self.facts["source"]["kind"] == "folder" else "built-in scenes"
+        return f"{self.statistics.images:,} {kind}"
+
+
+def write_card(folder: AnyPath, to: Path | None = None, statements: Statements | None = None) -> Path:
+    """Write the card of a finished dataset into it, or to another folder; return the folder.
+
+    ConfigError if mlcroissant is missing, the folder cannot be written, or it has other files of these names, which the
+    author may have edited; DamageError if the dataset is not finished or was changed.
+    """
+    require("mlcroissant", "report: --card needs mlcroissant", "card")
+    out = _folder_to_write(folder, to)
+    facts, config = checked_facts(folder)
+    manifest = folder / "manifest.csv"
+    statistics = read_statistics(read_rows(manifest), facts["pairs"])
+    described = _Described(encode_name(folder_name(folder)), facts, config, read_columns(manifest), statistics)
+    given = statements or Statements()
+    contents = dict(zip(CARD_FILES, (_readme(described, given), _croissant(described, given)), strict=True))
+    for name, text in contents.items():
+        if (out / name).exists() and (out / name).read_bytes() != text.encode():
+            raise ConfigError(
+                f"report: {out / name}: exists with another text, which may be yours; expected no such file; move it "
+                "away, or give --to FOLDER"
+            )
+    write_files(out, {name: text.encode() for name, text in contents.items()})
+    return out
+
+
+def _folder_to_write(folder: AnyPath, to: Path | None) -> Path:
+    if to is not None and not (isinstance(folder, Path) and to.resolve() == folder.resolve()):
+        check_output_folder(to, f"--to {to}")
+        return to
+    if not isinstance(folder, Path):
+        raise ConfigError(f"report: {folder} is in an object store; expected a local folder; give --to FOLDER")
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"report: {folder} is read-only; expected a folder that can be written; give --to FOLDER")
+    return folder
+
+
+# ----------------------------------------------------------------------------------------------------------- README.md
+
+
+def _readme(described: _Described, given: Statements) -> str:
+    facts, statistics, config = described.facts, described.statistics, described.config
+    licence, shards = given.licence or LEFT_TO_AUTHOR, facts["shards"]
+    if facts["source"]["kind"] == "synthetic" and not given.licence:
+        licence = "No photograph is contained: the sources are scenes that unprocess_gen (MIT) draws."
+    contents = {
+        "pairs": f"{facts['pairs']:,}, of {described.sources}",
+        "failed sources": f"{sum(facts['failed'].values()):,}",
+        "size": f"{byte_size(sum(entry['bytes'] for entry in shards))} in {counted(len(shards), 'shard')}",
+        "width × height": values_text(statistics.sizes),
+        "pattern": values_text(statistics.texts["pattern"]),
+        **{name: values_text(statistics.texts[name]) for name in ("camera", "noise", "scene")},
+        "effects": values_text(statistics.effects),
+    }
+    return README.format(
+        title=html.escape(described.name, quote=False),
+        name=json.dumps(described.name, ensure_ascii=False),
+        quoted=shlex.quote(described.name),
+        licence_key=f"license: {json.dumps(given.licence)}\n" if given.licence else "",
+        size=next((name for bound, name in SIZES if facts["pairs"] < bound), "n>10M"),
+        summary=described.summary,
+        contents=_table("property", "value", contents),
+        settings=_table("setting", "value", shown_settings(config)),
+        fingerprint=facts["fingerprint"],
+        licence=licence,
+        citations="\n".join(f"- {text}" for text in CITATIONS),
+    )
+
+
+def _table(first: str, second: str, rows: Mapping[str, str]) -> str:
+    cells = (f"| {key} | {text.replace('|', chr(92) + '|')} |" for key, text in rows.items())
+    return "\n".join([f"| {first} | {second} |", "|---|---|", *cells])
+
+
+README = """\
+---
+pretty_name: {name}
+{licence_key}task_categories: [image-to-image]
+tags: [raw, bayer, denoising, image-restoration, synthetic]
+size_categories: [{size}]
+---
+
+# {title}
+
+{summary}
+
+{contents}
+
+## Files
+
+- `shards/shard-00000.tar`, …: uncompressed tar files in WebDataset layout: `KEY.clean.npy`, `KEY.noisy.npy`, `KEY.json`
+- `manifest.csv`: a row for each pair, with every parameter from which it was drawn
+- `config.yaml`: all settings; `dataset.json`: counts, versions and the SHA-256 of every file
+- `croissant.json`: this description for programs (Croissant 1.1)
+
+## How it was made
+
+Each source is unprocessed to linear raw light (tone curve, gamma, colour matrix and white balance are inverted),
+sampled by a Bayer mosaic, and recorded with simulated sensor noise. Clean and noisy frame differ by random draws only.
+These settings and the others in `config.yaml` decide every byte:
+
+{settings}
+
+From the same sources, this command makes the dataset again, bit for bit: `gen-dataset again {quoted} out=again`
+
+## Read it
+
+```python
+import unprocess_gen as ug
+
+for clean, noisy, row in ug.RawPairs({name}):  # uint16 mosaics in DN, and the row of the manifest
+    ...
+```
+
+`gen-dataset verify {quoted}` checks every byte. The fingerprint is `{fingerprint}`.
+
+mlcroissant reads `croissant.json`. It keeps unpacked shards by their names, so set `CROISSANT_CACHE` to another folder
+for each dataset.
+
+## Licence
+
+{licence}
+
+## Citation
+
+{citations}
+"""
+
+
+# ------------------------------------------------------------------------------------------------------ croissant.json
+
+
+def _croissant(described: _Described, given: Statements) -> str:
+    """Return Croissant JSON: the rows of the manifest as records, and the arrays in the shards with their keys."""
+    import mlcroissant as mlc  # optional library, extra "card"
+
+    facts = described.facts
+    manifest = mlc.FileObject(
+        id="manifest.csv",
+        name="manifest.csv",
+        content_url="manifest.csv",
+        encoding_formats=["text/csv"],
+        sha256=facts["manifest_sha256"],
+    )
+    shards = [
+        mlc.FileObject(
+            id=entry["file"],
+            name=entry["file"],
+            content_url=entry["file"],
+            content_size=f"{entry['bytes']} B",
+            encoding_formats=["application/x-tar"],
+            sha256=entry["sha256"],
+        )
+        for entry in facts["shards"]
+        if entry["file"] is not None
+    ]
+    arrays = mlc.FileSet(
+        id="arrays",
+        name="arrays",
+        description="Arrays of the pairs, NumPy's NPY format.",
+        contained_in=[shard.id for shard in shards],
+        encoding_formats=["application/x-npy"],
+        includes=["*.npy"],
+    )
+    metadata = mlc.Metadata(
+        name=described.name,
+        description=described.summary,
+        conforms_to=[CROISSANT],
+        keywords=["raw", "bayer", "denoising", "image restoration", "synthetic"],
+        license=[given.licence] if given.licence else None,
+        date_published=given.published or None,
+        cite_as=" ".join(CITATIONS),
+        version="1.0.0",
+        data_collection=f"Simulated by unprocess_gen {described.version}; fingerprint {facts['fingerprint']}.",
+        distribution=[manifest, *shards, *([arrays] if shards else [])],
+        record_sets=[_rows(described.columns), *([_arrays()] if shards else [])],
+    )
+    content = metadata.to_json()
+    content["@context"]["containedIn"] = "cr:containedIn"  # a term of 1.1 that mlcroissant reads and does not write
+    return json.dumps(content, indent=1, default=str) + "\n"
+
+
+def _rows(names: tuple[str, ...]) -> Any:
+    """Describe the rows of the manifest, with a field for each of its columns."""
+    import mlcroissant as mlc
+
+    types: dict[object, Any] = {int: mlc.DataType.INTEGER, float: mlc.DataType.FLOAT}
+    fields = [
+        mlc.Field(
+            id=f"pairs/{column.name}",
+            name=column.name,
+            description=", ".join(filter(None, (column.meaning, column.unit))),
+            data_types=[types.get(column.type, mlc.DataType.TEXT)],
+            source=mlc.Source(file_object="manifest.csv", extract=mlc.Extract(column=column.name)),
+        )
+        for column in COLUMNS
+        if column.name in names
+    ]
+    description = "Rows of the manifest. Readers that take a key for a number drop its leading zeros."
+    return mlc.RecordSet(id="pairs", name="pairs", description=description, key="pairs/key", fields=fields)
+
+
+def _arrays() -> Any:
+    """Describe the arrays in the shards: key, name of the array, and the content of the file."""
+    import mlcroissant as mlc
+
+    extracts = {
+        "key": ("key of the sample: source index, and patch if there is one", "fullpath", r"^([^.]+)\."),
+        "array": ("clean, noisy, or another array of the pair", "fullpath", r"^[^.]+\.(.+)\.npy$"),
+        "content": ("NPY file: numpy.load(io.BytesIO(content))", "content", None),
+    }
+    fields = [
+        mlc.Field(
+            id=f"frames/{name}",
+            name=name,
+            description=description,
+            data_types=[mlc.DataType.TEXT],
+            source=mlc.Source(
+                file_set="arrays",
+                extract=mlc.Extract(file_property=part),
+                transforms=[mlc.Transform(regex=regex)] if regex else [],
+            ),
+        )
+        for name, (description, part, regex) in extracts.items()
+    ]
+    return mlc.RecordSet(id="frames", name="frames", description="Arrays in the shards.", fields=fields)
