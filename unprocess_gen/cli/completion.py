@@ -17,7 +17,7 @@ from pathlib import Path
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.limits import BOOLEAN, Choice
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import build_names, conf_dir, group_options
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import ConfigError
@@ -66,6 +66,7 @@ def complete(line: str) -> tuple[str, list[str]]:
     candidates = [f"{key}=" for key in verb.settings]
     candidates += VERBS if len(before) == 1 and re.fullmatch("[a-z]*", current) else ()
     candidates += _settings(current, _option_folders(before)) if verb.composes else ()
+    candidates += build_names() if verb.name == "build" else ()
     words = _starting(current, [*candidates, *verb.words])
     return (verb.place.completes, []) if verb.place and not (words and current) else (WORDS, words)
 

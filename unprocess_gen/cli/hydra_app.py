@@ -63,7 +63,7 @@ def compose(
         from unprocess_gen.cli.sweep_plugins import run_with_plugins
 
         return run_with_plugins(call, expansion, task)
-    return _run_sweep(folders, expansion.jobs, task, sweep_csv, totals)
+    return run_sweep(folders, expansion.jobs, task, sweep_csv, totals)
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
@@ -91,12 +91,12 @@ def _option_folders(hydra: Mapping[str, Any]) -> OptionFolders:
 # ------------------------------------------------------------------------------------------------------------ sweeps
 
 
-def _run_sweep(
+def run_sweep(
     folders: OptionFolders,
     jobs: Sequence[SweepJob],
     task: Task,
     sweep_csv: bool,
-    totals: Callable[[Sequence[Any]], str] | None,
+    totals: Callable[[Sequence[Any]], str] | None = None,
 ) -> int:
     """Run every job of a sweep, one after the other, and return the worst exit code.
 

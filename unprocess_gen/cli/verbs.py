@@ -214,6 +214,18 @@ _VERBS = (
         resumes=True,
     ),
     Verb(
+        "build",
+        "make a benchmark build and compare every byte with its recorded digests",
+        "builds.build",
+        (
+            _to("write the build to DIR", "DIR"),
+            Argument(("--list",), "list all builds"),
+            _integer("n_jobs", "number of worker processes; -1: all cores"),
+        ),
+        extra=Argument(("name",), "name of the build", "NAME"),
+        resumes=True,
+    ),
+    Verb(
         "calibrate",
         "measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile",
         "calibration.calibrate",

@@ -36,15 +36,27 @@ PACKAGE_DIRECTIVE = "# @package"
 
 
 def conf_dir() -> Path:
-    """Return the folder of the built-in option files.
+    """Return the folder of the built-in option files."""
+    return _shipped_folder("conf", "config.yaml")
 
-    An installed package contains it as ``unprocess_gen/conf``; in a source tree it is next to the package.
-    """
+
+def manifests_dir() -> Path:
+    """Return the folder of the benchmark builds."""
+    return _shipped_folder("manifests", "README.md")
+
+
+def build_names() -> list[str]:
+    """Return the names of the benchmark builds."""
+    return group_options("recipes", manifests_dir())
+
+
+def _shipped_folder(name: str, file: str) -> Path:
+    """Return a folder by a file in it: an installed package contains it, in a source tree it is next to the package."""
     package = Path(__file__).resolve().parents[1]
-    for folder in (package / "conf", package.parent / "conf"):
-        if (folder / "config.yaml").is_file():
+    for folder in (package / name, package.parent / name):
+        if (folder / file).is_file():
             return folder
-    raise ConfigError(f"conf/config.yaml: not found in or next to {package}; reinstall unprocess_gen")
+    raise ConfigError(f"{name}/{file}: not found in or next to {package}; reinstall unprocess_gen")
 
 
 def group_options(group: str, *folders: Path) -> list[str]:

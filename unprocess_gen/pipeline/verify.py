@@ -121,8 +121,7 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
 def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
     """Check whether a new manifest has the rows of an older one, in every column that the older one has.
 
-    Empty cells of an older manifest without frames are not compared. The reason ``too_small`` was ``unsupported`` up to
-    version 0.2. Raises DamageError if a manifest cannot be read.
+    Raises DamageError if a manifest cannot be read.
     """
     with suppress(OSError):  # reported below
         if file_sha256(old) == file_sha256(new):
@@ -131,13 +130,21 @@ def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
     if not set(names) <= set(read_columns(new)):
         return False
     for row, other in itertools.zip_longest(read_rows(old), read_rows(new), fillvalue=no_row):
-        reasons = row.get("reason"), other.get("reason")
-        same_reason = reasons[0] == reasons[1] or reasons == ("unsupported", "too_small")
-        planned = row.get("status") == "ok" and not has_frames(row)  # cells of frames are empty
-        known = [name for name in names if name != "reason" and not (planned and row.get(name) in (None, ""))]
-        if not same_reason or any(row.get(name) != other.get(name) for name in known):
+        if differing_columns(row, other, names):
             return False
     return True
+
+
+def differing_columns(old: Row, new: Row, names: Iterable[str]) -> list[str]:
+    """List the columns in which a row differs from an older one.
+
+    Empty cells of an older row without frames are not compared. The reason ``too_small`` was ``unsupported`` up to
+    version 0.2.
+    """
+    if old.get("status") == "ok" and not has_frames(old):
+        names = [name for name in names if old.get(name) not in (None, "")]
+    renamed = (old.get("reason"), new.get("reason")) == ("unsupported", "too_small")
+    return [name for name in names if old.get(name) != new.get(name) and not (name == "reason" and renamed)]
 
 
 def _without_path(error: DamageError) -> str:

@@ -1,0 +1,228 @@
+"""Measure how hard the benchmark builds are, and write their cards: PSNR and SSIM of noisy and of denoised frames.
+
+``python manifests/measure.py DIR`` makes every build in DIR, or uses what is there, and rewrites ``scores.csv``, the
+cards and the table of ``README.md``; names after DIR select builds. ``measure`` takes any denoiser, so that its results
+can be quoted next to these. Needs scikit-image (``pip install '.[photos]'``).
+
+With ``--pin``, builds whose NAME.sha256 is missing get their digests and rows; those of others are not changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.metrics import structural_similarity
+from skimage.restoration import denoise_nl_means
+
+import unprocess_gen as ug
+from unprocess_gen.cli.builds import make_build
+from unprocess_gen.cli.main import run
+from unprocess_gen.config.option_files import build_names
+from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.types import Frame, Row
+from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.pipeline.builds import MANIFEST, Build, read_build
+from unprocess_gen.simulation.reference.cfa import unpack
+
+FOLDER = Path(__file__).resolve().parent
+SCORES = FOLDER / "scores.csv"
+UNRECORDED = {"dataset.json", "sweep.csv", "sweep.csv.lock"}
+DIGITS = {"psnr": 2, "ssim": 3}
+BEGIN, END = "<!-- scores: written by measure.py -->", "<!-- end of scores -->"
+COLUMNS = tuple(
+    f"{frame}_{domain}_{kind}"
+    for frame in ("noisy", "denoised")
+    for domain in ("raw", "srgb")
+    for kind in ("psnr", "ssim")
+)
+
+Planes = NDArray[np.float64]
+Denoiser = Callable[[Frame, Row], Frame]
+"""Function of a noisy mosaic in DN, uint16 [H, W], and its manifest row; returns the denoised mosaic, uint16."""
+
+
+def non_local_means(noisy: Frame, row: Row) -> Frame:
+    """Denoise a mosaic by non-local means on its four planes, after the generalised Anscombe transformation.
+
+    The transformation takes gain and variance without light from the row, so that all noise has a standard deviation
+    near 1. The inverse is the closed form of Mäkitalo and Foi (IEEE Transactions on Image Processing 22, 2013).
+    """
+    dark = row["b_dn2"] if row["dark_variance_dn2"] is None else row["dark_variance_dn2"]
+    gain, black, white = float(row["a_dn"]), int(row["black_level_dn"]), int(row["white_level_dn"])
+    variance = max(float(dark or 0), 0.0) / gain**2
+    light = (ug.pack(noisy, str(row["pattern"])).astype(np.float64) - black) / gain
+    stable = 2 * np.sqrt(np.maximum(light + 3 / 8 + variance, 0))
+    settings = {"patch_size": 5, "patch_distance": 6, "h": 0.8, "sigma": 1.0, "fast_mode": True}
+    smooth = denoise_nl_means(stable, channel_axis=0, preserve_range=True, **settings)
+    smooth = np.maximum(smooth, 2 * math.sqrt(3 / 8 + variance))
+    root = math.sqrt(3 / 2)
+    unbiased = smooth**2 / 4 + root / 4 / smooth - 11 / 8 / smooth**2 + 5 / 8 * root / smooth**3 - 1 / 8 - variance
+    planes = np.clip(np.rint(np.maximum(unbiased, 0) * gain + black), 0, white).astype(noisy.dtype)
+    return unpack(planes, str(row["pattern"]))
+
+
+def psnr(clean: NDArray[Any], other: NDArray[Any], peak: float) -> float:
+    """Return the peak signal-to-noise ratio in dB."""
+    return 10 * math.log10(peak**2 / float(np.mean((other.astype(np.float64) - clean) ** 2)))
+
+
+def ssim(clean: NDArray[Any], other: NDArray[Any], peak: float, axis: int) -> float:
+    """Return the mean structural similarity of Wang et al. (2004): Gaussian window of sigma 1.5."""
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(structural_similarity(clean, other, data_range=peak, channel_axis=axis, **window))
+
+
+def score(clean: Frame, other: Frame, row: Row) -> tuple[float, float, float, float]:
+    """Compare a frame with the clean one: PSNR and SSIM of the raw frames, then of the developed ones.
+
+    The peak of raw frames is white - black; SSIM is the mean over the four planes of the mosaic. Developed frames are
+    8-bit sRGB, ``ug.develop`` with the parameters of the row; SSIM is the mean over R, G and B.
+    """
+    peak, pattern = int(row["white_level_dn"]) - int(row["black_level_dn"]), str(row["pattern"])
+    raw = ug.pack(clean, pattern), ug.pack(other, pattern)
+    srgb = ug.develop(clean, row), ug.develop(other, row)
+    return psnr(*raw, peak), ssim(*raw, peak, 0), psnr(*srgb, 255), ssim(*srgb, 255, 2)
+
+
+def measure(dataset: Path, denoise: Denoiser = non_local_means) -> dict[str, float]:
+    """Return means over the pairs of a dataset: scores of the noisy frames, then of the denoised ones.
+
+    A last odd row or column is cut off before.
+    """
+    scores = []
+    for clean, noisy, row in ug.RawPairs(dataset):
+        height, width = (side // 2 * 2 for side in clean.shape)
+        clean, noisy = clean[:height, :width], noisy[:height, :width]
+        scores.append((*score(clean, noisy, row), *score(clean, denoise(noisy, row), row)))
+    return dict(zip(COLUMNS, np.mean(scores, axis=0).tolist(), strict=True))
+
+
+# --------------------------------------------------------------------------------------------------- digests and cards
+
+
+def make(build: Build, folder: Path, pin: bool) -> None:
+    """Make a build; with ``pin``, record its digests and rows if it has none."""
+    rows, digests = FOLDER / f"{build.name}.csv", FOLDER / f"{build.name}.sha256"
+    if build.digests or not pin:
+        if code := run(["build", build.name, "--to", str(folder)]):
+            raise SystemExit(code)
+        return
+    with rows.open("w", encoding="utf-8", newline="") as stream:
+        write_rows(stream, [])  # no photograph is compared
+    if code := make_build(build, folder):
+        raise SystemExit(code)
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in UNRECORDED)
+    digests.write_text("".join(f"{file_sha256(path)}  {path.relative_to(folder).as_posix()}\n" for path in files))
+    with rows.open("w", encoding="utf-8", newline="") as stream:
+        write_rows(stream, (row for path in files if path.name == MANIFEST for row in read_rows(path)))
+
+
+def scores_of(build: Build, folder: Path) -> list[dict[str, str]]:
+    """Return the lines of a build in ``scores.csv``, one for each dataset."""
+    lines = []
+    for dataset in build.datasets:
+        print(f"{build.name} {dataset}", flush=True)
+        texts = {name: f"{value:.{DIGITS[name[-4:]]}f}" for name, value in measure(folder / dataset).items()}
+        lines.append(
+            {"build": build.name, "dataset": dataset, "pairs": str(len(ug.RawPairs(folder / dataset))), **texts}
+        )
+    return lines
+
+
+def mean_line(lines: list[dict[str, str]]) -> dict[str, str]:
+    """Return the means over the pairs of all datasets of a build."""
+    pairs = [int(line["pairs"]) for line in lines]
+    means = {name: np.average([float(line[name]) for line in lines], weights=pairs) for name in COLUMNS}
+    return {"pairs": str(sum(pairs)), **{name: f"{value:.{DIGITS[name[-4:]]}f}" for name, value in means.items()}}
+
+
+def table(first: str, lines: dict[str, dict[str, str]]) -> str:
+    """Return a Markdown table of scores, whose rows have names in the first column."""
+    titles = (f"{frame}, {domain}" for frame in ("noisy", "denoised") for domain in ("raw", "sRGB"))
+    text = [f"| {first} | pairs | {' | '.join(titles)} |", f"|---|{'--:|' * 5}"]
+    for name, line in lines.items():
+        cells = [f"{line[COLUMNS[at]]} / {line[COLUMNS[at + 1]]}" for at in range(0, len(COLUMNS), 2)]
+        text.append(f"| {name} | {line['pairs']} | {' | '.join(cells)} |")
+    return "\n".join(text)
+
+
+def card(build: Build, lines: list[dict[str, str]]) -> str:
+    """Return the card of a build in Markdown."""
+    recipe = build.recipe
+    sources = ", ".join(recipe.photographs) or "built-in scenes"
+    settings = shlex.join(["gen-dataset", *(["-m"] if recipe.sweep else []), *recipe.overrides, *recipe.sweep])
+    named = {f"`{line['dataset']}`": line for line in lines} if recipe.sweep else {}
+    return CARD.format(
+        name=build.name,
+        title=recipe.title[0].upper() + recipe.title[1:],
+        purpose=recipe.purpose,
+        sources=sources,
+        settings=settings,
+        table=table("dataset", {**named, "all": mean_line(lines)}),
+    )
+
+
+CARD = """\
+<!-- written by measure.py -->
+# {name}
+
+{title}. {purpose}
+
+    gen-dataset build {name} --to {name}
+
+- Sources: {sources}
+- Settings: `{settings}`
+- Digests: [`{name}.sha256`](../{name}.sha256); rows: [`{name}.csv`](../{name}.csv)
+
+PSNR in dB / SSIM, means over the pairs; [definitions](../README.md#scores).
+
+{table}
+"""
+
+
+def texts(lines: list[dict[str, str]]) -> dict[str, str]:
+    """Return the files that follow from the scores: the cards, and ``README.md`` with its table."""
+    files, rows = {}, {}
+    for build in map(read_build, build_names()):
+        if of_build := [line for line in lines if line["build"] == build.name]:
+            files[f"cards/{build.name}.md"] = card(build, of_build)
+            rows[f"[`{build.name}`](cards/{build.name}.md): {build.recipe.title}"] = mean_line(of_build)
+    before, _, rest = (FOLDER / "README.md").read_text(encoding="utf-8").partition(BEGIN)
+    return {**files, "README.md": f"{before}{BEGIN}\n{table('build', rows)}\n{END}{rest.partition(END)[2]}"}
+
+
+def read_scores() -> list[dict[str, str]]:
+    """Return the lines of ``scores.csv``."""
+    with SCORES.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def main() -> None:
+    """Make and measure the builds that the command line names, all by default."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the builds")
+    parser.add_argument("names", nargs="*", default=build_names(), metavar="NAME", help="build, all by default")
+    parser.add_argument("--pin", action="store_true", help="record the digests of builds that have none")
+    arguments = parser.parse_args()
+    for name in arguments.names:
+        make(read_build(name), arguments.folder / name, arguments.pin)
+        others = [line for line in read_scores() if line["build"] != name]
+        lines = sorted(others + scores_of(read_build(name), arguments.folder / name), key=lambda line: line["build"])
+        with SCORES.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, lines[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(lines)
+        for file, text in texts(lines).items():
+            (FOLDER / file).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
