@@ -161,7 +161,7 @@ README = """\
 ---
 pretty_name: {name}
 {licence_key}task_categories: [image-to-image]
-tags: [raw, bayer, denoising, image-restoration, synthetic]
+tags: [raw, denoising, image-restoration, synthetic]
 size_categories: [{size}]
 ---
 
@@ -181,7 +181,7 @@ size_categories: [{size}]
 ## How it was made
 
 Each source is unprocessed to linear raw light (tone curve, gamma, colour matrix and white balance are inverted),
-sampled by a Bayer mosaic, and recorded with simulated sensor noise. Clean and noisy frame differ by random draws only.
+sampled by the sensor's pattern, and recorded with simulated noise. Clean and noisy frame differ by random draws only.
 These settings and the others in `config.yaml` decide every byte:
 
 {settings}
@@ -251,7 +251,7 @@ def _croissant(described: _Described, given: Statements) -> str:
         name=described.name,
         description=described.summary,
         conforms_to=[CROISSANT],
-        keywords=["raw", "bayer", "denoising", "image restoration", "synthetic"],
+        keywords=["raw", "denoising", "image restoration", "synthetic"],
         license=[given.licence] if given.licence else None,
         date_published=given.published or None,
         cite_as=" ".join(CITATIONS),
