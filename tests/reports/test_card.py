@@ -39,7 +39,7 @@ def copy(made: Path, tmp_path: Path) -> Path:
     return tmp_path / "ds"
 
 
-def test_card_is_written_beside_the_dataset_and_changes_nothing(
+def test_card_is_written_into_the_dataset_and_changes_nothing(
     copy: Path, made: Path, run_main: RunMain, tree_hash: TreeHash
 ) -> None:
     for _ in range(2):  # the same card is no obstacle
