@@ -213,10 +213,11 @@ def test_clipped_sites_agree_with_the_manifest(made: Path, text: str) -> None:
 
 @pytest.mark.slow
 def test_omitted_effects_are_listed_with_their_reason(make: Make, tmp_path: Path) -> None:
-    make(None, tmp_path / "ds", "source.limit=2", "noise=sony_a7s2", "effects.prnu=off", "source.patch=[random,64,3]")
+    camera = ["noise=oppo_reno10x", "noise.iso=[uniform,100,3200]", "effects.prnu=off"]
+    make(None, tmp_path / "ds", "source.limit=2", *camera, "source.patch=[random,64,3]")
     text = dataset_report.dataset_page(tmp_path / "ds")
     assert '<tr><td>prnu</td><td class="n">6</td><td>switched off</td></tr>' in text
-    assert '<tr><td>column</td><td class="n">6</td><td>noise=sony_a7s2 gives no column_std_dn</td></tr>' in text
+    assert '<tr><td>row</td><td class="n">6</td><td>noise=oppo_reno10x gives no row_std_dn</td></tr>' in text
     assert "<b>read_std_dn</b>" in text
     assert "<dd>2, rows 6</dd>" in text
 
