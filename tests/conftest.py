@@ -8,6 +8,7 @@ import hashlib
 import itertools
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -25,20 +26,27 @@ from helpers.commands import COMMAND, Cli, Done, RunMain, run_process
 from helpers.configs import composed
 from helpers.datasets import MadeHash, Make, Settings, TreeHash
 from helpers.photographs import pixels
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from PIL import Image
 
 from unprocess_gen.cli import main as entry_point
 from unprocess_gen.config import composition
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import replaced
+from unprocess_gen.config.schema import GROUPS, Config, replaced
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.sources.scenes import synthetic
 
 _BUCKETS = itertools.count()
+
+KEY = re.compile(rf"(({'|'.join(GROUPS)})\.\w+|{'|'.join(settings_of(Config))})=")
+"""Begin of an override that sets the value of a key."""
 
 pytest_plugins = ["helpers.linux_only", "helpers.promise_report"]
 
@@ -116,22 +124,30 @@ def _options_parsed_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _composed_once() -> Iterator[None]:
-    """Let Hydra compose equal overrides of the package's options once: a composition takes 0.1 s, a third are equal.
+    """Let Hydra compose equal choices of the package's options once, and set the values of keys in a copy.
 
-    Compositions with other folders of options, and those that fail, are done each time.
+    A composition takes 0.1 s. Those with other folders of options, and those that fail, are done each time.
     """
-    compose = hydra.compose
-    kept: dict[tuple[str, ...], bytes] = {}
+    compose, kept = hydra.compose, dict[tuple[str, ...], bytes]()
 
     def composed_once(name: str, overrides: list[str], **options: bool) -> Any:
         folders = [one.path for one in GlobalHydra.instance().config_loader().get_search_path().get_path()]
         added = any("searchpath" in one for one in overrides)
         if added or composition._own_folder or str(conf_dir()) not in folders or not options:
             return compose(name, overrides, **options)
-        key = (name, *folders, *overrides)
+        values = [one for one in overrides if KEY.match(one)]
+        choices = [one for one in overrides if one not in values]
+        key = (name, *folders, *choices)
         if key not in kept:
-            kept[key] = pickle.dumps(compose(name, overrides, return_hydra_config=True))
+            kept[key] = pickle.dumps(compose(name, choices, return_hydra_config=True))
         node = pickle.loads(kept[key])
+        try:
+            parsed = OverridesParser.create().parse_overrides(values)
+            assert not any(one.is_sweep_override() for one in parsed)
+            ConfigLoaderImpl._apply_overrides_to_config(parsed, node)
+        except (HydraException, AssertionError):
+            return compose(name, overrides, **options)
+        node.hydra.overrides.task = [one for one in overrides if not one.startswith("hydra")]
         node.hydra.runtime.cwd = str(Path.cwd())
         return node
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import os
 import re
 import signal
@@ -70,29 +71,18 @@ def test_full_stdout_gives_one_line_and_exit_code_5(
     assert (done.code, messages(done.err)) == (5, [FULL])
 
 
-SLOW_TO_START = [name for name in COMMANDS if name not in ("help", "plan")]
-
-
-@pytest.mark.parametrize(
-    "name", ["help", "plan", *(pytest.param(one, marks=pytest.mark.slow) for one in SLOW_TO_START)]
-)
+@pytest.mark.parametrize("name", slow_except(("help", "verify"), COMMANDS))
 def test_full_stdout_of_a_process_gives_exit_code_5(name: str, folder: Path) -> None:
     done = shell('exec "$@" > /dev/full', folder, *COMMANDS[name])
     assert (done.returncode, messages(done.stderr)) == (5, [FULL])
 
 
 STREAMS = [">&-", "2>&-", "2>/dev/full", "<&- >&- 2>&-"]
-QUICK = [("generate", "<&- >&- 2>&-"), ("generate", "2>/dev/full"), *(("help", stream) for stream in STREAMS)]
+QUICK = [("verify", "<&- >&- 2>&-"), ("generate", "2>/dev/full"), *(("help", stream) for stream in STREAMS)]
+CASES = itertools.product(("help", "generate", "plan", "verify"), STREAMS)
 
 
-@pytest.mark.parametrize(
-    ("name", "stream"),
-    [
-        pytest.param(name, stream, marks=() if (name, stream) in QUICK else pytest.mark.slow)
-        for name in ("help", "generate", "plan", "verify")
-        for stream in STREAMS
-    ],
-)
+@pytest.mark.parametrize(("name", "stream"), slow_except(QUICK, CASES))
 def test_closed_streams_and_full_stderr_do_not_end_a_command(name: str, stream: str, folder: Path) -> None:
     done = shell(f'exec "$@" {stream}', folder, *COMMANDS[name])
     assert done.returncode == 0
@@ -104,7 +94,7 @@ def test_mistake_keeps_its_exit_code_without_stderr(folder: Path) -> None:
     assert shell('exec "$@" 2>&-', folder, "verify", "no such folder").returncode == 2
 
 
-@pytest.mark.parametrize("name", ["help", "plan", pytest.param("verify", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", slow_except(("help", "verify"), ("help", "plan", "verify")))
 def test_broken_pipe_gives_exit_code_141_without_a_message(name: str, folder: Path) -> None:
     done = shell('{ "$@"; echo $? >&3; } 3>&2 | true', folder, *COMMANDS[name])
     assert done.stderr in ("141\n", "0\n")  # 0: the pipe still had a reader
@@ -284,7 +274,7 @@ def test_error_that_replaces_a_signal_is_reported_as_the_signal(number: signal.S
 
 
 def test_nohup_is_respected(tmp_path: Path) -> None:
-    process = start(tmp_path, "source.limit=2", "n_jobs=1", "out=ds", prefix=("nohup",))
+    process = start(tmp_path, "source.limit=1", "n_jobs=1", "out=ds", prefix=("nohup",))
     wait_for((tmp_path / "ds/.work").exists)
     process.send_signal(signal.SIGHUP)
     process.communicate(timeout=WAIT_S)

@@ -183,7 +183,7 @@ commit, made = worker.commit_shard, []
 def commits(storage, shard):
     report = commit(storage, shard)
     made.append(shard)
-    if len(made) == 18:
+    if len(made) == 6:
         os.kill(os.getpid(), signal.SIGKILL)
     return report
 
@@ -191,7 +191,7 @@ def commits(storage, shard):
 worker.commit_shard = commits
 main()
 """
-"""A command that is killed once it has committed 18 shards."""
+"""A command that is killed once it has committed 6 shards."""
 
 
 @pytest.mark.linux_only("kills a process by a signal")
@@ -217,13 +217,13 @@ def test_repair_of_a_sweep_leaves_jobs_without_a_dataset(run_main: RunMain, sour
 
 
 def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path) -> None:
-    source = fill(tmp_path / "p", 12)
+    source = fill(tmp_path / "p", 4)
     arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")
     folders = [f"{folder},output.pairs_per_shard=1" for folder in FOLDERS]
     command = [sys.executable, "-c", KILLED, *arguments]
     killed = subprocess.run(command, cwd=tmp_path, env=environment(PYTHONPATH=PATHS), capture_output=True, check=False)
     assert killed.returncode == -signal.SIGKILL
-    assert len(list((tmp_path / "sweep").glob("*/shards/*.tar"))) == 18
+    assert len(list((tmp_path / "sweep").glob("*/shards/*.tar"))) == 6
     assert len(list((tmp_path / "sweep").glob("*/dataset.json"))) == 1
 
     done = run_main(*arguments)

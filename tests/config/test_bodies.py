@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import Settings
 
@@ -31,7 +32,7 @@ def test_every_physical_profile_has_a_body() -> None:
     assert set(BODIES) == set(physical_profiles())
 
 
-@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("body", slow_except(("sony_a7s2", "oppo_reno10x"), BODIES))
 def test_body_has_matrix_levels_and_noise_of_one_camera(body: str, settings: Settings) -> None:
     config = settings(f"body={body}")
     levels = [getattr(config.sensor, key) for key in SENSOR_KEYS[:3]]

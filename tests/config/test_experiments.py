@@ -219,7 +219,7 @@ def test_crvd_like_supports_every_iso_twice(make: Make, tmp_path: Path) -> None:
 
 def test_eld_low_light_has_isos_and_factors_of_its_dataset(make: Make, tmp_path: Path) -> None:
     """Section 5 of the paper: ISO 800, 1600, 3200; factors 100 and 200. K of the release: Kmin 0.415039 at ISO 100."""
-    fill(tmp_path / "photos", 10)
+    fill(tmp_path / "photos", 6)
     make(tmp_path / "photos", tmp_path / "ds", f"+{RECIPE}=eld_low_light")
     rows = [row for *_, row in RawPairs(tmp_path / "ds")]
     assert {row["iso"] for row in rows} == {800, 1600, 3200}

@@ -31,7 +31,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-QUICK = ("README.md", "docs/quickstart.md")
+QUICK = ("README.md",)
 """Pages whose blocks run in the quick tests; the others run with ``-m slow``."""
 
 COMMENT = re.compile(r"<!-- (not run|needs|exit code|output)(?:: (.+?))? -->")

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 from helpers.commands import run_process
-from helpers.photographs import pixels
-from PIL import Image
 
 ROOT = Path(__file__).parents[2]
 CURVES = "unprocess_gen/core/data/curves_16bit.npz"
@@ -70,17 +68,13 @@ def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
-def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path: Path) -> None:
-    """Without compiling: an installation has a cache of kernels of its own."""
-    Image.fromarray(pixels(1, 8, 12)).save(tmp_path / "a.png")
+def test_the_installed_command_reads_its_own_files(installed: Path, tmp_path: Path) -> None:
     code = "import unprocess_gen; print(unprocess_gen.__file__)"
     where = run_process(installed / "python", "-c", code, cwd=tmp_path, PYTHONPATH="")
-    arguments = ("source.root=a.png", "n_jobs=1", "accuracy=reference", "out=ds")
-    done = run_process(installed / "gen-dataset", *arguments, cwd=tmp_path, PYTHONPATH="", NUMBA_DISABLE_JIT="1")
+    done = run_process(installed / "gen-dataset", "--cfg", "job", "camera=choice", cwd=tmp_path, PYTHONPATH="")
 
     assert Path(where.stdout.strip()).is_relative_to(installed.parent)
-    assert done.returncode == 0, done.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "ds"]
+    assert (done.returncode, "law: choice" in done.stdout) == (0, True), done.stderr
 
 
 @pytest.mark.slow
@@ -89,10 +83,3 @@ def test_the_installed_command_compiles_its_kernels(installed: Path, tmp_path: P
 
     assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ds"]
-
-
-def test_the_editable_installation_sees_the_source_tree(tmp_path: Path) -> None:
-    done = run_process(sys.executable, "-m", "unprocess_gen", "--cfg", "job", "camera=choice", cwd=tmp_path)
-
-    assert done.returncode == 0, done.stderr
-    assert "law: choice" in done.stdout
