@@ -38,7 +38,7 @@ CANDIDATES = [
     ("gen-dataset --vers", ["--version"]),
     ("gen-dataset verify --r", ["--regenerate", "--repair"]),
     ("gen-dataset verify ds --log", ["--log-file"]),
-    ("gen-dataset again ds o", ["out="]),
+    ("gen-dataset again ds o", ["out=", "output.frames="]),
     ("gen-dataset again ds so", ["source.max_failed=", "source.root="]),
     ("gen-dataset completion ", ["bash", "zsh"]),
     ("gen-dataset 'camera=nex", ["camera=nexus_6p"]),

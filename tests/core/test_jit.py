@@ -102,6 +102,7 @@ def test_another_process_loads_the_machine_code(compiled: Copy) -> None:
     assert compiled.call() == "True 2.0 1"
 
 
+@pytest.mark.slow
 def test_editing_other_packages_keeps_machine_code(copy: Copy) -> None:
     copy.write("cli/main.py", "x = 2")
     copy.write("cli/new.py", "y = 3")
@@ -109,6 +110,7 @@ def test_editing_other_packages_keeps_machine_code(copy: Copy) -> None:
     assert copy.call() == "True 2.0 1"
 
 
+@pytest.mark.slow
 @content_stamps
 def test_other_modification_times_keep_machine_code(copy: Copy) -> None:
     for path in copy.package.rglob("*.py"):

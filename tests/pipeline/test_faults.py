@@ -436,7 +436,8 @@ def test_full_disk_is_a_system_error_that_costs_no_byte(
     figure("disk-full", f"same bytes in {len(fulls)} of {len(fulls)} reruns, disks of {min(sizes)} to {max(sizes)} KiB")
 
 
-@pytest.mark.parametrize("n_jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("n_jobs", [1, 2])
 def test_full_disk_ends_with_5_within_five_seconds(
     n_jobs: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, empty_disk: Disk
 ) -> None:

@@ -2,8 +2,8 @@
 
 Each test makes one small dataset in a new process under settings that change the code path of a library, and compares
 every byte with a plain run. The process reports whether the settings took effect (`everywhere`); a setting that a
-library no longer knows proves nothing. A quick test applies all settings of libraries at once. Slow tests apply them
-one by one, to name the setting that changes a byte; they also compile the kernels with other options.
+library no longer knows proves nothing. A slow test applies all settings of libraries at once, others apply them one by
+one, to name the setting that changes a byte; they also compile the kernels with other options.
 
 A change in the last place of a double changes one DN in 10^12 sites, so that bytes alone could miss it. Doubles before
 rounding are therefore compared too, and the machine code of the kernels is inspected for x86-64 with AVX-512, Arm and
@@ -155,7 +155,8 @@ OLD_OPENCV = {"OPENCV_CPU_DISABLE": ",".join(everywhere.opencv_features()), "OPE
 LIBRARIES = OLD_OPENCV | {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED), "GLIBC_TUNABLES": WITHOUT_FMA}
 
 
-@pytest.mark.parametrize("flags", [(), *(pytest.param((flag,), marks=pytest.mark.slow) for flag in ("-O", "-OO"))])
+@pytest.mark.slow
+@pytest.mark.parametrize("flags", [(), ("-O",), ("-OO",)])
 def test_all_settings_together_change_no_byte(flags: tuple[str, ...], make: Make, plain: Made, figure: Figure) -> None:
     """Libraries use their oldest code; ``-O`` compiles all Python modules again, without assertions."""
     made = make(sys.executable, *flags, **SURROUNDINGS, **LIBRARIES)

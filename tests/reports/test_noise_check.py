@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.noise_faults import (
@@ -140,7 +141,10 @@ def alarms(pairs: Sequence[Checked]) -> list[Alarm]:
 # Untouched pairs ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", LAWS)
+QUICK_LAWS = ("default", "float32 without limits", "clipped at black, packed", "correlated rows")
+
+
+@pytest.mark.parametrize("name", slow_except(QUICK_LAWS, LAWS))
 def test_untouched_pairs_raise_no_alarm(name: str, settings: Settings) -> None:
     pairs = [*checked(settings, LAWS[name], 0), *checked(settings, LAWS[name], 1)]
     assert any(scores for _, scores in pairs)
@@ -153,7 +157,7 @@ END_LAWS = (
 )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_except(("patch of 64", "black", "white"), KINDS))
 def test_black_and_white_sites_raise_no_alarm(kind: str, settings: Settings) -> None:
     for overrides in END_LAWS:
         pairs = [pair for n in range(4) for pair in checked(settings, overrides, n, kind=kind)]
