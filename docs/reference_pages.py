@@ -16,7 +16,7 @@ from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.forms import spelled as spelled_form
 from unprocess_gen.config.interpretation import needed_numbers
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings
+from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings, group_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import REASONS
@@ -91,7 +91,7 @@ def settings_page() -> str:
         options = [option for option in group_options(group) if option != "default"]
         if options:
             blocks.append(_options(group, options, defaults[group]))
-        settings = settings_of(kind)
+        settings = group_settings(group)
         if options and len(options) > 1:
             chosen = f", with their values in `{group}={defaults[group]}`" if defaults[group] else ""
             blocks.append(f"Keys{chosen}:")

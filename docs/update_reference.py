@@ -16,7 +16,7 @@ from pathlib import Path
 import grimp
 
 from unprocess_gen.cli.help import description
-from unprocess_gen.config.schema import GROUPS, Config
+from unprocess_gen.config.schema import GROUPS, Config, group_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import value_text
 
@@ -112,7 +112,7 @@ def keys_of_help() -> str:
         f"{name}={value_text(getattr(Config, name))}": description(setting)
         for name, setting in settings_of(Config).items()
     }
-    groups = {group: list(settings_of(kind)) for group, kind in GROUPS.items()}
+    groups = {group: list(group_settings(group)) for group in GROUPS}
     return json.dumps({"groups": groups, "top": top}, indent=1) + "\n"
 
 

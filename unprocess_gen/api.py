@@ -25,7 +25,7 @@ from unprocess_gen.config.values import refusal
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.types import PACKED, Frame, Pair, Patch, Plan, Row, Source, Srgb, Value
+from unprocess_gen.core.types import PACKED, Frame, Pair, Patch, Photograph, Plan, Row, Source, Srgb, Value
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import pair_row, plan_from_row
 from unprocess_gen.dataset.reader import mosaic_dn
@@ -422,7 +422,7 @@ def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> P
             )
     recorded = _downscaled(pixels, config.source.downscale)
     _full_frame(recorded, config.output.layout)
-    return plan_pixels(settings, recorded, _array_source(pixels, identity), identity)
+    return plan_pixels(settings, Photograph(recorded, 1), _array_source(pixels, identity), identity)
 
 
 def _array_source(pixels: Srgb, identity: str) -> Source:

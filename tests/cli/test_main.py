@@ -40,7 +40,7 @@ REFUSED = [
     (["~camera"], r"~camera: a setting cannot be removed"),
     (["+camera=convex"], r".*camera.*more than once"),
     (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
-    (["word"], r"word: no such verb; expected generate, .*again, build, calibrate, completion or settings key=value"),
+    (["word"], r"word: no such verb; expected generate, .*build, calibrate, camera, completion or settings key=value"),
     (["camera=convex", "word"], r"generate: word: expected a setting key=value"),
     (["camera.name"], r"generate: camera.name: expected a setting key=value"),
     ([""], r"."),

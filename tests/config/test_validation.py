@@ -101,7 +101,7 @@ effects: default
 accuracy: reference exact fast
 output: webdataset
 executor: local dask
-experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body
+experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training
 sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
 """
 """Options that commands of users name."""

@@ -77,6 +77,12 @@ PHYSICAL = PLAN.replace(effects=("prnu", "shot", "read", "quantise"), skipped=("
 DARK = PHYSICAL.replace(dark=DarkFramePlan("ab" * 32, (2, 4), 512.0, 0.5, "cd" * 32))
 
 
+RAW = PHYSICAL.replace(
+    shrink=4, raw_pattern="XTRANS", raw_black_dn=(512.25, 1e-05, 513.0, 0.0), raw_white_dn=(16383.0,) * 4,
+    mosaic_xxh3="ab" * 16, source_iso=100.0, source_exposure_s=0.04, own_a_dn=0.5, own_b_dn2=2.25,
+)  # fmt: skip
+
+
 def csv_text(rows: Iterable[Row]) -> str:
     stream = io.StringIO(newline="")
     write_rows(stream, rows)
@@ -180,7 +186,9 @@ def test_columns_have_the_order_of_the_contract() -> None:
 OF_DARK_FRAMES = {column.empty_if for column in COLUMNS if column.name.startswith("dark_") and column.since == "0.2"}
 (NO_LIGHT,) = (column.empty_if for column in COLUMNS if column.name == "cct_k")
 UNMIXED = "there is no mixture, or the source failed"
+OF_RAW = {column.empty_if for column in COLUMNS if "raw" in column.empty_if}
 BY_DEFAULT = {
+    *OF_RAW,
     NO_LIGHT,
     UNMIXED,
     "exposure_ratio is 1, or output.frames is false",
@@ -216,6 +224,7 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
         "light": (row_of(PHYSICAL.replace(light="a", cct_k=2856.0)), passed | absent - {NO_LIGHT}),
         "mixture": (row_of(PHYSICAL.replace(mixture=0)), passed | absent - {UNMIXED}),
         "dark frame": (row_of(DARK), passed | absent - OF_DARK_FRAMES),
+        "raw": (row_of(RAW), passed | absent - OF_RAW),
         "assumed": (row_of(PHYSICAL.replace(assumed=("prnu_std",))), passed | absent - {unassumed}),
         "float clean": (row_of(PHYSICAL.replace(clean_dtype="float32")), passed | absent - {same}),
         "without effects": (row_of(bare), passed | absent | {one for one in failed if one.startswith("no effect")}),
@@ -229,6 +238,7 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
 
 
 def test_every_value_of_a_row_has_its_columns_type() -> None:
+    assert plan_from_row(row_of(RAW)) == RAW
     for plan in (PLAN, PHYSICAL):
         row = row_of(plan)
         assert list(row) == list(NAMES)

@@ -21,7 +21,7 @@ from unprocess_gen.config.defaults import default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, ProvenanceConfig, all_settings
+from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.dataset.columns import COLUMNS
@@ -103,13 +103,15 @@ def test_every_setting_is_explained() -> None:
         assert setting.meaning and not setting.meaning.endswith("."), key
         assert str(setting.limit), key
         assert setting.unit.startswith(promised_unit(name)), key
-        assert f"| `{name}` |" in section(group), key
+        outer, _, inner = group.partition(".")
+        assert f"| `{f'{inner}.' * bool(inner)}{name}` |" in section(outer), key
 
 
 def test_settings_declare_all_keys_of_the_schema() -> None:
-    for kind in (*GROUPS.values(), BranchConfig, ProvenanceConfig, Config):
+    for kind in (*GROUPS.values(), *NESTED.values(), BranchConfig, ProvenanceConfig, Config):
         plain = {field.name for field in dataclasses.fields(kind)} - set(settings_of(kind))
-        assert plain == (set(GROUPS) if kind is Config else set())
+        nested = {place.partition(".")[2] for place in NESTED if kind is GROUPS.get(place.partition(".")[0])}
+        assert plain == (set(GROUPS) if kind is Config else nested)
 
 
 def test_null_is_explained_if_it_is_a_default() -> None:

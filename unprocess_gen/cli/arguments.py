@@ -286,11 +286,11 @@ def path_hint(word: str) -> str:
 
 def _setting_hint(verb: Verb, flag: str) -> str:
     """Return what to write instead of a setting with hyphens, such as ``--out``."""
-    from unprocess_gen.config.schema import GROUPS, Config  # imports NumPy, too slow for --help
+    from unprocess_gen.config.schema import GROUPS, Config, group_settings  # imports NumPy, too slow for --help
 
     name, _, value = flag.lstrip("-").partition("=")
     group, _, key = name.partition(".")
-    keys = settings_of(GROUPS.get(group, Config))
+    keys = group_settings(group) if group in GROUPS else settings_of(Config)
     if name in verb.settings or (verb.composes and (name in GROUPS or (key or name) in keys)):
         return f"; {name} is a setting: write {name}={value or '…'}"
     return ""

@@ -18,7 +18,7 @@ from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.limits import BOOLEAN, Choice
 from unprocess_gen.config.option_files import build_names, conf_dir, group_options
-from unprocess_gen.config.schema import GROUPS, Config, all_settings
+from unprocess_gen.config.schema import GROUPS, Config, all_settings, group_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.suggestions import did_you_mean
@@ -97,7 +97,7 @@ def _settings(current: str, folders: list[Path]) -> list[str]:
     """Return keys as far as they are typed: ``camera=``, ``camera.``, and the keys of ``camera.`` once it is typed."""
     group = current.partition(".")[0]
     if "." in current:
-        return [f"{group}.{name}=" for name in settings_of(GROUPS[group])] if group in GROUPS else []
+        return [f"{group}.{name}=" for name in group_settings(group)] if group in GROUPS else []
     added = {path.name for folder in folders for path in folder.glob("*/")} - set(GROUPS)
     chosen = [name for name in GROUPS if len(group_options(name, *folders)) > 1]
     keys = [f"{name}=" for name in (*settings_of(Config), *chosen)]

@@ -10,7 +10,7 @@ from pathlib import Path
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.settings import Setting, settings_of
+from unprocess_gen.config.settings import Setting
 from unprocess_gen.config.values import value_text
 
 WIDTH = 100
@@ -89,7 +89,7 @@ def exit_code_lines() -> str:
 
 def group_help(group: str, conf: Path) -> str:
     """Return the help of one group of settings: its options and its keys."""
-    from unprocess_gen.config.schema import GROUPS
+    from unprocess_gen.config.schema import GROUPS, group_settings
 
     parts = []
     options = [option for option in group_options(group, conf) if option != "default"]
@@ -100,12 +100,15 @@ def group_help(group: str, conf: Path) -> str:
     if group in GROUPS:
         from unprocess_gen.config.defaults import default_options, default_values
 
-        values, option = default_values(group), default_options().get(group) or "default"
+        settings = group_settings(group)
+        nested = {name.rpartition(".")[0] for name in settings if "." in name}
+        inside = {f"{one}.{name}": value for one in nested for name, value in default_values(f"{group}.{one}").items()}
+        values, option = default_values(group) | inside, default_options().get(group) or "default"
         chosen = f" with {group}={option}" if option != "default" else ""
         title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"
         lines = [
             _two_columns(f"{name}={value_text(values[name])}"[: WIDTH - 2], description(setting))
-            for name, setting in settings_of(GROUPS[group]).items()
+            for name, setting in settings.items()
         ]
         parts.append("\n".join([title, *lines]))
     return "\n\n".join(parts) + "\n"

@@ -268,6 +268,23 @@ _VERBS = (
         Place("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
     ),
     Verb(
+        "camera",
+        "write a camera option, and a sensor option, from one raw file",
+        "camera.camera",
+        (
+            _to("write the matrix of the camera to CAMERA.yaml", "CAMERA", required=True),
+            Argument(
+                ("--sensor",),
+                "write pattern, bits and levels to SENSOR.yaml",
+                "SENSOR",
+                _local_path,
+                "a local file",
+                "files",
+            ),
+        ),
+        Place("FILE", "the raw file: a DNG, or another one that LibRaw reads", "files"),
+    ),
+    Verb(
         "completion",
         'print a completion script: eval "$(gen-dataset completion bash)"',
         "completion.completion",

@@ -37,6 +37,7 @@ from unprocess_gen.config.composition_errors import assignment, explain, unknown
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.mixture import read_entries
 from unprocess_gen.config.option_files import OPTIONAL_GROUPS, check_override, conf_dir
+from unprocess_gen.config.raw_composition import NOT_APPLIED, OF_FILE, source_overrides
 from unprocess_gen.config.schema import ENTRY_GROUPS, Config, MixtureEntry
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import entry_errors, validate_config
@@ -124,7 +125,11 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     try:
         _check_own_options(overrides, folders)
         with _hydra_for(folders):
-            return hydra.compose(folders.name or "config", [*map(hydra_override, overrides)], return_hydra_config=True)
+            given, name = [*map(hydra_override, overrides)], folders.name or "config"
+            node = hydra.compose(name, given, return_hydra_config=True)
+            if added := source_overrides(node, overrides):
+                node = hydra.compose(name, [*given, *added], return_hydra_config=True)
+            return node
     except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
         raise ConfigError(explain(error, overrides)) from error
 
@@ -165,11 +170,15 @@ def _with_entries(config: Config, node: DictConfig, settings: Any, overrides: Se
     places = {source.provider: Path(source.path) for source in settings.runtime.config_sources if source.path}
     folders = OptionFolders(places["main"], settings.job.config_name, places.get("command-line"))
     given = [one for one in settings.overrides.task if one.lstrip("+").partition("=")[0] != "mixture"]
+    if config.source.kind == "raw":  # each entry is composed with what follows from the kind
+        given = [one for one in given if one != OF_FILE and not one.startswith("source.include=")]
     outside = _settings_outside(node, settings.runtime.choices, given, overrides, folders)
     entries = []
     for number, (weight, options, values) in enumerate(read_entries(config.mixture)):
         with entry_errors(number):
             for key in (*options, *values):
+                if config.source.kind == "raw" and (group := key.partition(".")[0]) in NOT_APPLIED:
+                    raise ConfigError(f"{key}: source.kind=raw: {group} inverts the {NOT_APPLIED[group]}; remove it")
                 if key in outside:
                     problem = f"{outside[key]} is set outside of the mixture too; expected one of both; remove one"
                     raise ConfigError(f"{key}: {problem}")

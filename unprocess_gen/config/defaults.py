@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import GROUPS, Config
+from unprocess_gen.config.schema import GROUPS, NESTED, Config
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 
@@ -19,12 +19,18 @@ def default_options() -> dict[str, str | None]:
 
 def default_values(group: str) -> dict[str, Any]:
     """Return the default values of a group, or of the top level (``""``), as YAML has them; interpolations are text."""
+    if group in NESTED:
+        outer, _, name = group.partition(".")
+        return {**vars(NESTED[group]()), **_written(outer)[name]}
     schema = GROUPS[group]() if group else Config()
     values = {name: getattr(schema, name) for name in settings_of(schema)}
-    written = read_yaml_mapping(conf_dir() / "config.yaml")
+    return values | {name: value for name, value in _written(group).items() if name in values}
+
+
+def _written(group: str) -> dict[str, Any]:
+    """Read what the primary config and the default option of a group set."""
+    written: dict[str, Any] = read_yaml_mapping(conf_dir() / "config.yaml")
+    option = default_options().get(group)
     if group:
         written = written.get(group, {})
-        option = default_options().get(group)
-        if option is not None:
-            written = read_yaml_mapping(conf_dir() / group / f"{option}.yaml") | written
-    return values | {name: value for name, value in written.items() if name in values}
+    return written if option is None else read_yaml_mapping(conf_dir() / group / f"{option}.yaml") | written

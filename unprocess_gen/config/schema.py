@@ -50,6 +50,39 @@ class Group:
                 object.__setattr__(self, name, frozen(value))
 
 
+PATTERN = Choice("RGGB", "BGGR", "GRBG", "GBRG")
+
+
+@documented
+@dataclass(frozen=True)
+class RawConfig(Group):
+    """State what files of raw sources do not state, or state wrongly.
+
+    Attributes
+    ----------
+    pattern
+        CFA pattern of mosaics in TIFF, PNG and NPY files
+    black_dn
+        black level of the files
+    white_dn
+        white level of the files
+    a_dn
+        noise of the files themselves: slope of the variance a_dn (x - black) + b_dn2
+    b_dn2
+        noise of the files themselves: variance at black
+    """
+
+    pattern: Optional[str] = key(None, PATTERN, null="that of the file", since="0.3")
+    black_dn: Any = key(None, limits.NumberOrFour(Numbers(0, 65534)), unit="DN", null="that of the file", since="0.3")
+    white_dn: Any = key(None, limits.NumberOrFour(Numbers(1, 65535)), unit="DN", null="that of the file", since="0.3")
+    a_dn: Optional[float] = key(
+        None, Numbers(0, 65535), unit="DN", null="that of the tag NoiseProfile of a DNG", since="0.3"
+    )
+    b_dn2: Optional[float] = key(
+        None, Numbers(0, 65535**2), unit="DN²", null="that of the tag NoiseProfile of a DNG", since="0.3"
+    )
+
+
 @documented
 @dataclass(frozen=True)
 class SourceConfig(Group):
@@ -57,6 +90,9 @@ class SourceConfig(Group):
 
     Attributes
     ----------
+    kind
+        srgb: photographs; raw: clean frames of a camera, DNG and other raw files or 16-bit mosaics (extra raw), of
+        which the light is used: camera, gains and isp are not applied
     root
         folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://
     roots
@@ -94,7 +130,15 @@ class SourceConfig(Group):
         white
     patch
         cut images into square patches, after downscaling
+    shrink
+        of raw sources, side of the cells whose sites of one colour become the mean in one pixel of camera RGB, from
+        which a new mosaic is sampled; 1 keeps the mosaic; X-Trans files need 2 or 4, and have cells of 6
+    own_noise
+        noise of raw sources themselves: subtract lowers the variance that a profile with two numbers adds by that of
+        the source, down to 0; the column zero_variance counts the sites where the source has as much or more
     """
+
+    kind: str = key("srgb", Choice("srgb", "raw"), since="0.3")
 
     root: Optional[str] = key(
         None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
@@ -103,7 +147,9 @@ class SourceConfig(Group):
     list: Optional[str] = key(
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False, since="0.3"
     )
-    include: tuple[str, ...] = key((), Limit("a list of at least one pattern such as '*.jpg'"))
+    include: Optional[tuple[str, ...]] = key(
+        (), Limit("a list of at least one pattern such as '*.jpg'"), null="the suffixes of files that kind reads"
+    )
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
@@ -115,6 +161,9 @@ class SourceConfig(Group):
     downscale: int = key(1, Integers(1, 64), unit="pixels")
     dequantize: str = key("off", limits.DEQUANTIZE)
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
+    shrink: int = key(1, Limit("1, 2 or 4", lambda value: value in (1, 2, 4)), unit="sites", since="0.3")
+    own_noise: str = key("keep", Choice("keep", "subtract"), since="0.3")
+    raw: RawConfig = field(default_factory=RawConfig)
 
     @property
     def place(self) -> Root | None:
@@ -201,6 +250,8 @@ class SensorConfig(Group):
 
     Attributes
     ----------
+    levels
+        given: bits, levels and pattern are those below; source: they are those of each raw file (source.kind=raw)
     bits
         bits per sample
     black_level_dn
@@ -232,6 +283,7 @@ class SensorConfig(Group):
     saturated: str = key("noisy", Choice("noisy", "pinned", "white", "auto"))
     dark_offset: str = key("removed", Choice("removed", "kept"))
     units: Any = key("image", NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"))
+    levels: str = key("given", Choice("given", "source"), since="0.3")
 
 
 CHOSEN, PROFILE = "Chosen for a run", "Every profile"
@@ -784,9 +836,20 @@ GROUPS: dict[str, type[Any]] = {
 """Dataclass of each config group, in the order of the config."""
 
 
+NESTED: dict[str, type[Any]] = {"source.raw": RawConfig}
+"""Dataclasses of the groups inside of groups."""
+
+
+def group_settings(group: str) -> dict[str, Setting]:
+    """Return the settings of a group by key, and those of the groups inside of it: ``raw.pattern``."""
+    inside = {place.removeprefix(f"{group}."): kind for place, kind in NESTED.items() if place.startswith(f"{group}.")}
+    nested = {f"{place}.{name}": one for place, kind in inside.items() for name, one in settings_of(kind).items()}
+    return {**settings_of(GROUPS[group]), **nested}
+
+
 def all_settings() -> Iterator[tuple[str, str, Setting]]:
     """Yield every setting of a config with its group, ``""`` for the top level; branches are left out."""
-    for group, kind in [*GROUPS.items(), ("", Config)]:
+    for group, kind in [*GROUPS.items(), *NESTED.items(), ("", Config)]:
         for name, setting in settings_of(kind).items():
             yield group, name, setting
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,7 +26,7 @@ from unprocess_gen.config.interpretation import (
     uses_physics,
 )
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import ENTRY_GROUPS, GROUPS, Config, MixtureEntry, all_settings, frozen
+from unprocess_gen.config.schema import ENTRY_GROUPS, GROUPS, NESTED, Config, MixtureEntry, all_settings, frozen
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
@@ -63,11 +64,13 @@ NUMBER_KEYS = _keys(lambda setting: setting.limit.is_float and setting.decides_d
 """Keys whose numbers are written as floats, because users may write 1 or 1.0."""
 
 
-SOURCE_KINDS = ("folder", "synthetic")
+SOURCE_KINDS = ("folder", "synthetic", "raw")
 
 
 def source_kind(config: Config) -> str:
-    """Return the kind of source that ``config.yaml`` records, ``folder`` or ``synthetic``."""
+    """Return the kind of source that ``config.yaml`` records."""
+    if config.source.kind == "raw":
+        return "raw"
     return "synthetic" if config.source.place is None else "folder"
 
 
@@ -107,7 +110,8 @@ def _canonical_settings(config: Config) -> dict[str, Any]:
     if not has_float_clean(config):
         settings["output"].pop("clean_dtype", None)
     for group, keys in NUMBER_KEYS.items():
-        settings[group] = {key: _canonical(value) if key in keys else value for key, value in settings[group].items()}
+        place = functools.reduce(lambda found, name: found.get(name, {}), group.split("."), settings)
+        place |= {key: _canonical(value) for key, value in place.items() if key in keys}
     return settings
 
 
@@ -127,9 +131,13 @@ def _recorded(group: Any) -> Any:
             omitted = one.name in NOT_RECORDED
         else:
             omitted = not setting.decides_data or bool(setting.since and value == one.default)
-        if not omitted:
+        if not omitted and not (one.name in _NESTED_KEYS and value == type(value)()):
             recorded[one.name] = _recorded(value)
     return recorded
+
+
+_NESTED_KEYS = frozenset(group.rpartition(".")[2] for group in NESTED)
+"""Keys that are groups inside of groups; ``config.yaml`` omits them at their defaults."""
 
 
 def _canonical(value: Any) -> Any:
@@ -163,6 +171,8 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
         raise ConfigError("missing key source.kind")
     kind = loaded["source"].pop("kind")
     one_of("source.kind", kind, SOURCE_KINDS)
+    if kind == "raw":
+        loaded["source"]["kind"] = kind
     config = _build(Config, loaded, "")
     assert isinstance(config, Config)
     if config.mixture is not None:
@@ -184,7 +194,7 @@ def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
     omitted = _OMITTED.get(group, ())
     fields = {one.name: one for one in dataclasses.fields(group) if one.name not in omitted}
-    later = {name for name, setting in settings_of(group).items() if setting.since}
+    later = {name for name, setting in settings_of(group).items() if setting.since} | _NESTED_KEYS
     missing, unknown = fields.keys() - loaded.keys() - later, loaded.keys() - fields.keys()
     for problem, keys in (("missing", missing), ("unknown", unknown)):
         if keys:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import operator
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -34,6 +35,7 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, MIN_GAIN, SWITCH, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
+from unprocess_gen.config.raw_validation import check_raw_source
 from unprocess_gen.config.schema import (
     ENTRY_GROUPS,
     PHYSICAL,
@@ -99,6 +101,7 @@ def _check_values(config: Config) -> None:
         return
     _check_settings(config)
     _check_source(config.source)
+    check_raw_source(config)
     _check_camera(config.camera)
     gain_distributions(config.gains)
     _check_lights(config)
@@ -155,7 +158,7 @@ def _check_settings(config: Config) -> None:
     """Check each value against the limit that the schema declares for it, except values that the profile ignores."""
     physical = is_physical(config.noise)
     for group, name, setting in all_settings():
-        values = getattr(config, group) if group else config
+        values = operator.attrgetter(group)(config) if group else config
         key, value, limit = f"{group}.{name}".lstrip("."), getattr(values, name), setting.limit
         if key in CHECKED_WHERE_USED or (setting.section == PHYSICAL and not physical):
             continue
@@ -175,6 +178,11 @@ def _check_environment(config: Config) -> None:
     _check_places(source)
     if source.root is not None:
         _check_root(source.root)
+    if source.kind == "raw":
+        if source.place is None:
+            raise refusal("source.kind", "raw", "the built-in scenes are pictures; expected frames; give source.root=…")
+        for library in ("rawpy", "tifffile"):
+            require(library, f"source.kind=raw: needs {library}", "raw")
     if source.icc == "refuse":
         require("PIL", "source.icc=refuse: needs Pillow", "icc", ", or set source.icc=ignore")
     if config.executor.kind == "dask":

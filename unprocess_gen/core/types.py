@@ -103,10 +103,16 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """Decoded pixels: ``srgb`` (uint8 or uint16 [H, W, 3], R, G, B), after applying the EXIF ``orientation``."""
+    """Decoded pixels: ``srgb`` (uint8 or uint16 [H, W, 3], R, G, B), after applying the EXIF ``orientation``.
+
+    Of a raw source, ``srgb`` has the codes of its camera RGB, and ``raw`` what the file states. ``note`` is a
+    warning about the file.
+    """
 
     srgb: Srgb
     orientation: int
+    raw: RawParts | None = None
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +221,7 @@ class Facts:
     """Facts about an image's pixels that a plan may depend on: integers, identical on every machine.
 
     ``dark_code`` and ``bright_code`` are the lowest and highest code in any channel, of ``codes`` possible codes.
-    ``frames`` is the number of frames in the clip, 1 for a photograph.
+    ``frames`` is the number of frames in the clip, 1 for a photograph. ``raw`` is what the file of a raw source states.
     """
 
     width: int
@@ -224,6 +230,7 @@ class Facts:
     dark_code: int
     bright_code: int
     frames: int = 1
+    raw: RawParts | None = None
 
 
 REFERENCE_METHOD, FLOAT32_METHOD = "colour:numpy_float64", "colour:fused_float32"
@@ -240,6 +247,13 @@ MOSAIC, PACKED = "mosaic", "packed"
 """Layouts of frames: ``[H, W]``, or ``[4, H / 2, W / 2]`` (`cfa.pack`)."""
 
 
+Levels = tuple[float, ...]
+"""A level in DN for each packed plane: R, G of the red rows, G of the blue rows, B."""
+
+CODE_RANGE = 65535.0
+"""Largest code of a raw source."""
+
+
 @dataclass(frozen=True, slots=True)
 class SourcePlan:
     """Preparation of the source's pixels.
@@ -250,10 +264,54 @@ class SourcePlan:
         Side of the squares of source pixels that were averaged.
     dequantize : str
         ``"off"``, or how 8-bit codes are dithered.
+    shrink : int
+        Of a raw source, side of the cells whose sites of one colour were averaged, 1 for the mosaic itself; 0 for
+        photographs.
+    raw_pattern : str
+        CFA pattern of the file of a raw source.
+    raw_black_dn, raw_white_dn : Levels
+        Levels of that file.
+    mosaic_xxh3 : str
+        XXH3-128 of its decoded mosaic.
+    source_iso, source_exposure_s : float
+        ISO and exposure time that it states; 0 if it does not.
+    own_a_dn, own_b_dn2 : float
+        Noise variance of the source itself in the clean frame, own_a_dn (x - black) + own_b_dn2; 0 if it is not stated.
     """
 
     downscale: int
     dequantize: str
+    shrink: int = 0
+    raw_pattern: str = ""
+    raw_black_dn: Levels = ()
+    raw_white_dn: Levels = ()
+    mosaic_xxh3: str = ""
+    source_iso: float = 0.0
+    source_exposure_s: float = 0.0
+    own_a_dn: float = 0.0
+    own_b_dn2: float = 0.0
+
+    @property
+    def is_raw(self) -> bool:
+        """True for raw sources."""
+        return self.shrink > 0
+
+    @property
+    def code_levels(self) -> tuple[Levels, Levels]:
+        """Codes of a raw source at black and at white, by plane: DN, or after averaging the finest binary steps of it.
+
+        The steps are powers of two of a DN, so that means of 2, 4 and 8 sites of up to 12 bits are exact.
+        """
+        if self.shrink == 1:
+            return self.raw_black_dn, self.raw_white_dn
+        span = min(white - black for black, white in zip(self.raw_black_dn, self.raw_white_dn, strict=True))
+        steps = 1.0
+        while span * steps * 2 <= CODE_RANGE:
+            steps *= 2
+        while span * steps > CODE_RANGE:
+            steps /= 2
+        black = float(int((CODE_RANGE - span * steps) / 2))
+        return (black,) * 4, (black + span * steps,) * 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,6 +385,28 @@ class SensorPlan:
     def span_dn(self) -> int:
         """White level minus black level, DN."""
         return self.white_level_dn - self.black_level_dn
+
+
+class RawParts(NamedTuple):
+    """Parts of a plan that the file of a raw source gives, and its own noise.
+
+    Attributes
+    ----------
+    source : SourcePlan
+        Levels of the file, digest of its mosaic, ISO and exposure time.
+    camera, isp : CameraPlan, IspPlan
+        Colours and curves with which pictures are drawn; frames do not depend on them.
+    sensor : SensorPlan
+        Pattern, bits and levels of the file.
+    noise : (float, float) or None
+        S and O of the variance S·x + O of the source, with x = 0 at black and 1 at white; None if it is not known.
+    """
+
+    source: SourcePlan
+    camera: CameraPlan
+    isp: IspPlan
+    sensor: SensorPlan
+    noise: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,12 +144,15 @@ NO_FRAMES = "the source failed, or output.frames is false"
 
 NO_DARK_FRAME = "there is no dark frame"
 
+NO_RAW = "the source is not raw, or it failed"
+
 NO_VIDEO = "the source failed, unless it is a frame of a video"
 
 
 HEXADECIMAL = Spelling("{:016x}".format, lambda text: int(text, 16))
 LIST = Spelling(";".join, lambda text: tuple(text.split(";")) if text else ())
 SWITCH = Spelling(int, bool)
+LEVEL_LIST = Spelling(lambda levels: ";".join(map(repr, levels)), lambda text: tuple(map(float, text.split(";"))))
 GAMMA = Spelling(
     lambda gamma: number_or_text(gamma_text(gamma)), lambda value: value if value == "srgb" else float(value)
 )
@@ -169,6 +172,9 @@ HEX_64 = Text(re.compile(r"([0-9a-f]{16})?|none"), "16 hexadecimal digits")
 HEX_128 = Text(re.compile(r"([0-9a-f]{32})?"), "32 hexadecimal digits")
 HEX_256 = Text(re.compile(r"([0-9a-f]{64})?"), "64 hexadecimal digits")
 
+
+_LEVEL = r"\d{1,5}(\.\d{1,17})?(e-\d\d)?"
+LEVELS = Text(re.compile(rf"({_LEVEL}(;{_LEVEL}){{3}})?"), "four numbers, separated by ;")
 
 _TARGET = f"({'|'.join(TARGETS)}):({'|'.join(DESCRIPTIONS)}):[0-9a-f]{{32}}"
 
@@ -431,6 +437,27 @@ COLUMNS = (
            in_json=False, empty_if="the gains follow from no light (gains.light=null), or the source failed"),
     Column("mixture", "number of the entry of mixture whose settings the image has, from 0", integers(0, 10**6), Plan,
            since="0.3", in_json=False, empty_if="there is no mixture, or the source failed"),
+    Column("shrink", "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
+           integers(1, 4), SourcePlan, since="0.3", empty_if=NO_RAW),
+    Column("raw_pattern", "CFA pattern of the raw file", Words(("RGGB", "BGGR", "GRBG", "GBRG", "XTRANS")), SourcePlan,
+           since="0.3", empty_if=NO_RAW),
+    *(
+        Column(f"raw_{level}_dn", f"{level} levels of the raw file: R, G of the red rows, G of the blue rows, B, "
+               "separated by ;",
+               LEVELS, SourcePlan, spelling=LEVEL_LIST, since="0.3", unit="DN of the file", empty_if=NO_RAW)
+        for level in ("black", "white")
+    ),
+    Column("mosaic_xxh3", "XXH3-128 of the mosaic that the raw file was decoded to", HEX_128, SourcePlan, since="0.3",
+           empty_if=NO_RAW),
+    Column("source_iso", "ISO of the raw file", Range(0, 1e9), SourcePlan, since="0.3",
+           empty_if="the file states none, or the source is not raw"),
+    Column("source_exposure_s", "exposure time of the raw file", Range(0, 1e7), SourcePlan, since="0.3", unit="seconds",
+           empty_if="the file states none, or the source is not raw"),
+    Column("own_a_dn", "noise of the raw source itself in the clean frame, whose variance is own_a_dn (x - black) + "
+           "own_b_dn2",
+           NOT_NEGATIVE, SourcePlan, since="0.3", unit="DN", empty_if="it is not stated, or the source is not raw"),
+    Column("own_b_dn2", "variance at black of the raw source itself in the clean frame", NOT_NEGATIVE, SourcePlan,
+           since="0.3", unit="DN²", empty_if="it is not stated, or the source is not raw"),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 

@@ -16,7 +16,7 @@ PARQUET_SHA256 = "parquet_sha256"
 class SourceFacts(msgspec.Struct, frozen=True):
     """Hold kind and place of the sources, and the file that lists them."""
 
-    kind: Literal["folder", "synthetic"]
+    kind: Literal["folder", "synthetic", "raw"]
     root: str | None
     roots: tuple[str, ...] = ()
     list: str | None = None

@@ -36,6 +36,9 @@ shorten another. The size decides the bytes of shards."""
 TARGET_JSON_BYTES = 72
 """More bytes for each stored target: its name, dtype and digest."""
 
+RAW_JSON_BYTES = 512
+"""More bytes for a pair of a raw source: its levels, the digest of its mosaic, and what the file states."""
+
 MAX_LINE_BYTES = 2**17
 """Longest line of a manifest that is read. Paths have at most 4096 bytes, three characters each if encoded."""
 
@@ -639,7 +642,7 @@ OTHERS = "others"
 _JSON_COLUMNS = tuple(column for column in COLUMNS if column.in_json)
 
 
-def json_size(source_name: str, pairs: int = 1, targets: int = 0) -> int:
+def json_size(source_name: str, pairs: int = 1, targets: int = 0, is_raw: bool = False) -> int:
     """Return the size of a sample's JSON in the shard.
 
     Parameters
@@ -650,6 +653,8 @@ def json_size(source_name: str, pairs: int = 1, targets: int = 0) -> int:
         Noisy frames of the sample.
     targets : int
         Stored targets of a pair.
+    is_raw : bool
+        Whether the source is raw.
 
     Returns
     -------
@@ -657,7 +662,8 @@ def json_size(source_name: str, pairs: int = 1, targets: int = 0) -> int:
         Bytes, padding included; a multiple of 512.
     """
     named = 2 * len(json.dumps(source_name))  # the name of its clip is a part of it, or equal to it
-    return -(-(JSON_BYTES + named + TARGET_JSON_BYTES * targets) * pairs // 512) * 512
+    more = TARGET_JSON_BYTES * targets + RAW_JSON_BYTES * is_raw
+    return -(-(JSON_BYTES + named + more) * pairs // 512) * 512
 
 
 def row_json(rows: Sequence[Row]) -> bytes:
@@ -683,7 +689,8 @@ def row_json(rows: Sequence[Row]) -> bytes:
     content = {**first, OTHERS: others} if others else first
     text = json.dumps(content, separators=(",", ":")).encode("ascii")
     targets = str(rows[0]["targets"])
-    size = json_size(str(first["source"]), len(rows), targets.count(";") + 1 if targets else 0)
+    is_raw, stored = bool(rows[0]["raw_pattern"]), targets.count(";") + 1 if targets else 0
+    size = json_size(str(first["source"]), len(rows), stored, is_raw)
     if len(text) >= size:
         raise ValueError(f"row {first['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")
     return text.ljust(size - 1) + b"\n"

@@ -38,7 +38,7 @@ def recorded_config(
 
 def _root(folder: AnyPath, kind: str, root: str | None) -> Root | None:
     """Return the root of the sources, given or recorded; None for the built-in scenes."""
-    if kind != "folder":
+    if kind == "synthetic":
         if root is not None:
             raise ConfigError(
                 f"again: source.root={root}: {folder} was generated from a source of kind {kind}; expected no root; "

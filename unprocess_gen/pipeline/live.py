@@ -29,6 +29,7 @@ from unprocess_gen.pipeline.targets import kernels_for, levels_of, noise_law, ta
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.mixture import config_of_key
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
+from unprocess_gen.planning.raw_source import parts_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_crop
 from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
@@ -179,7 +180,7 @@ class LivePairs:
         plan, patch = image.plan, image.patch
         if epoch and self._redraw == "all":
             config, (height, width) = config_of_key(settings.config, plan.stream_key, epoch), srgb.shape[:2]
-            facts = facts_for(config, srgb, image.source.frames)
+            facts = facts_for(config, srgb, image.source.frames, parts_of(plan))
             plan = redraw_plan(config, plan, facts, settings.dark_frames, epoch)
             rule = patch_rule(config.source)
             patch = list_patches(rule, plan.stream_key, height, width, plan.output.layout, epoch)[patch.number]

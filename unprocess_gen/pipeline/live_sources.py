@@ -16,7 +16,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import Recent
-from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Source, Srgb, Value
+from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Source, SourcePlan, Srgb, Value
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import (
     pair_row,
@@ -133,7 +133,7 @@ class RecordedPairs:
 
     def pixels(self, image: LiveImage) -> Srgb:
         """Return the decoded image of a pair; raise as `PairRegenerator.photograph`."""
-        names = image.source, image.sha256, image.plan.source.downscale
+        names = image.source, image.sha256, image.plan.source
         if self._cache is None:
             return self._sources.photograph(*names).srgb
         return self._cache.get(_cache_name(*names), lambda: self._sources.photograph(*names).srgb)
@@ -176,7 +176,7 @@ class PlannedPairs:
         planned = self._planned.get(index)
         if planned is None:
             sha256, photograph = self._decode(source)
-            image = plan_pixels(self.settings, photograph.srgb, source, sha256)
+            image = plan_pixels(self.settings, photograph, source, sha256)
             planned = self._planned.keep(index, (sha256, photograph.orientation, image.plans, image.patches))
         sha256, orientation, plans, patches = planned
         patch, plan = patches[rest // self._plans], plans[rest % self._plans]
@@ -188,7 +188,7 @@ class PlannedPairs:
         """Return the decoded image of a pair; raise as `load_source`."""
         if self._cache is None:
             return self._decode(image.source)[1].srgb
-        name = _cache_name(image.source, image.sha256, self.settings.config.source.downscale)
+        name = _cache_name(image.source, image.sha256, image.plan.source)
         return self._cache.get(name, lambda: self._decode(image.source)[1].srgb)
 
     def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
@@ -203,5 +203,7 @@ class PlannedPairs:
         return decoded[1:]
 
 
-def _cache_name(source: Source, sha256: str, downscale: int) -> str:
-    return f"{sha256}-{source.frame}-{downscale}"
+def _cache_name(source: Source, sha256: str, prepared: SourcePlan) -> str:
+    if prepared.is_raw:
+        return f"{prepared.mosaic_xxh3}-{prepared.shrink}-{array_xxh3(np.array(prepared.code_levels))}"
+    return f"{sha256}-{source.frame}-{prepared.downscale}"

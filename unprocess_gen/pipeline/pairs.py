@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import DarkFrames, Facts, Pair, Patch, Plan, Source, Srgb
+from unprocess_gen.core.types import DarkFrames, Facts, Pair, Patch, Photograph, Plan, Source, Srgb
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.mixture import image_config
 from unprocess_gen.planning.plan import plan_pairs
+from unprocess_gen.planning.raw_source import with_raw_sensor
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.patches import crop_patch, list_patches
@@ -59,6 +60,8 @@ class PlannedImage:
         Facts about the pixels, for physical noise profiles.
     dark_folder : DarkFolder or None
         Access to the dark frames that the plans name.
+    config : Config or None
+        The config of the image; None if the plans are recorded.
     """
 
     srgb: Srgb
@@ -66,6 +69,7 @@ class PlannedImage:
     patches: tuple[Patch, ...]
     facts: Facts | None = None
     dark_folder: DarkFolder | None = None
+    config: Config | None = None
 
     def pairs(self) -> Iterator[tuple[Patch, Plan, Pair]]:
         """Simulate the pairs of every patch, in the order of the manifest; pairs of a patch share their clean frame."""
@@ -75,11 +79,12 @@ class PlannedImage:
                 yield patch, plan, pair
 
 
-def plan_pixels(settings: PairSettings, srgb: Srgb, source: Source, sha256: str) -> PlannedImage:
-    """Plan the pairs of decoded pixels; ``sha256`` is the digest of the source's bytes."""
-    config = image_config(settings.config, *source.stream_identity(sha256))
-    facts = facts_for(config, srgb, source.frames)
+def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, sha256: str) -> PlannedImage:
+    """Plan the pairs of a decoded image; ``sha256`` is the digest of the source's bytes."""
+    srgb, raw = photograph.srgb, photograph.raw
+    config = with_raw_sensor(image_config(settings.config, *source.stream_identity(sha256)), raw)
+    facts = facts_for(config, srgb, source.frames, raw)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, settings.dark_frames)
     height, width = srgb.shape[:2]
     patches = list_patches(patch_rule(config.source), plans[0].stream_key, height, width, config.output.layout)
-    return PlannedImage(srgb, plans, patches, facts, settings.dark_folder)
+    return PlannedImage(srgb, plans, patches, facts, settings.dark_folder, config)

@@ -191,7 +191,7 @@ class _Repair:
 
     def _read_config(self) -> Config:
         config, kind = read_dataset_yaml(self._config_file)
-        config = replaced(config, source_changes((self._root or "") if kind == "folder" else None, self._folder))
+        config = replaced(config, source_changes((self._root or "") if kind != "synthetic" else None, self._folder))
         return with_dark_places(config, self._dark)
 
     # ---------------------------------------------------------------------------------------------------- manifest

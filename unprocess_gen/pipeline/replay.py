@@ -7,22 +7,23 @@ damage of the dataset: it is reported separately, with exit code 5 instead of 4.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from unprocess_gen.config.schema import SourceConfig, at_place
+from unprocess_gen.config.schema import RawConfig, SourceConfig, at_place
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.roots import Root, is_remote, root_path
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source
+from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source, SourcePlan
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import (
@@ -222,7 +223,7 @@ class PairRegenerator:
         plan, names = plan_from_row(row), target_names(row)
         for kernels in kernels_for(names, plan):
             self_test.check(kernels)
-        photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source.downscale)
+        photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source)
         patch = patch_from_row(row)
         height, width = photograph.srgb.shape[:2]
         if patch.y + patch.height > height or patch.x + patch.width > width:
@@ -235,16 +236,22 @@ class PairRegenerator:
         targets = targets_of(names, photograph.srgb, plan, patch, pair, row)
         return {"clean": pair.clean, "noisy": pair.noisy, **targets}
 
-    def photograph(self, source: Source, recorded: str, downscale: int) -> Photograph:
+    def photograph(self, source: Source, recorded: str, prepared: SourcePlan) -> Photograph:
         """Return the decoded source of a row with this SHA-256; raise as `regenerate`."""
         if self._root is None and source.size_bytes != 0:
             raise ConfigError(
                 f"source.root is missing: row {source.index:08d} was generated from the file {source.name}; "
                 "expected its folder; give source.root=…"
             )
-        sha256, photograph = self._load_unchanged(source, recorded, downscale)
+        sha256, photograph = self._load_unchanged(source, recorded, prepared)
         if sha256 != recorded:
             raise SourceChangedError(_changed(sha256, recorded))
+        if photograph.raw is not None and photograph.raw.source.mosaic_xxh3 != prepared.mosaic_xxh3:
+            raise SourceChangedError(
+                f"its file is the same, but is decoded to another mosaic: XXH3-128 is "
+                f"{photograph.raw.source.mosaic_xxh3}, the row records {prepared.mosaic_xxh3}; expected the version of "
+                "LibRaw (rawpy) that dataset.json records"
+            )
         return photograph
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
@@ -269,10 +276,10 @@ class PairRegenerator:
             raise DamageError(difference)
         return arrays
 
-    def _load_unchanged(self, source: Source, recorded: str, downscale: int) -> tuple[str, Photograph]:
+    def _load_unchanged(self, source: Source, recorded: str, prepared: SourcePlan) -> tuple[str, Photograph]:
         """Load a source; raise SourceChangedError unless the file can be read and used as when it was listed."""
         try:
-            return self._load(source, downscale)
+            return self._load(source, prepared)
         except SourceError as error:
             if error.sha256 not in (None, recorded):
                 raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
@@ -281,13 +288,23 @@ class PairRegenerator:
         except MachineError as error:
             raise SourceChangedError(f"{str(error).partition(';')[0]}; {ADVICE}") from error
 
-    def _load(self, source: Source, downscale: int) -> tuple[str, Photograph]:
-        root = None if source.size_bytes == 0 else self._root  # built-in scenes have no bytes
-        config = SourceConfig(**at_place(root), max_pixels=NO_LIMIT, downscale=downscale)
+    def _load(self, source: Source, prepared: SourcePlan) -> tuple[str, Photograph]:
+        config = recorded_source(self._root, source, prepared)
         if self._kept is None or self._kept[:2] != (config, source):
             self._kept = None  # frees the last photograph first: two at a time would take twice the memory
             self._kept = config, source, *load_source(config, source)
         return self._kept[2:]
+
+
+def recorded_source(root: Root | None, source: Source, prepared: SourcePlan) -> SourceConfig:
+    """Return the settings with which the source of a row is decoded again."""
+    place = at_place(None if source.size_bytes == 0 else root)  # built-in scenes have no bytes
+    config = SourceConfig(**place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
+    if not prepared.is_raw:
+        return config
+    pattern = None if PurePosixPath(source.path).suffix.lower() in RAW_FILES else prepared.raw_pattern
+    raw = RawConfig(pattern, prepared.raw_black_dn, prepared.raw_white_dn)
+    return replace(config, kind="raw", shrink=prepared.shrink, raw=raw)
 
 
 def _difference(arrays: Targets, row: Row) -> str:

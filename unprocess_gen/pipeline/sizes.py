@@ -80,7 +80,7 @@ def source_bytes(config: Config, name: str, height: int, width: int, bits: int =
     if min(height, width) < max(smallest, config.source.min_side or 1):
         return 0
     patches = list_patches(rule, 0, height, width, output.layout)
-    json_bytes, total = json_size(name, pairs, len(output.targets)), 0
+    json_bytes, total = json_size(name, pairs, len(output.targets), config.source.kind == "raw"), 0
     srgb_dtype = UINT16 if bits == 16 or config.source.downscale > 1 else UINT8
     for patch in patches:
         noisy = array_format(output.dtype, output.layout, patch.height, patch.width)
@@ -230,7 +230,7 @@ def _size_in_shard(config: Config, source: Source, read: Read) -> int:
     side, bits = config.source.downscale, 8
     if config.source.place is None:
         height, width = synthetic.SIZES.get(source.path, synthetic.DEFAULT_SIZE)
-    elif source.is_video:
+    elif source.is_video or config.source.kind == "raw":
         height, width = load_source(config.source, replace(source, frame=0))[1].srgb.shape[:2]
         side = 1
     else:

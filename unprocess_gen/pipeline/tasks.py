@@ -71,10 +71,13 @@ class ShardLog:
         Failures of the self-test, each once, if ``self_test=go_on`` accepts them.
     times : StageTimes
         Processor time of the stages.
+    notes : list of str
+        Warnings about sources.
     """
 
     failures: dict[str, None] = field(default_factory=dict)
     times: StageTimes = field(default_factory=StageTimes)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def self_test(self) -> str | None:
@@ -217,7 +220,7 @@ class ShardResult:
         }
         failed = [row for row in images if row["status"] == "failed"]
         details = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in failed[:SHOWN]]
-        failures = () if self.killer else tuple(details)
+        failures = () if self.killer else (*details, *self.log.notes[:SHOWN])
         counts = len(images), len(failed), len(self.rows)
         return ShardReport(self.shard, *counts, tuple(clips), self.killer, self.log, failures)
 

@@ -131,8 +131,10 @@ def make_image(
     except SourceError as error:
         _check_not_deleted(config, source, error)
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
+    if photograph.note:
+        log.notes.append(f"{source.name} {photograph.note}")
     with log.times.adding("simulate_s"):
-        image = plan_pixels(context.settings, photograph.srgb, source, sha256)
+        image = plan_pixels(context.settings, photograph, source, sha256)
         noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
     if not config.output.frames:
         identity = sha256, photograph.orientation, shard

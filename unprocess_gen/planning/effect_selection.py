@@ -33,7 +33,7 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Facts, Srgb
+from unprocess_gen.core.types import Facts, RawParts, Srgb
 from unprocess_gen.planning.frame_model import FrameModel, SignalRange, ratio_to_noise
 from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS, Physics
 from unprocess_gen.simulation.effects.prediction import STATISTICS
@@ -48,15 +48,15 @@ BODY_CLIP = 100
 """Frames of a clip for which they are decided."""
 
 
-def facts_of(srgb: Srgb, frames: int = 1) -> Facts:
+def facts_of(srgb: Srgb, frames: int = 1, raw: RawParts | None = None) -> Facts:
     """Return the integer facts about decoded pixels that planning may use; ``frames`` is the length of the clip."""
     height, width = srgb.shape[:2]
-    return Facts(width, height, int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(srgb.max()), frames)
+    return Facts(width, height, int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(srgb.max()), frames, raw)
 
 
-def facts_for(config: Config, srgb: Srgb, frames: int = 1) -> Facts | None:
-    """Return `facts_of` the pixels for a physical noise profile; None for one with two numbers, which needs none."""
-    return facts_of(srgb, frames) if is_physical(config.noise) else None
+def facts_for(config: Config, srgb: Srgb, frames: int = 1, raw: RawParts | None = None) -> Facts | None:
+    """Return `facts_of` the pixels for a physical noise profile or a raw source; others need none."""
+    return facts_of(srgb, frames, raw) if is_physical(config.noise) or raw is not None else None
 
 
 @dataclass(frozen=True, slots=True)

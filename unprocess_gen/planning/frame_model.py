@@ -14,7 +14,7 @@ from operator import add, mul
 from typing import NamedTuple
 
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import CameraPlan, Facts, IspPlan
+from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, SourcePlan
 from unprocess_gen.simulation.effects import BY_NAME, EFFECTS, Physics
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, PerStatistic
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
@@ -45,6 +45,16 @@ def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float
         most = r * (high if r > 0 else low) + g * (high if g > 0 else low) + b * (high if b > 0 else low)
         lowest, highest = min(lowest, least * k), max(highest, most * max(k, 1.0))
     return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
+
+
+def raw_signal_range(facts: Facts, source: SourcePlan, exposure: float, span_dn: float) -> SignalRange:
+    """Return the signal range of a raw source between its lowest and highest code in any plane, DN above black."""
+    levels = list(zip(*source.code_levels, strict=True))
+    lowest, highest = (
+        choose((code - black) / (white - black) for black, white in levels)
+        for choose, code in ((min, facts.dark_code), (max, facts.bright_code))
+    )
+    return SignalRange(*(min(max(min(light, 1.0) * exposure, 0.0), 1.0) * span_dn for light in (lowest, highest)))
 
 
 class FrameModel(FrameFacts):

@@ -20,7 +20,7 @@ from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core import types
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, split_uniform, stream_key
-from unprocess_gen.core.types import DarkFrames, Facts, Plan
+from unprocess_gen.core.types import DarkFrames, Facts, Plan, SourcePlan
 from unprocess_gen.planning.draws import COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
@@ -29,8 +29,9 @@ from unprocess_gen.planning.effect_selection import (
     effect_rules,
     select_effects,
 )
-from unprocess_gen.planning.frame_model import SignalRange, signal_range
+from unprocess_gen.planning.frame_model import SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
+from unprocess_gen.planning.raw_source import NEUTRAL, own_noise, parts_of, with_raw_sensor
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains, chromaticity
@@ -78,7 +79,8 @@ def plan_pairs(
 
 def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int) -> Plan:
     """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay."""
-    levels = _planner(config).levels_of_key(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
+    planner = _planner(with_raw_sensor(config, parts_of(plan)))
+    levels = planner.levels_of_key(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
     noise = plan.noise
     redrawn, _ = next(itertools.islice(levels, noise.level, None))
     return redrawn.replace(draw=noise.draw, frame=noise.frame, dark=noise.dark)
@@ -202,20 +204,29 @@ class Planner:
             raise ValueError("a physical profile needs the facts of the pixels")
         uniforms = parameter_uniforms(key, COUNT, epoch=epoch)
         scene = types.ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
-        camera = self._draw_camera(uniforms)
-        steep = self._steep_accuracy != self._accuracy and is_steep(camera, scene.exposure)
+        raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
+        source, isp = self._source, self._isp
+        if raw is None:
+            camera = self._draw_camera(uniforms)
+        else:
+            source, camera, isp = own_noise(raw, scene.exposure, span_dn), raw.camera, raw.isp
+        steep = self._steep_accuracy != self._accuracy
+        steep = steep and is_steep(camera if raw is None else NEUTRAL, scene.exposure)
         accuracy = self._steep_accuracy if steep else self._accuracy
         signals = None
         if self._is_physical and facts is not None:
-            signals = signal_range(facts, self._isp, camera, scene.exposure, float(self._sensor.span_dn))
-        image = Image(seed, key, facts, signals, dark_frames)
+            if raw is None:
+                signals = signal_range(facts, isp, camera, scene.exposure, span_dn)
+            else:
+                signals = raw_signal_range(facts, source, scene.exposure, span_dn)
+        image = Image(seed, key, facts, signals, dark_frames, source)
         for number, level in enumerate(self._levels):
             if number:
                 drawn_again = parameter_uniforms(key, COUNT, number, epoch)
                 for counter in NOISE_COUNTERS:
                     uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)
-            parts = self._source, scene, camera, self._isp, self._sensor, noise, accuracy, self._output
+            parts = source, scene, camera, isp, self._sensor, noise, accuracy, self._output
             yield Plan(seed, key, *parts, split, self._mixture), selection
 
     def _draw_split(self, seed: int, source_sha256: str) -> str:
@@ -265,6 +276,8 @@ class Image:
         Facts about the pixels, and the signal range; needed by physical profiles only.
     dark_frames : DarkFrames or None
         Frames from which noise is sampled.
+    source : SourcePlan
+        Preparation of the pixels, with the source's own noise.
     """
 
     seed: int
@@ -272,6 +285,7 @@ class Image:
     facts: Facts | None
     signals: SignalRange | None
     dark_frames: DarkFrames | None
+    source: SourcePlan
 
 
 class TwoNumberLevel:
@@ -293,6 +307,8 @@ class TwoNumberLevel:
     def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
         """Draw the two numbers and select the effects of an image at this level."""
         a_dn, b_dn2 = self.two_numbers(uniforms)
+        if self._config.source.own_noise == "subtract":  # the variances are lines, so their difference is one
+            a_dn, b_dn2 = a_dn - image.source.own_a_dn, b_dn2 - image.source.own_b_dn2
         effects, skipped = plan_effects(self._config, a_dn, b_dn2, self._span_dn)
         noise, clip = self._config.noise, self._config.sensor.clip
         plan = types.NoisePlan(
@@ -424,7 +440,7 @@ def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tup
     skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)  # recorded: decides bytes of datasets
     if interpretation.effect_switch(config.effects, "heteroscedastic") == "off":
         return last, ("heteroscedastic: switched off", *skipped)  # recorded: decides bytes of datasets
-    if a_dn * span_dn + b_dn2 <= 0:
+    if max(a_dn * span_dn + b_dn2, b_dn2) <= 0:
         numbers = f"a_dn={a_dn!r}, b_dn2={b_dn2!r}"
         none = f"heteroscedastic: noise={noise} has no variance ({numbers})"  # recorded: decides bytes of datasets
         return last, (none, *skipped)

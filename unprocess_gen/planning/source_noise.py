@@ -60,12 +60,16 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     noise than the others and are left out.
     """
     codes = _green_sites(srgb, plan.sensor.pattern)
-    last = int(np.iinfo(srgb.dtype).max)
-    codes = codes[((codes > 0) & (codes < last)).all(axis=(1, 2, 3))]
+    last, plane = int(np.iinfo(srgb.dtype).max), 1 if "R" in plan.sensor.pattern[:2] else 2
+    black, white = (levels[plane] for levels in plan.source.code_levels) if plan.source.is_raw else (0, last)
+    codes = codes[((codes > 0) & (codes < white)).all(axis=(1, 2, 3))]
     quiet = np.argsort(_laplacian_sums(codes[..., 1].astype(np.int64)), kind="stable")[: (len(codes) + 1) // 2]
     if not quiet.size:
         return TileNoise(np.zeros(0), np.zeros(0))
-    light = camera_light(codes[quiet], plan, linear_table(plan.isp.tone, plan.isp.gamma, last + 1))[..., 1]
+    if plan.source.is_raw:
+        light = (codes[quiet][..., 1] - black) / (white - black)
+    else:
+        light = camera_light(codes[quiet], plan, linear_table(plan.isp.tone, plan.isp.gamma, last + 1))[..., 1]
     span = float(plan.sensor.white_level_dn - plan.sensor.black_level_dn)
     steps = np.rint(np.clip(light, 0, 1) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
     _, height, width = steps.shape

@@ -35,7 +35,7 @@ from unprocess_gen.pipeline.sizes import SAMPLE as SIZE_SAMPLE
 from unprocess_gen.pipeline.sizes import estimate_shards, source_bytes
 from unprocess_gen.pipeline.targets import noise_law, targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
-from unprocess_gen.planning.mixture import entry_number, image_config
+from unprocess_gen.planning.mixture import entry_number
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
 from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.reports.benchmark.timing import measure_in_turns, thread_ns
@@ -235,9 +235,9 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     except SourceError as error:
         seconds = time.perf_counter() - started
         return SourceEstimate(source, seconds, status=error.status, reason=error.reason, detail=error.text)
-    image = plan_pixels(settings, photograph.srgb, source, sha256)
-    identity = source.stream_identity(sha256)
-    planned = plan_levels(image_config(config, *identity), *identity, image.facts, settings.dark_frames)
+    image = plan_pixels(settings, photograph, source, sha256)
+    assert image.config is not None
+    planned = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
     levels, predictions = zip(*planned, strict=True)
     height, width = photograph.srgb.shape[:2]
     clean_levels, planned_s = 0, time.perf_counter() - started

@@ -301,8 +301,10 @@ def _dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Srgb:
     return dequantise(srgb, plan, linear_table(plan.isp.tone, plan.isp.gamma, 256), origin)
 
 
-def _curve(srgb: Srgb, plan: Plan) -> Float:
-    """Return the exact curve from the image's codes to linear light."""
+def _curve(srgb: Srgb, plan: Plan) -> Float | None:
+    """Return the exact curve from the image's codes to linear light; raw sources have none."""
+    if plan.source.is_raw:
+        return None
     return linear_table(plan.isp.tone, plan.isp.gamma, int(np.iinfo(srgb.dtype).max) + 1)
 
 

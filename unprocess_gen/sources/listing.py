@@ -29,6 +29,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import Entry, EntryKind, StoreAccessError
 from unprocess_gen.core.paths import absolute_text, any_path
+from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.roots import Root, root_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.names import encode_name
@@ -42,10 +43,10 @@ READABLE_SUFFIXES = frozenset((".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff",
 CONVERTIBLE_SUFFIXES = frozenset(
     (
         *(".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"),
-        *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".raf", ".rw2"),
+        *RAW_FILES,
     )
 )
-"""Suffixes of photographs that cannot be decoded; `unmatched_sentence` advises to convert them."""
+"""Suffixes of pictures that photographs are not read from; `unmatched_sentence` advises to convert them."""
 
 
 MAX_LISTED = 4096
@@ -231,6 +232,7 @@ def unmatched_sentence(unmatched: dict[str, int]) -> str:
         f"{files} not matched by source.include ({kinds})"
         + (f"; extend source.include to read {readable}" if readable else "")
         + (f"; convert {convertible} to JPEG, PNG or TIFF" if convertible else "")
+        + ("; source.kind=raw reads raw files" if unmatched.keys() & set(RAW_FILES) else "")
     )
 
 

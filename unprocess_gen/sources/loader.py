@@ -20,6 +20,7 @@ from unprocess_gen.sources import reading
 from unprocess_gen.sources.clips import clip_warnings, number_clips
 from unprocess_gen.sources.image import decode
 from unprocess_gen.sources.listing import Listing, list_file, list_folder, matcher, place_setting
+from unprocess_gen.sources.raw.frames import read_raw_source
 from unprocess_gen.sources.read_ahead import Read
 from unprocess_gen.sources.scenes import synthetic
 from unprocess_gen.sources.twins import number_twins
@@ -48,12 +49,15 @@ def list_photographs(config: SourceConfig) -> Listing:
         names = (synthetic.clip_listing if config.clips else synthetic.listing)(config.limit)
         scenes = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
         return Listing(number_clips(None, scenes) if config.clips else scenes)
-    include = [*config.include, *(config.video if config.clips else ())]
+    video = () if config.kind == "raw" else config.video
+    include = [*(config.include or ()), *(video if config.clips else ())]
     if config.list is None:
-        listed = list_folder(place, include, config.recursive, config.limit, () if config.clips else config.video)
+        listed = list_folder(place, include, config.recursive, config.limit, () if config.clips else video)
     else:
         listed = list_file(place, config.list, config.limit)
     numbered = number_twins(place, listed.sources)
+    if config.kind == "raw":
+        config = replace(config, video=())
     if not config.clips:
         return replace(listed, sources=numbered)
     _refuse_remote_videos(config, place, numbered)
@@ -127,6 +131,8 @@ def _decoded(config: SourceConfig, source: Source, read: Read) -> tuple[str, Pho
     digest = hashlib.sha256(content).hexdigest()
     _check_digest(source, digest)
     try:
+        if config.kind == "raw":
+            return digest, read_raw_source(config, content, source.name)
         return digest, decode.decode(content, max_pixels=config.max_pixels, icc=config.icc, name=source.name)
     except SourceError as error:
         raise SourceError(error.reason, error.text, digest) from error

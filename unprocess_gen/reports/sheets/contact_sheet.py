@@ -32,7 +32,7 @@ from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.core.types import CODE_RANGE, Float, Plan, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row, read_columns
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.report_files import write_files
@@ -231,7 +231,7 @@ def stages_sheet(pair: SheetPair, source: Srgb) -> Picture:
     """Draw a sheet of the source after each step, uint8 ``[H, W, 3]`` RGB; black is 0 and white is 1."""
     plan, window = pair.plan, panels.detail_window(pair.clean.shape)
     overview, detail = _views(source, window, panels.PANEL_PX)
-    drawn = [_image_panel("source", "", overview, detail)]
+    drawn = [_image_panel("source", "codes of the raw file" if plan.source.is_raw else "", overview, detail)]
     if plan.source.dequantize != "off" and source.dtype == np.uint8:
         detail = _dithered(pair, source, window)
         drawn.append(_image_panel("codes dithered", "by up to half a code", overview, detail))
@@ -251,6 +251,10 @@ def stages_sheet(pair: SheetPair, source: Srgb) -> Picture:
 def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Float]]:
     """Yield title, note and result of the steps of the article's Figure 1 before the mosaic, ``[H, W, 3]``."""
     isp, camera = plan.isp, plan.camera
+    if plan.source.is_raw:
+        (black, *_), (white, *_) = plan.source.code_levels
+        yield "levels", "black 0, white 1", (values * CODE_RANGE - black) / (white - black)
+        return
     values = unprocess.TONES[isp.tone](values, 1 - values)
     yield "tone curve inverted", isp.tone, values
     values = unprocess.expand_gamma(values, isp.gamma)

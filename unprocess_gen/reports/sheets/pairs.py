@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from unprocess_gen.config.schema import SourceConfig, at_place
+from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.roots import Root
@@ -15,7 +15,7 @@ from unprocess_gen.core.types import Photograph, Plan, Row, Source, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
-from unprocess_gen.pipeline.replay import ADVICE, NO_LIMIT, source_of, source_root
+from unprocess_gen.pipeline.replay import ADVICE, recorded_source, source_of, source_root
 from unprocess_gen.reports.sheets.panels import Mosaic
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
@@ -60,14 +60,12 @@ def selected_pairs(folder: AnyPath, keys: Sequence[str], source: AnyPath | None)
 
 def _load_part(row: Row, root: Root | None, load: Load) -> tuple[Srgb | None, str]:
     """Load the part of the source that a row's frames show; None and the reason if it is not available."""
-    is_scene = row["source_bytes"] == 0
-    if root is None and not is_scene:
+    if root is None and row["source_bytes"] != 0:
         return None, "the dataset does not record where its photographs are; give --source ROOT"
-    config = SourceConfig(
-        **at_place(None if is_scene else root), max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1)
-    )
+    source = source_of(row)
+    config = recorded_source(root, source, plan_from_row(row).source)
     try:
-        sha256, photograph = load(config, source_of(row))
+        sha256, photograph = load(config, source)
     except (SourceError, MachineError, ConfigError) as error:  # the sheet is drawn without this photograph
         return None, f"{str(error).partition(';')[0]}; {ADVICE}"
     if sha256 != row["source_sha256"]:

@@ -41,9 +41,9 @@ FLOAT32_MARGIN = 2.0**-18
 class Scene(NamedTuple):
     """Hold the parameters of a clean frame in float64."""
 
-    products: NDArray[Any]  # [3, 3, codes]: matrix entry (c, j) times the curve at code k
+    products: NDArray[Any]  # [3, 3, codes]: matrix entry (c, j) times the curve at code k; [4, 3, codes] of raw sources
     code_count: int
-    site_channels: NDArray[np.int64]  # [2, VECTOR_WIDTH + 2]: channel of each CFA site
+    site_channels: NDArray[np.int64]  # [2, VECTOR_WIDTH + 2]: channel of each CFA site; of raw sources its plane
     inverse_gains: NDArray[Any]  # [3]
     gray_mean: bool
     highlight_threshold: float
@@ -80,16 +80,17 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] 
 
 
 def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -> Scene:
-    in_float32, channels = kind is Scene32, _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2)
+    in_float32, is_raw = kind is Scene32, plan.source.is_raw
+    channels = _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2, is_raw)
     f: Any = np.float32 if in_float32 else np.float64
     camera, exposure, brightest = plan.camera, plan.scene.exposure, plan.brightest
     black_dn, span_dn = plan.sensor.black_level_dn, float(plan.sensor.span_dn)
-    gray_mean, gains, limit = camera.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
+    gray_mean, gains, limit = _uses_gray_mean(plan), _site_gains(plan), _linear_limit(plan)
     scale = tuple(gain * exposure * span_dn if in_float32 else 1.0 for gain in gains)
     numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
     limits, light_per_signal, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
     divisor = 1 - camera.highlight_threshold
-    products = np.array(camera.rgb2cam).reshape(3, 3, 1) * linear_table(plan.isp.tone, plan.isp.gamma, codes)
+    products = _raw_products(plan, codes) if is_raw else _products(plan, codes)
     if in_float32 and not gray_mean:
         products *= np.array(scale)[:, None, None]
     return kind(
@@ -122,21 +123,41 @@ _scenes = [functools.lru_cache(maxsize=count)(_scene) for count in (256, 4)]
 """Scenes of 256 codes (18 kB each) and of 65,536 codes (5 MB each), of which the last ones are kept."""
 
 
+def _products(plan: Plan, codes: int) -> NDArray[np.float64]:
+    """Return each entry of the matrix times the light of each code."""
+    curve: NDArray[np.float64] = linear_table(plan.isp.tone, plan.isp.gamma, codes)
+    return np.array(plan.camera.rgb2cam).reshape(3, 3, 1) * curve
+
+
+def _raw_products(plan: Plan, codes: int) -> NDArray[np.float64]:
+    """Return the light of each code of a raw source by plane, which depends on the channel of its filter alone."""
+    products = np.zeros((4, 3, codes))
+    for plane, (black, white) in enumerate(zip(*plan.source.code_levels, strict=True)):
+        products[plane, (plane + 1) // 2] = (np.arange(codes) - black) / (white - black)
+    return products
+
+
 def with_response(scene: Scene, response: SiteMap) -> Scene:
     """Return the scene of a clean frame whose light is multiplied by a response."""
     # the second pass computes every vector, because only it applies the response
     return scene._replace(response=response, limits=np.full_like(scene.limits, -np.inf))
 
 
-def _site_gains(plan: Plan) -> tuple[float, float, float]:
+def _site_gains(plan: Plan) -> tuple[float, ...]:
     """Return the factors of the channels that remain: `_fill_gray_mean_signal` has inverted the gains already."""
-    return (1.0, 1.0, 1.0) if plan.camera.highlight == "gray_mean" else plan.camera.inverse_gains
+    if plan.source.is_raw:
+        return 1.0, 1.0, 1.0, 1.0
+    return (1.0, 1.0, 1.0) if _uses_gray_mean(plan) else plan.camera.inverse_gains
+
+
+def _uses_gray_mean(plan: Plan) -> bool:
+    return plan.camera.highlight == "gray_mean" and not plan.source.is_raw
 
 
 def _headroom(plan: Plan) -> list[float]:
     """Return the factor of the per-channel highlight term by channel; 0 without the term."""
     has_term = plan.camera.highlight == "per_channel"
-    return [max(1 - gain, 0.0) if has_term else 0.0 for gain in plan.camera.inverse_gains]
+    return [max(1 - gain, 0.0) if has_term else 0.0 for gain in _site_gains(plan)]
 
 
 def _linear_limit(plan: Plan) -> float:
@@ -147,9 +168,12 @@ def _linear_limit(plan: Plan) -> float:
 
 
 @functools.lru_cache(maxsize=16)
-def _site_channels(pattern: str, top: int, left: int) -> NDArray[np.int64]:
-    """Return the channel of the sites of an even and an odd row, ``[2, VECTOR_WIDTH + 2]``."""
-    return np.tile(np.array(tile(pattern, (top, left))), (1, VECTOR_WIDTH // 2 + 1))
+def _site_channels(pattern: str, top: int, left: int, planes: bool = False) -> NDArray[np.int64]:
+    """Return the channel, or the packed plane, of the sites of an even and an odd row, ``[2, VECTOR_WIDTH + 2]``."""
+    sites = np.array(tile(pattern, (top, left)))
+    if planes:
+        sites = np.where(sites == 2, 3, np.where((sites == 1) & ~(sites == 0).any(axis=1, keepdims=True), 2, sites))
+    return np.tile(sites, (1, VECTOR_WIDTH // 2 + 1))
 
 
 @inner

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Frame
+from unprocess_gen.core.types import Float, Frame, Srgb
 
 CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -79,12 +79,12 @@ def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int
     return (channel(0, 0), channel(0, 1)), (channel(1, 0), channel(1, 1))
 
 
-def mosaic(camera_rgb: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> Float:
+def mosaic(camera_rgb: Float | Srgb, pattern: str, origin: tuple[int, int] = (0, 0)) -> Float:
     """Sample one channel per CFA site.
 
     Parameters
     ----------
-    camera_rgb : ndarray of float64, [H, W, 3]
+    camera_rgb : ndarray of float64 or uint16, [H, W, 3]
         Camera RGB.
     pattern : str
         One of `PATTERNS`.

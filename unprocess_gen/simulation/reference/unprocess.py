@@ -14,7 +14,7 @@ import numpy as np
 
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import Float, Plan, Srgb
-from unprocess_gen.simulation.reference.cfa import mosaic
+from unprocess_gen.simulation.reference.cfa import mosaic, plane_sites
 
 
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: Float | None = None) -> Float:
@@ -36,7 +36,32 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: F
     ndarray of float64, [H, W]
         Normalised light, 0 at black and 1 at white.
     """
+    if plan.source.is_raw:
+        return raw_light(srgb, plan, origin)
     return mosaic(camera_light(srgb, plan, curve), plan.sensor.pattern, origin)
+
+
+def raw_light(codes: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
+    """Compute the clean mosaic of a raw source before clipping: (code - black) / (white - black), plane by plane.
+
+    Parameters
+    ----------
+    codes : ndarray of uint16, [H, W, 3]
+        Codes of the camera RGB of a raw source; each site uses the channel of its filter.
+    plan : Plan
+        Parameters of the pair, with the levels of the codes.
+    origin : (int, int)
+        Row and column of ``codes[0, 0]`` in the full frame.
+
+    Returns
+    -------
+    ndarray of float64, [H, W]
+        Normalised light, 0 at black and 1 at white.
+    """
+    light = mosaic(codes, plan.sensor.pattern, origin)
+    for (y, x), black, white in zip(plane_sites(plan.sensor.pattern, origin), *plan.source.code_levels, strict=True):
+        light[y::2, x::2] = (light[y::2, x::2] - black) / (white - black)
+    return light
 
 
 def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -66,8 +66,11 @@ def _decode_with_libraw(content: bytes, facts: RawMetadata, max_pixels: int) -> 
             side = len(raw.raw_pattern)
             if side > MOST_PATTERN or raw.num_colors != 3:
                 raise SourceError("unsupported", f"has a CFA of {side} x {side} sites and {raw.num_colors} colours")
-            colours = raw.raw_colors_visible[:side, :side].copy()
-            return RawFrame(raw.raw_image_visible.copy(), colours, facts.completed(decoder_facts(raw)))
+            completed, colours = facts.completed(decoder_facts(raw)), raw.raw_colors_visible[:side, :side].copy()
+            if facts.area is None or facts.pattern is None:
+                return RawFrame(raw.raw_image_visible.copy(), colours, completed)
+            # LibRaw moves odd margins to even ones, and then confuses the black levels of the sites
+            return RawFrame(_visible(raw.raw_image, facts.area), _colours(facts.pattern), completed)
     except rawpy.LibRawError as error:
         raise SourceError("corrupt", f"cannot be decoded by LibRaw ({decoder_message(error)})") from error
 
@@ -81,22 +84,32 @@ def _decode_jpeg_xl(content: bytes, facts: RawMetadata, max_pixels: int) -> RawF
         pages = (page for first in file.pages for page in (first, *(first.pages or ())))
         page: Any = next(page for page in pages if page.tags.valueof(262) == CFA)
         height, width = page.shape
-        _check_size(width, height, max_pixels)
+        area = facts.area or (0, 0, height, width)
+        _check_size(area[3] - area[1], area[2] - area[0], max_pixels)
         rows, columns = (int(page.tags.valueof(code) or 1) for code in (50975, 52547))
         try:
             stored = page.asarray()
         except Exception as error:  # imagecodecs has no common class of errors
             raise SourceError("corrupt", f"its JPEG XL tiles cannot be decoded ({error})") from error
         fields = stored.reshape(rows, height // rows, columns, width // columns)
-        top, left, bottom, right = page.tags.valueof(50829) or (0, 0, height, width)
-        pixels = fields.transpose(1, 0, 3, 2).reshape(height, width)[top:bottom, left:right]
-        tile = np.frombuffer(page.tags.valueof(33422), np.uint8)
-    if pixels.dtype != np.uint16 or tile.size != 4 or tile.max() > 2:
-        raise SourceError("unsupported", f"is a mosaic of {pixels.dtype} and {tile.size} sites; expected uint16 and 4")
-    colours = tile.reshape(2, 2)
-    # CFAPattern begins at the corner of the active area (DNG specification, ActiveArea)
-    pattern = "".join("RGB"[one] for one in tile)
-    return RawFrame(np.ascontiguousarray(pixels), colours, replace(facts, pattern=pattern).completed(RawMetadata()))
+        pixels = _visible(fields.transpose(1, 0, 3, 2).reshape(height, width), area)
+    if pixels.dtype != np.uint16 or facts.pattern is None:
+        raise SourceError("unsupported", f"is a mosaic of {pixels.dtype}; expected uint16 and a Bayer pattern")
+    return RawFrame(pixels, _colours(facts.pattern), facts.completed(RawMetadata()))
+
+
+def _visible(stored: NDArray[np.uint16], area: tuple[int, int, int, int]) -> NDArray[np.uint16]:
+    """Return a copy of the visible part of a mosaic."""
+    top, left, bottom, right = area
+    if not (0 <= top < bottom <= stored.shape[0] and 0 <= left < right <= stored.shape[1]):
+        raise SourceError(
+            "corrupt", f"its ActiveArea {area} is not inside of its {stored.shape[1]} x {stored.shape[0]} sites"
+        )
+    return stored[top:bottom, left:right].copy()
+
+
+def _colours(pattern: str) -> NDArray[np.uint8]:
+    return np.array(["RGB".index(letter) for letter in pattern], np.uint8).reshape(2, 2)
 
 
 def _check_size(width: int, height: int, max_pixels: int) -> None:

@@ -50,6 +50,8 @@ class RawMetadata:
         matrix of the camera in LibRaw's table, and gains of red and blue as LibRaw reads them
     compression
         value of the TIFF tag Compression
+    area
+        first row and column of the visible part, and the ends of its rows and columns (ActiveArea of DNG)
     """
 
     pattern: str | None = None
@@ -64,6 +66,7 @@ class RawMetadata:
     xyz2cam: Matrix | None = None
     gains: tuple[float, float] | None = None
     compression: int | None = None
+    area: tuple[int, int, int, int] | None = None
 
     def completed(self, other: RawMetadata) -> RawMetadata:
         """Return these facts, completed by those of another reader."""
@@ -148,7 +151,12 @@ def _facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model
     if isinstance(seconds, tuple):
         seconds = seconds[0] / seconds[1] if len(seconds) == 2 else seconds[0]
     is_tile = len(black) == 4 and tags.get(50713, (2, 2)) == (2, 2)
+    filters, area = tags.get(33422, ()) if 50706 in tags else (), tags.get(50829, ())
+    has_bayer = len(filters) == 4 and tags.get(33421, (2, 2)) == (2, 2) and set(filters) <= {0.0, 1.0, 2.0}
     return RawMetadata(
+        # CFAPattern and BlackLevel begin at the corner of ActiveArea
+        pattern="".join("RGB"[int(one)] for one in filters) if has_bayer else None,
+        area=(int(area[0]), int(area[1]), int(area[2]), int(area[3])) if len(area) == 4 else None,
         black_dn=(black * 4)[:4] if black and len(set(black)) == 1 else black if is_tile else None,
         white_dn=max(white) if 50706 in tags and white else None,
         # the largest of 16 bits means that another tag has the ISO
@@ -179,7 +187,7 @@ def _colour(tags: Mapping[int, tuple[float, ...]]) -> DngColour:
 
 def _numbers(tag: Any) -> tuple[float, ...]:
     """Return the values of a tag as numbers, rationals divided; none for text."""
-    values = tag.value if isinstance(tag.value, tuple) else (tag.value,)
+    values = tuple(tag.value) if isinstance(tag.value, tuple | bytes) else (tag.value,)
     if not all(isinstance(value, int | float) for value in values):
         return ()
     if tag.dtype in RATIONALS:

@@ -1,0 +1,230 @@
+"""Raw sources pass through the pipeline: closed loop, law of noise, live pairs, replay, and refused settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unprocess_gen as ug
+from unprocess_gen.core.errors import ConfigError, SourceChangedError
+from unprocess_gen.core.types import Pair, Photograph, Plan, Source
+from unprocess_gen.dataset import dng
+from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
+from unprocess_gen.pipeline.replay import PairRegenerator
+from unprocess_gen.simulation.pair import reference_pair
+from unprocess_gen.sources.raw.frames import read_raw_source
+
+SENSORS = [("RGGB", 10, 63), ("BGGR", 12, 241), ("GRBG", 14, 1023), ("GBRG", 16, 4097)]
+
+
+def raw_config(tmp_path: Path, *overrides: str) -> Any:
+    return ug.load_config(["source.kind=raw", f"source.root={tmp_path}", *overrides])
+
+
+def simulated(config: Any, photograph: Photograph) -> tuple[Pair, Plan]:
+    image = plan_pixels(PairSettings(config), photograph, Source(0, "a", "a", 1), "00" * 32)
+    (_, plan, pair), *_ = image.pairs()
+    return pair, plan
+
+
+def mosaics(config: Any, dn: np.ndarray) -> Photograph:
+    """Decode a mosaic as the NPY file of a raw source."""
+    return Photograph(*_read(config, dn))
+
+
+def _read(config: Any, dn: np.ndarray) -> tuple[Any, ...]:
+    import io
+
+    file = io.BytesIO()
+    np.save(file, dn)
+    photograph = read_raw_source(config.source, file.getvalue(), "a.npy")
+    return photograph.srgb, 1, photograph.raw
+
+
+# ---------------------------------------------------------------------------------------------------------- closed loop
+
+
+@pytest.mark.parametrize(("pattern", "bits", "black"), SENSORS)
+def test_exported_clean_frames_keep_every_dn(tmp_path: Path, pattern: str, bits: int, black: int) -> None:
+    levels = [f"sensor.black_level_dn={black}", f"sensor.white_level_dn={2**bits - 1}", f"sensor.bits={bits}"]
+    config = ug.load_config([*levels, f"sensor.pattern={pattern}"])
+    pair = ug.make_pair(np.random.default_rng(bits).integers(0, 256, (44, 61, 3)).astype(np.uint8), config)
+    content = dng.encode(pair.clean, pair.row, "clean")
+    own = raw_config(tmp_path)
+    found, plan = simulated(own, read_raw_source(own.source, content, "a.dng"))
+    assert (found.clean == pair.clean).all()
+    assert (plan.sensor.pattern, plan.sensor.black_level_dn, plan.sensor.white_level_dn) == (
+        pattern,
+        black,
+        2**bits - 1,
+    )
+    assert plan.camera.red_gain == pytest.approx(pair.row["red_gain"], rel=1e-8)
+    recorded = [pair.row[f"rgb2cam_{i}{j}"] for i in range(3) for j in range(3)]
+    assert plan.camera.rgb2cam == pytest.approx(recorded, abs=1e-7)
+
+
+@pytest.mark.parametrize("noise", ["imx385_iso3200", "sony_a7s2"])
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_kernels_equal_the_reference(tmp_path: Path, noise: str, shrink: int) -> None:
+    levels = "source.raw.black_dn=[500,509,511,523]", "source.raw.white_dn=16000", "source.raw.pattern=GRBG"
+    overrides = *levels, f"source.shrink={shrink}", f"noise={noise}", "scene=night", "sensor=generic_14bit"
+    config = raw_config(tmp_path, *overrides)
+    photograph = mosaics(config, np.random.default_rng(5).integers(300, 16384, (36, 50)).astype(np.uint16))
+    pair, plan = simulated(config, photograph)
+    reference = reference_pair(photograph.srgb, plan)
+    assert (pair.clean == reference.clean).all() and (pair.noisy == reference.noisy).all()
+    assert pair.counts == reference.counts
+    inside = (slice(10, 30), slice(14, 38)) if shrink == 1 else (slice(2, 12), slice(4, 20))
+    crop = reference_pair(photograph.srgb[inside], plan, (inside[0].start, inside[1].start))
+    assert (crop.clean == pair.clean[inside]).all()
+
+
+def test_light_is_exact_before_the_exposure(tmp_path: Path) -> None:
+    levels = "source.raw.black_dn=[500,509,511,523]", "source.raw.white_dn=16000", "source.raw.pattern=RGGB"
+    scene = "scene.exposure_ratio=100", "output.clean_dtype=float32", "noise=sony_a7s2"
+    config = raw_config(tmp_path, *levels, *scene)
+    dn = np.random.default_rng(6).integers(400, 16384, (20, 20)).astype(np.uint16)
+    pair, _ = simulated(config, mosaics(config, dn))
+    black = np.tile([[500.0, 509.0], [511.0, 523.0]], (10, 10))
+    light = np.clip((dn - black) / (16000 - black), 0, 1) / 100
+    assert np.abs(pair.clean - light).max() < 1e-9
+
+
+# --------------------------------------------------------------------------------------------------------------- noise
+
+LEVELS = ("source.raw.pattern=RGGB", "source.raw.black_dn=1000", "source.raw.white_dn=16000", "sensor=source")
+NOISE = ("noise=heteroscedastic", "noise.a=4", "noise.b=90", "noise.units=dn", "noise.black=subtracted",
+         "noise.bits=14", "noise.black_level_dn=1000", "noise.white_level_dn=16000")  # fmt: skip
+
+
+@pytest.mark.parametrize("dn", [1000, 3000, 9000])
+def test_noise_has_the_variance_of_its_profile(tmp_path: Path, dn: int) -> None:
+    config = raw_config(tmp_path, *LEVELS, *NOISE)
+    pair, _ = simulated(config, mosaics(config, np.full((512, 512), dn, np.uint16)))
+    assert (pair.clean == dn).all()
+    wanted = 4 * (dn - 1000) + 90 + 1 / 12
+    assert pair.noisy.astype(float).var() == pytest.approx(wanted, rel=5 * np.sqrt(2 / 512**2))
+
+
+@pytest.mark.parametrize("dn", [1200, 3000, 9000])
+def test_subtracting_own_noise_leaves_the_target_variance(tmp_path: Path, dn: int) -> None:
+    own = 1.5 * (dn - 1000) + 40
+    frame = np.rint(dn + np.sqrt(own) * np.random.default_rng(dn).standard_normal((512, 512))).astype(np.uint16)
+    settings = "source.raw.a_dn=1.5", "source.raw.b_dn2=40", "scene.exposure_ratio=2"
+    for own_noise, share in (("keep", 1), ("subtract", 0)):
+        config = raw_config(tmp_path, *LEVELS, *NOISE, *settings, f"source.own_noise={own_noise}")
+        pair, plan = simulated(config, mosaics(config, frame))
+        assert (plan.source.own_a_dn, plan.source.own_b_dn2) == pytest.approx((0.75, 10.0))
+        target = 4 * (dn - 1000) / 2 + 90
+        assert pair.noisy.astype(float).var() == pytest.approx(target + share * own / 4, rel=0.02)
+
+
+def test_sites_of_noisier_sources_are_counted(tmp_path: Path) -> None:
+    settings = "source.raw.a_dn=9", "source.raw.b_dn2=20", "source.own_noise=subtract"
+    config = raw_config(tmp_path, *LEVELS, *NOISE, *settings)
+    dn = np.arange(1000, 1064, dtype=np.uint16).repeat(64).reshape(64, 64)
+    pair, plan = simulated(config, mosaics(config, dn))
+    assert (plan.noise.a_dn, plan.noise.b_dn2) == (-5.0, 70.0)
+    assert pair.counts.zero_variance == (dn >= 1014).sum()  # 5 · 14 = 70
+    assert reference_pair(mosaics(config, dn).srgb, plan).counts == pair.counts
+
+
+# ------------------------------------------------------------------------------------------------------------ datasets
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    (tmp_path / "frames").mkdir()
+    for number in range(2):
+        dn = np.random.default_rng(number).integers(1000, 16000, (64, 72)).astype(np.uint16)
+        np.save(tmp_path / "frames" / f"{number}.npy", dn)
+    overrides = *LEVELS, "source.patch=[random,32,2]", "noise=sony_a7s2", "scene=night", "n_jobs=1"
+    ug.generate(raw_config(tmp_path / "frames", *overrides, f"out={tmp_path / 'ds'}"))
+    return tmp_path / "ds"
+
+
+def test_datasets_of_raw_sources_are_complete(dataset: Path, tmp_path: Path) -> None:
+    assert not ug.verify(dataset) and not any(result.complaint for result in ug.replay(dataset))
+    pairs, live = ug.RawPairs(dataset), ug.LivePairs(dataset)
+    assert len(pairs) == 4
+    assert (live[0].noisy == pairs[0].noisy).all() and (live[1, 0].clean == pairs[0].clean).all()
+    redrawn = ug.LivePairs(dataset, redraw="all")[1, 0]
+    recorded = pairs[0].row
+    assert redrawn.row["bits"] == recorded["bits"]
+    assert redrawn.row["exposure_ratio"] != recorded["exposure_ratio"]
+    assert ug.develop(pairs[0].clean, pairs[0].row).shape == (32, 32, 3)
+    config = (dataset / "config.yaml").read_text()
+    assert "  kind: raw\n" in config and "levels: source" in config
+    manifest = (dataset / "manifest.csv").read_bytes()
+    (dataset / "manifest.csv").unlink()
+    from unprocess_gen.pipeline.repair import repair
+
+    list(repair(dataset, None))
+    assert (dataset / "manifest.csv").read_bytes() == manifest
+
+
+def test_another_decoded_mosaic_is_not_another_file(dataset: Path) -> None:
+    pairs = ug.RawPairs(dataset)
+    row = {**pairs[0].row, "mosaic_xxh3": "0" * 32}
+    with pytest.raises(SourceChangedError, match="file is the same, but is decoded to another mosaic"):
+        PairRegenerator(str(dataset.parent / "frames")).regenerate(row)
+    np.save(dataset.parent / "frames" / "0.npy", np.zeros((64, 72), np.uint16))
+    with pytest.raises(SourceChangedError, match="SHA-256"):
+        PairRegenerator(str(dataset.parent / "frames")).regenerate(pairs[0].row)
+
+
+# ------------------------------------------------------------------------------------------------------------- refused
+
+REFUSED = {
+    "camera=sony_a7r": "camera inverts",
+    "gains.red=2": "gains inverts",
+    "isp=srgb": "isp inverts",
+    "sensor.bits=12": "takes it from each file",
+    "source.downscale=2": "use source.shrink",
+    "source.dequantize=dither": "is for photographs",
+    "source.shrink=3": "1, 2 or 4",
+    "output.targets=[linear_rgb]": "set source.shrink=2",
+    "output.targets=[srgb]": "no photograph",
+    "source.raw.a_dn=1": "source.raw.b_dn2",
+    "source.raw.black_dn=[1,2,3]": "four by colour",
+}
+
+
+@pytest.mark.parametrize("override", REFUSED)
+def test_settings_of_photographs_are_refused(tmp_path: Path, override: str) -> None:
+    with pytest.raises(ConfigError, match=REFUSED[override]):
+        raw_config(tmp_path, override)
+
+
+@pytest.mark.parametrize("override", ["source.shrink=2", "source.own_noise=subtract", "sensor=source",
+                                      "source.raw.white_dn=4095"])  # fmt: skip
+def test_settings_of_raw_sources_are_refused_for_photographs(override: str) -> None:
+    with pytest.raises(ConfigError, match=r"source\.kind=raw"):
+        ug.load_config([override])
+
+
+def test_subtraction_needs_a_line_of_variance(tmp_path: Path) -> None:
+    for others in (["noise=sony_a7s2"], ["source.shrink=2"]):
+        with pytest.raises(ConfigError, match=r"source\.own_noise=subtract"):
+            raw_config(tmp_path, "source.own_noise=subtract", *others)
+
+
+def test_a_body_gives_the_sensor_and_the_noise(tmp_path: Path) -> None:
+    config = raw_config(tmp_path, "body=sony_a7s2")
+    assert (config.sensor.white_level_dn, config.noise.name) == (16300, "sony_a7s2")
+    assert raw_config(tmp_path).sensor.levels == "source"
+    assert "*.dng" in (raw_config(tmp_path).source.include or ())
+
+
+@pytest.mark.parametrize(("recipe", "patches"), [("raw_low_light", 4), ("raw_training", 16)])
+def test_recipes_make_dark_pairs_with_unrounded_clean_frames(tmp_path: Path, recipe: str, patches: int) -> None:
+    config = raw_config(tmp_path, f"+experiment={recipe}", *LEVELS[:3])
+    photograph = mosaics(config, np.full((512, 512), 16000, np.uint16))
+    image = plan_pixels(PairSettings(config), photograph, Source(0, "a", "a", 1), "00" * 32)
+    assert len(image.patches) == patches
+    plan = image.plans[0]
+    assert (plan.noise.name, plan.output.clean_dtype, plan.sensor.white_level_dn) == ("sony_a7s2", "float32", 16300)
+    assert 10 <= plan.scene.exposure_ratio <= 300

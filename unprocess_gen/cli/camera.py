@@ -1,0 +1,44 @@
+"""Run the verb camera: a camera option, and a sensor option, from one raw file."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.messages import print_result
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import machine_errors
+from unprocess_gen.core.paths import LocalPath, local_path
+
+
+def camera(call: Call) -> int:
+    """Write the options, and print what was read from which tag."""
+    from unprocess_gen.sources.raw.options import camera_options, check_options
+
+    assert call.path is not None
+    if call.words:
+        raise ConfigError(f"camera: {call.words[0]}: unexpected; expected one raw file")
+    file = local_path(call.path, f"camera: {call.path} is in an object store; expected a local file")
+    if not file.is_file():
+        raise ConfigError(f"camera {file}: no such file; expected a raw file")
+    to, sensor = Path(call.values["to"]), call.values.get("sensor")
+    check_options(to, None if sensor is None else Path(sensor))
+    options = camera_options(file, to.stem)
+    _write(to, options.camera)
+    if sensor is not None:
+        _write(Path(sensor), options.sensor)
+    for sentence in options.sources:
+        print_result(sentence)
+    chosen = [f"camera={to.stem}", *([] if sensor is None else [f"sensor={Path(sensor).stem}"])]
+    folder = to.parent.parent
+    where = f"--config-dir {shlex.quote(str(folder))}"
+    if to.absolute().parent.name != "camera":
+        where = "the file in a folder camera of --config-dir, and"
+    print_result(f"{to}: use it with {where} {' '.join(chosen)}")
+    return 0
+
+
+def _write(path: Path, text: str) -> None:
+    with machine_errors(path):
+        LocalPath(path).write(text.encode(), str(path.parent))

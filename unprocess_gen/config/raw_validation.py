@@ -1,0 +1,77 @@
+"""Check the settings of raw sources, and that others do not use them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from unprocess_gen.config.interpretation import is_physical, uses_dark_frames
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.values import refusal
+from unprocess_gen.simulation.reference.cfa import MONO
+
+OF_PHOTOGRAPHS = {"downscale": 1, "dequantize": "off", "icc": "ignore"}
+"""Keys of the source that prepare photographs, with the value of raw sources."""
+OF_RAW = {"shrink": 1, "own_noise": "keep"}
+"""Keys of raw sources, with the value of photographs."""
+
+
+def check_raw_source(config: Config) -> None:
+    """Raise ConfigError if settings of raw sources and of photographs are mixed, or contradict each other."""
+    source, is_raw = config.source, config.source.kind == "raw"
+    for name, value in (OF_PHOTOGRAPHS if is_raw else OF_RAW).items():
+        if (found := getattr(source, name)) != value:
+            kind, advice = ("photographs", "use source.shrink") if is_raw else ("raw sources", "set source.kind=raw")
+            raise refusal(f"source.{name}", found, f"is for {kind}; expected {value}, or {advice}")
+    if is_raw:
+        _check_levels(config)
+        _check_own_noise(config)
+        _check_targets(config)
+        return
+    for name, found in asdict(source.raw).items():
+        if found is not None:
+            raise refusal(f"source.raw.{name}", found, "describes raw files; expected null, or set source.kind=raw")
+    if config.sensor.levels == "source":
+        raise refusal("sensor.levels", "source", "photographs state no levels; choose a sensor, or set source.kind=raw")
+
+
+def _check_levels(config: Config) -> None:
+    raw = config.source.raw
+    if config.sensor.pattern == MONO:
+        raise refusal("sensor.pattern", MONO, "raw sources have the light behind filters; choose a Bayer pattern")
+    if raw.black_dn is not None and raw.white_dn is not None:
+        for black, white in zip(by_plane(raw.black_dn), by_plane(raw.white_dn), strict=True):
+            if not black < white:
+                raise refusal("source.raw.black_dn", raw.black_dn, f"expected less than white_dn={raw.white_dn}")
+    if config.sensor.levels == "source" and uses_dark_frames(config.noise):
+        problem = "dark frames are converted to the levels of one sensor; choose a sensor"
+        raise refusal("sensor.levels", "source", problem)
+
+
+def by_plane(level: float | tuple[float, ...]) -> tuple[float, ...]:
+    """Return a level for each packed plane."""
+    return tuple(map(float, level)) if isinstance(level, list | tuple) else (float(level),) * 4
+
+
+def _check_own_noise(config: Config) -> None:
+    source, noise = config.source, config.noise
+    if (source.raw.a_dn is None) != (source.raw.b_dn2 is None):
+        raise refusal("source.raw.a_dn", source.raw.a_dn, "expected source.raw.a_dn and source.raw.b_dn2, or none")
+    if source.own_noise != "subtract":
+        return
+    if is_physical(noise) or noise.law != "gaussian":
+        problem = f"noise={noise.name} adds Poisson counts, from which no variance can be taken away"
+        raise refusal("source.own_noise", "subtract", f"{problem}; expected a profile with two numbers (a, b), or keep")
+    if source.shrink != 1:
+        problem = "means of green have less noise than those of red and blue; expected source.shrink=1, or keep"
+        raise refusal("source.own_noise", "subtract", problem)
+
+
+def _check_targets(config: Config) -> None:
+    targets = config.output.targets
+    if "srgb" in targets:
+        raise refusal(
+            "output.targets", targets, "a raw source has no photograph; remove srgb; ug.develop draws pictures"
+        )
+    if "linear_rgb" in targets and config.source.shrink == 1:
+        problem = "linear_rgb needs all colours at each site; set source.shrink=2, or remove it"
+        raise refusal("output.targets", targets, problem)

@@ -1,0 +1,139 @@
+"""Write a camera option, and a sensor option, from what one raw file states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from unprocess_gen.config.limits import CAMERA_LAWS, NAME
+from unprocess_gen.config.schema import RawConfig
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.output_paths import check_output_file
+from unprocess_gen.core.raw_files import RAW_FILES
+from unprocess_gen.simulation.reference import colour
+from unprocess_gen.sources.raw.colour import temperature
+from unprocess_gen.sources.raw.decode import decode_raw
+from unprocess_gen.sources.raw.frames import XTRANS, camera_colours, file_levels, file_pattern
+from unprocess_gen.sources.raw.metadata import RawMetadata, tags_of
+
+MARK = "Written by gen-dataset camera"
+"""Text in the first line of each file, by which an earlier one is known."""
+
+SENSOR_KEYS = """\
+clip: sensor            # noisy frames: sensor: at 0 and 2^bits - 1; black: at black instead of 0; none: float32 only
+saturated: auto
+dark_offset: removed    # mean of the dark current: removed (as with optical-black pixels) or kept
+units: image            # camera bodies with their own fixed patterns: image (one per image), or a number of bodies
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOptions:
+    """Texts of the options, and sentences that state what was read from which tag.
+
+    Attributes
+    ----------
+    camera, sensor : str
+        Contents of the files.
+    sources : tuple of str
+        A sentence for each fact.
+    """
+
+    camera: str
+    sensor: str
+    sources: tuple[str, ...]
+
+
+def check_options(to: Path, sensor: Path | None) -> None:
+    """Refuse, before any work, names to which options cannot be written."""
+    for option, path in (("--to", to), ("--sensor", sensor)):
+        if path is None:
+            continue
+        if path.suffix != ".yaml" or not NAME.allows(path.stem):
+            raise ConfigError(f"{option} {path}: is no name of an option; expected {NAME}, and .yaml")
+        check_output_file(path, f"{option} {path}", "an earlier option of this verb", MARK.lower().encode())
+    if to.stem in (*colour.CAMERAS, *CAMERA_LAWS.words):
+        raise ConfigError(f"--to {to}: is the name of a built-in camera; choose another name")
+    if sensor is not None and sensor.resolve() == to.resolve():
+        raise ConfigError(f"--sensor {sensor}: is --to too; choose another name")
+
+
+def camera_options(file: Path, name: str) -> CameraOptions:
+    """Read a raw file and describe its camera as options; ``name`` is that of the camera.
+
+    Raises ConfigError or MachineError.
+    """
+    if file.suffix.lower() not in RAW_FILES:
+        raise ConfigError(f"camera {file}: is no raw file; expected a file as {', '.join(RAW_FILES)}")
+    try:
+        content = file.read_bytes()
+        frame, tags = decode_raw(content), tags_of(content)
+        matrix, gains = camera_colours(frame.metadata)
+        pattern = file_pattern(frame, RawConfig())
+        black, white = file_levels(frame.metadata, pattern, RawConfig())
+    except OSError as error:
+        raise MachineError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except SourceError as error:
+        raise ConfigError(f"camera {file}: {error.text}") from error
+    if matrix is None:
+        raise ConfigError(f"camera {file}: has no ColorMatrix, and LibRaw knows no matrix of its camera; expected one")
+    if pattern == XTRANS:
+        raise ConfigError(f"camera {file}: has an X-Trans mosaic, which no sensor option has; expected a Bayer mosaic")
+    model = " ".join((frame.metadata.model or "a camera without a name").split())
+    of_matrix, of_gains = _matrix_source(tags), _gains_source(tags, gains)
+    levels = round(sum(black) / 4), round(min(white))
+    origin = f"# {file.name}, SHA-256 {file_sha256(file)}.\n"
+    entries = [f"{entry:.6g}" for entry in matrix]
+    rows = ",\n          ".join(", ".join(entries[row : row + 3]) for row in (0, 3, 6))
+    bits = int(levels[1]).bit_length()
+    of_levels = [f"{tag} {value}" for tag, value in _level_sources(tags, black, levels[1])]
+    return CameraOptions(
+        f"# {model}: the matrix from XYZ to the camera. {MARK}.\n# Source: {of_matrix}.\n{origin}# Gains of the frame: "
+        f"{of_gains}.\nname: {name}\nlaw: custom\nxyz2cam: [{rows}]\n",
+        f"# {model}, {bits} bits. {MARK}.\n# Source: {', '.join(of_levels)}.\n{origin}bits: {bits}\nblack_level_dn: "
+        f"{levels[0]}\nwhite_level_dn: {levels[1]}\npattern: {pattern}\n{SENSOR_KEYS}",
+        (
+            f"matrix: {of_matrix}",
+            f"gains: {of_gains}",
+            f"levels: {', '.join(of_levels)}; {bits} bits hold them",
+            f"pattern: {pattern} at the corner of the visible part "
+            f"({'CFAPattern and ActiveArea' if tags.colour else 'LibRaw'})",
+        ),
+    )
+
+
+def _matrix_source(tags: RawMetadata) -> str:
+    """Describe the source of the matrix."""
+    if tags.colour is None:
+        return "table of LibRaw, for D65"
+    named = [
+        f"ColorMatrix{number} ({kelvin:g} K)" if kelvin else f"ColorMatrix{number}"
+        for number, kelvin in enumerate(tags.colour.lights_k, start=1)
+    ]
+    others = [
+        f"CameraCalibration{number}" for number in (1, 2) if tags.colour.calibrations[number - 1] != colour.IDENTITY
+    ]
+    others += ["AnalogBalance"] if tags.colour.balance != (1.0, 1.0, 1.0) else []
+    x, y = white = tags.colour.white()
+    stated = "AsShotWhiteXY" if tags.colour.white_xy else "AsShotNeutral" if tags.colour.neutral else "no tag, so D50"
+    where = f"the white point x {x:.4f}, y {y:.4f} ({temperature(white):.0f} K; {stated})"
+    return f"{', '.join([*named, *others])} at {where}"
+
+
+def _gains_source(tags: RawMetadata, gains: tuple[float, float] | None) -> str:
+    """Describe the gains and their source."""
+    if gains is None:
+        return "not stated"
+    stated = tags.colour is not None and tags.colour.gains() is not None
+    tag = ("AsShotNeutral" if tags.colour and tags.colour.neutral else "AsShotWhiteXY") if stated else "LibRaw"
+    red, blue = (f"{gain:.6g}" for gain in gains)
+    return f"red {red}, blue {blue} ({tag}); gains=fixed gains.red={red} gains.blue={blue}"
+
+
+def _level_sources(tags: RawMetadata, black: tuple[float, ...], white: int) -> list[tuple[str, str]]:
+    levels = f"{black[0]:g}" if len(set(black)) == 1 else f"{', '.join(f'{one:g}' for one in black)} (mean)"
+    return [
+        ("black level (LibRaw)" if tags.black_dn is None else "BlackLevel", levels),
+        ("white level (LibRaw)" if tags.white_dn is None else "WhiteLevel", f"{white}"),
+    ]
