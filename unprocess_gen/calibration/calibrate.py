@@ -48,7 +48,7 @@ def calibrate(folder: Path, quick: bool = False, watch: Watch = lambda frames: f
 
     Raises ConfigError or MachineError.
     """
-    return _measured(read_captures(folder), quick, watch, None)
+    return measure_all(read_captures(folder), quick, watch, None)
 
 
 def calibrate_darks(
@@ -63,11 +63,11 @@ def calibrate_darks(
     if flats := len(captures.captures) - len(darks):
         captures.notes.append(f"{folder}: --from darks leaves out {flats} flats")
     captures = captures._replace(captures=darks)
-    return _measured(captures, False, watch, known_gain(captures, profile, stated))
+    return measure_all(captures, False, watch, known_gain(captures, profile, stated))
 
 
-def _measured(captures: CaptureSet, quick: bool, watch: Watch, known: KnownGain | None) -> Calibration:
-    """Measure each ISO, and what all ISOs show together."""
+def measure_all(captures: CaptureSet, quick: bool, watch: Watch, known: KnownGain | None) -> Calibration:
+    """Measure each ISO, and what all ISOs show together; ISOs with a known gain are measured by darks alone."""
     gains = dict(known.by_iso) if known else {}
     for iso, gain in gains.items():
         if not gain.low > 0:  # not known: as if exact, in electrons

@@ -114,8 +114,8 @@ class CaptureSet(NamedTuple):
         return sorted({capture.iso for capture in self.captures})
 
 
-def read_captures(folder: Path, kind: str | None = None) -> CaptureSet:
-    """List the frames of a folder; ``kind`` is that of raw files whose names state none.
+def read_captures(folder: Path, kind: str | None = None, default: Sensor | None = None) -> CaptureSet:
+    """List the frames of a folder; ``kind`` is that of raw files whose names state none, ``default`` the sensor's.
 
     Raises ConfigError or MachineError.
     """
@@ -137,7 +137,7 @@ def read_captures(folder: Path, kind: str | None = None) -> CaptureSet:
         raise MachineError(f"{error.filename or folder}: cannot be read ({error.strerror or error})") from error
     _check_twins(captures, digests)
     notes: list[str] = []
-    sensor = _sensor(captures, notes)
+    sensor = _sensor(captures, notes, default)
     return CaptureSet(captures, sensor, hashlib.sha256("\n".join(sorted(digests)).encode()).hexdigest(), notes)
 
 
@@ -275,9 +275,13 @@ def _from_emva(folder: Path) -> Iterator[Capture]:
 # -------------------------------------------------------------------------------------------------------------- sensor
 
 
-def _sensor(captures: list[Capture], notes: list[str]) -> Sensor:
+def _sensor(captures: list[Capture], notes: list[str], default: Sensor | None) -> Sensor:
     """Return the sensor of all frames; levels that no file states are measured, with a note."""
     stated = {name: _common(captures, name) for name in ("bits", "black_level_dn", "white_level_dn", "pattern")}
+    if default is not None:
+        own: dict[str, Any] = {"black_level_dn": default.black_dn, "white_level_dn": default.white_dn}
+        own |= {"bits": default.bits, "pattern": default.pattern}
+        stated = {name: own[name] if value is None else value for name, value in stated.items()}
     height, width = captures[0].pixels().shape
     shape = height, width
     darks = [capture for capture in captures if capture.kind == "dark"]

@@ -68,8 +68,9 @@ def estimates(found: Calibration) -> list[Named]:
 def _of_iso(result: IsoResult, known: KnownGain | None, sites: Sequence[str]) -> Iterator[Named]:
     """Yield the estimates of one ISO."""
     iso, shape = result.iso, result.shape
-    yield Named("dn_per_e", iso, None, known.by_iso[iso] if known else result.gain.sensor, "DN/e")
-    if known is None:
+    gain = known.by_iso.get(iso, result.gain.sensor) if known else result.gain.sensor
+    yield Named("dn_per_e", iso, None, gain, "DN/e")
+    if result.curves:
         yield Named("dn_per_e_emva1288", iso, None, estimate(result.emva_gain, result.gain.sensor.error), "DN/e")
     yield Named("read_std_dn", iso, None, result.read, "DN")
     yield Named("read_shape", iso, None, shape.interval, "")
@@ -164,7 +165,7 @@ def profile_yaml(found: Calibration, name: str, two_parameter: bool) -> str:
     lines = head(start, isos, found.captures.sha256, found.notes, name, sensor)
     if two_parameter and len(isos) == 1:
         result = found.isos[0]
-        b = _dark_variance(result)
+        b = dark_variance(result)
         lines += [
             f"a: {yaml_text(rounded(result.gain.sensor.value))}   # {_range(result.gain.sensor)} DN per electron",
             f"b: {yaml_text(rounded(b.value))}   # {_range(b)} DN², without rounding",
@@ -189,7 +190,7 @@ def iso_branches(isos: Sequence[IsoResult]) -> list[list[int]]:
     return result
 
 
-def _dark_variance(result: IsoResult) -> Estimate:
+def dark_variance(result: IsoResult) -> Estimate:
     """Return the variance of a site without light, DN², all dark noise but rounding."""
     others = (result.row, result.column, result.column_temporal, result.dsnu_dn)
     value = result.read.value**2 + sum(one.value**2 for one in others)
@@ -207,7 +208,7 @@ def _branch_lines(
     origin = known.source if known else _ranges(isos, gains)
     lines = [f"  - iso: [{isos[0]:g}, {isos[-1]:g}]", f"    dn_per_e: {yaml_text(gain_by_iso)}   # {origin}"]
     if two_parameter:
-        variances = [_dark_variance(result) for result in results]
+        variances = [dark_variance(result) for result in results]
         reads = [estimate(math.sqrt(b.value), b.error / 2 / math.sqrt(b.value)) for b in variances]
         law = std_law(isos, reads)
         return [*lines, "    read_law: gaussian", f"    read_std_dn: {yaml_text(law)}   # {_ranges(isos, reads)}"]

@@ -5,16 +5,19 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_result, report, report_error
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import worst
+from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 from unprocess_gen.core.paths import AnyPath, local_path
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.repair import repair
 from unprocess_gen.pipeline.replay import ReplayResult, evenly_spaced_rows, source_root
 from unprocess_gen.pipeline.replay import replay as replay_rows
@@ -27,14 +30,11 @@ def verify(call: Call) -> int:
     """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
     folder = dataset_folder(call, sweeps=True)
     given_root(call)
-    if "to" in call.values:
-        if "noise" not in call.values:
-            raise ConfigError(f"verify: --to {call.values['to']}: draws the fits of --noise; add --noise")
-        from unprocess_gen.reports.photon_transfer import check_figure_file
-
-        check_figure_file(Path(call.values["to"]))
+    _check_to(call)
     if not is_sweep(folder):
         return _finish(folder, verify_dataset(folder), call)
+    if "against" in call.values:
+        raise ConfigError(f"verify: --against: {folder} is a sweep; expected one of its datasets")
     codes = []
     for result in verify_sweep(folder):
         try:
@@ -43,6 +43,23 @@ def verify(call: Call) -> int:
             codes.append(report_error(error))
     print_result(f"{folder}: {codes.count(0)} of {len(codes)} datasets are intact")
     return worst(codes)
+
+
+def _check_to(call: Call) -> None:
+    """Refuse, before any work, a file of ``--to`` that no flag writes, or that cannot be written."""
+    if "against" in call.values:
+        from unprocess_gen.reports.against import check_list
+
+        if "noise" in call.values:
+            raise ConfigError("verify: --noise, --against: both write --to; expected one of them")
+        if "to" in call.values:
+            check_list(Path(call.values["to"]))
+    elif "to" in call.values:
+        if "noise" not in call.values:
+            raise ConfigError(f"verify: --to {call.values['to']}: is for --noise or --against; add one of them")
+        from unprocess_gen.reports.photon_transfer import check_figure_file
+
+        check_figure_file(Path(call.values["to"]))
 
 
 def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
@@ -63,6 +80,8 @@ def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
         texts = _reported(folder, (_complaint(result) for result in results if result.complaint))
     if not texts and "noise" in call.values:
         texts = _check_noise(folder, call)
+    if not texts and "against" in call.values:
+        texts = _compare_frames(folder, Path(call.values["against"]), call.values.get("to"))
     if texts:
         return worst(codes) or DamageError.exit_code
     print_result(f"{folder} is intact{done}")
@@ -129,6 +148,25 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     unlisted = checks.wrong_pairs - sum(bool(alarm.key) for alarm in checks.alarms)
     more = [f"noise of {counted(unlisted, 'other pair')}: wrong too"] if unlisted else []
     return _reported(folder, [*map(str, checks.alarms), *more])
+
+
+def _compare_frames(folder: AnyPath, frames: Path, to: str | None) -> list[str]:
+    """Compare raw frames of a camera with the profile of a dataset; return what differs."""
+    from unprocess_gen.reports import against
+
+    config, _ = read_dataset_yaml(folder / "config.yaml")
+    found = against.compare_frames(config, frames, partial(with_bar, unit="frame"))
+    for note in found.notes:
+        report(note)
+    compared = [one for one in found.numbers if one.verdict != against.UNKNOWN]
+    print_result(
+        f"{frames}: {counted(len(compared), 'number')} compared with the profile {config.noise.name}, "
+        f"{len(found.differences)} wrong"
+    )
+    if to is not None:
+        against.write_list(found, Path(to))
+        print_result(f"listed in {to}")
+    return _reported(folder, map(str, found.differences))
 
 
 def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:

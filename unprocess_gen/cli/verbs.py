@@ -120,9 +120,17 @@ _VERBS = (
         (
             *INPUTS,
             REGENERATE,
-            _to("with --noise: draw the fits in FILE (PNG)", "FILE"),
+            _to("with --noise: draw the fits in FILE (PNG); with --against: list all numbers in FILE (CSV)", "FILE"),
             Argument(("--repair",), "restore damaged files to the same bytes"),
             Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
+            Argument(
+                ("--against",),
+                "compare raw darks and flats of a camera with the noise profile",
+                "FRAMES",
+                _local_path,
+                "a local folder",
+                "folders",
+            ),
         ),
         Place("DIR", "the folder of a dataset or of a sweep"),
     ),

@@ -12,7 +12,7 @@ import numpy as np
 from unprocess_gen.calibration.iso_laws import gain_law, std_law
 from unprocess_gen.calibration.measure import IsoResult, usable
 from unprocess_gen.calibration.profile import Calibration, Named, estimates, iso_branches, site_names
-from unprocess_gen.calibration.shape import fitted_shares
+from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
@@ -150,12 +150,19 @@ def _draw_transfer(curve_axes: Axes, residual_axes: Axes, result: IsoResult, sit
 
 def _draw_histogram(axes: Axes, result: IsoResult) -> None:
     """Draw the histogram of the darks against both fitted distributions."""
-    counts = result.histogram.counts.sum(axis=0)
-    centres = (result.histogram.edges[0, 1:] + result.histogram.edges[0, :-1]) / 2
-    axes.semilogy(centres, np.maximum(counts / counts.sum(), 1e-9), ".", markersize=4, color="#444444", label="darks")
-    for label, is_tukey in (("normal", False), (f"Tukey, λ {result.shape.shape:.3f}", True)):
-        shares = fitted_shares(result.histogram, result.shape, is_tukey)
-        axes.semilogy(centres, np.maximum(shares, 1e-9), linewidth=1, label=label)
+    histogram, shape = result.histogram, result.shape
+    group = max(1, round(1 / histogram.width))  # a bin for each DN, because values are integers
+    edges = np.arange(0, len(histogram.counts), group)
+    counts, moments = (
+        np.add.reduceat(values, edges) for values in (histogram.counts, histogram.counts * histogram.centres)
+    )
+    means = moments / np.maximum(counts, 1)
+    shares = counts / counts.sum() / (group * histogram.width)
+    axes.semilogy(means, np.maximum(shares, 1e-9), ".", markersize=4, color="#444444", label="darks")
+    for label, std, power in (("normal", shape.normal_std_dn, None), ("Tukey, λ", shape.tukey_std_dn, shape.shape)):
+        likelihoods = probabilities(histogram.centres, std, power)
+        label += "" if power is None else f" {power:.3f}"
+        axes.semilogy(histogram.centres, np.maximum(likelihoods, 1e-9), linewidth=1, label=label)
     axes.set(title="read noise", xlabel="DN from the mean of the row", ylabel="share", ylim=(1e-8, 1))
     axes.legend()
 

@@ -1,0 +1,242 @@
+"""Compare raw frames of a camera with the noise profile of a dataset: effects that it lacks, and numbers that are off.
+
+The frames are measured as `calibrate` measures them. A number differs if a number of the profile, with the errors of
+the measurement, would be as far away with the probability of an alarm of ``verify --noise``.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from unprocess_gen.calibration.calibrate import measure_all
+from unprocess_gen.calibration.captures import Sensor, read_captures
+from unprocess_gen.calibration.gain import NORMAL_95, Estimate
+from unprocess_gen.calibration.measure import Watch
+from unprocess_gen.calibration.profile import Calibration, KnownGain, Named, dark_variance, estimates, site_names
+from unprocess_gen.calibration.shape import NORMAL_SHAPE
+from unprocess_gen.config.interpretation import entry_configs, is_physical, noise_distributions
+from unprocess_gen.config.noise_validation import check_noise
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import machine_errors
+from unprocess_gen.core.output_paths import check_output_file
+from unprocess_gen.planning.draws import COUNT
+from unprocess_gen.planning.noise_profile import PhysicalNoise
+from unprocess_gen.planning.plan import TwoNumberLevel
+from unprocess_gen.reports.formatting import short_number
+from unprocess_gen.reports.noise_check.checks import FALSE_ALARM
+from unprocess_gen.reports.noise_check.scores import Score
+from unprocess_gen.simulation.effects import Physics
+
+EFFECTS = {
+    "dn_per_e": "shot",
+    "read_std_dn": "read",
+    "read_shape": "read",
+    "row_std_dn": "row",
+    "row_correlation": "row",
+    "column_std_dn": "column",
+    "column_temporal_std_dn": "column_temporal",
+    "black_error_dn": "black_error",
+    "prnu_std": "prnu",
+    "dsnu_std_e": "dsnu",
+    "dark_e_per_s": "dark_current",
+    "hot_pixel_share": "hot_pixels",
+    "dead_pixel_share": "dead_pixels",
+    "full_well_e": "full_well",
+    "b_dn2": "heteroscedastic",
+}
+"""Effect of each number that is compared, by its name in the list of estimates."""
+AT_TEMPERATURE = ("dark_e_per_s", "hot_pixel_share")
+"""Numbers that can be compared only if the frames state their temperature."""
+FIELDS = (
+    *("number", "iso", "site", "unit", "measured", "low", "high"),
+    *("profile", "difference_percent", "standard_errors", "verdict"),
+)
+"""Columns of the list."""
+AGREES, DIFFERS, UNKNOWN = "agrees", "differs", "not compared"
+LACKS, UNSEEN = "missing in the profile", "missing in the frames"
+
+
+class Comparison(NamedTuple):
+    """A measured number, that of the profile (None if it states none), and the verdict."""
+
+    measured: Named
+    profile: float | None
+    score: Score
+    verdict: str
+
+    def __str__(self) -> str:
+        one, number = self.measured, self.measured.number
+        assert number is not None and self.profile is not None
+        place = "".join([f"ISO {one.iso:g}: " if one.iso else "", f"site {one.site}: " if one.site else ""])
+        unit = one.unit and f" {one.unit}"
+        text = f"{place}{one.name} of the frames is {short_number(number.value, 4)}{unit}"
+        text += f" ({short_number(number.low, 4)} to {short_number(number.high, 4)})"
+        if self.verdict == LACKS:
+            return f"{text}; the profile lacks it: effect {EFFECTS[one.name]} is missing in the dataset"
+        if self.verdict == UNSEEN:
+            return f"{text}; the profile has {short_number(self.profile, 4)}: the camera does not show it"
+        side = "above" if self.score.total > 0 else "below"
+        off = f"{short_number(abs(self.score.total), 3)}{unit}"
+        off += f" or {abs(self.percent):.1f} %" if one.name != "black_error_dn" else ""
+        errors = f"{abs(self.score.errors):,.0f} standard errors"
+        return f"{text}, {off} {side} that of the profile, {short_number(self.profile, 4)} ({errors})"
+
+    @property
+    def percent(self) -> float:
+        """Difference relative to the number of the profile; NaN without one."""
+        return 100 * self.score.total / self.profile if self.profile else math.nan
+
+    @property
+    def cells(self) -> list[str]:
+        """Cells of the line in the list."""
+        one, score = self.measured, self.score
+        number = one.number or Estimate(math.nan, math.nan, math.nan)
+        values = [number.value, number.low, number.high, math.nan if self.profile is None else self.profile]
+        values += [math.nan] * 2 if self.verdict == UNKNOWN else [self.percent, score.errors]
+        numbers = [f"{value:.7g}" if math.isfinite(value) else "" for value in values]
+        return [one.name, "" if one.iso is None else f"{one.iso:g}", one.site or "", one.unit, *numbers, self.verdict]
+
+
+class Comparisons(NamedTuple):
+    """All comparisons of the frames with the profile, and notes on the frames."""
+
+    numbers: list[Comparison]
+    notes: list[str]
+
+    @property
+    def differences(self) -> list[Comparison]:
+        """Numbers that differ; of a number that differs at all sites together, not those of the sites."""
+        differing = [one for one in self.numbers if one.verdict not in (AGREES, UNKNOWN)]
+        whole = {(one.measured.name, one.measured.iso) for one in differing if one.measured.site is None}
+        return [
+            one for one in differing if one.measured.site is None or (one.measured.name, one.measured.iso) not in whole
+        ]
+
+
+def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: frames) -> Comparisons:
+    """Measure raw frames, and compare them with the profile of a dataset; levels they do not state are the dataset's.
+
+    Raises ConfigError or MachineError.
+    """
+    noises = {entry.noise for entry in entry_configs(config)}
+    if len(noises) > 1:
+        names = ", ".join(sorted(noise.name for noise in noises))
+        raise ConfigError(f"--against {frames}: the dataset has a mixture of profiles ({names}); expected one profile")
+    sensor = config.sensor
+    default = Sensor(sensor.bits, sensor.black_level_dn, sensor.white_level_dn, sensor.pattern, (0, 0))
+    captures = read_captures(frames, "dark", default)
+    with_flats = {capture.iso for capture in captures.captures if capture.kind == "flat"}
+    profile = Profile(config, captures.sensor, captures.isos)
+    dark_only = [iso for iso in captures.isos if iso not in with_flats]
+    known = {iso: Estimate(*[profile.numbers(iso, None)["dn_per_e"][0] or 1.0] * 3) for iso in dark_only}
+    found = measure_all(captures, True, watch, KnownGain("the profile of the dataset", "", known))
+    return Comparisons(list(_compared(found, profile, known)), found.notes)
+
+
+def _compared(found: Calibration, profile: Profile, known: dict[float, Estimate]) -> Iterator[Comparison]:
+    """Yield the comparison of each estimate."""
+    celsius, isos = found.body.dark_reference_c, found.captures.isos
+    variances = [Named("b_dn2", result.iso, None, dark_variance(result), "DN²") for result in found.isos]
+    listed = [one for one in [*estimates(found), *variances] if one.name in EFFECTS]
+    limit, sites = math.log(2 * len(listed) / FALSE_ALARM), site_names(found.sensor)
+    tukey = {
+        (one.iso, place): shape.is_tukey for one in found.isos for place, shape in enumerate([one.shape, *one.shapes])
+    }
+    for one in listed:
+        numbers = profile.numbers(one.iso or isos[0], celsius)
+        place = 1 + sites.index(one.site) if one.site else 0
+        if one.name not in numbers:
+            continue
+        expected = numbers[one.name][place]
+        is_open = one.number is None or not math.isfinite(one.number.high) or expected is None
+        is_open |= one.name == "dn_per_e" and one.iso in known
+        is_open |= one.name in AT_TEMPERATURE and celsius is None and bool(expected)
+        # a normal distribution is nearest to Tukey's at a shape that a fit may miss
+        is_open |= one.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[one.iso or 0.0, place]
+        if is_open or one.number is None or expected is None:
+            yield Comparison(one, expected, Score(0.0, 1.0, 0.0), UNKNOWN)
+            continue
+        score = _score(one.number, expected)
+        verdict = AGREES
+        if score.surprise > limit:
+            verdict = DIFFERS if expected and one.number.value else UNSEEN if expected else LACKS
+            verdict = DIFFERS if one.name == "black_error_dn" else verdict
+        yield Comparison(one, expected, score, verdict)
+
+
+def _score(number: Estimate, expected: float) -> Score:
+    """Return the score of a difference, with the error on the side of the expected number."""
+    error = (number.high - number.value if expected > number.value else number.value - number.low) / NORMAL_95
+    return Score(number.value - expected, 1.0, error**2)
+
+
+class Profile:
+    """Numbers of a dataset's noise profile in DN of the sensor that recorded the frames."""
+
+    def __init__(self, config: Config, sensor: Sensor, isos: list[float]) -> None:
+        levels = dataclasses.replace(
+            config.sensor,
+            bits=sensor.bits,
+            black_level_dn=round(sensor.black_dn),
+            white_level_dn=round(sensor.white_dn),
+            pattern=config.sensor.pattern if sensor.pattern == "MONO" else sensor.pattern,
+        )
+        noise = config.noise
+        if is_physical(noise):
+            noise = dataclasses.replace(noise, iso=None, scatter="off")
+        elif len(isos) > 1 or any(one.kind != "constant" for one in noise_distributions(noise)):
+            problem = "is for one ISO" if len(isos) > 1 else "draws its numbers"
+            raise ConfigError(f"verify: --against: noise={noise.name} {problem}; expected frames and a profile of one")
+        self.config = dataclasses.replace(config, sensor=levels, noise=noise, mixture=None)
+        for iso in isos:
+            try:
+                check_noise(noise, dataclasses.replace(config.scene, iso=iso))
+            except ConfigError as error:
+                raise ConfigError(f"verify: --against: the frames are of ISO {iso:g}: {error}") from error
+
+    def numbers(self, iso: float, celsius: float | None) -> dict[str, list[float | None]]:
+        """Return the numbers at an ISO by their names in the list of estimates: of the sensor, then of each site."""
+        scene = dataclasses.replace(self.config.scene, iso=iso, exposure_s=1.0)
+        if celsius is not None:
+            scene = dataclasses.replace(scene, temperature_c=celsius)
+        config, middle = dataclasses.replace(self.config, scene=scene), [0.5] * COUNT
+        if is_physical(config.noise):
+            physics = PhysicalNoise(config).draw(middle, 0, 0)
+            return {name: self._number(name, physics) for name in EFFECTS if name != "b_dn2"}
+        a, b = TwoNumberLevel(config, 0).two_numbers(middle)
+        two: dict[str, float | None] = {"dn_per_e": a, "b_dn2": b, "read_std_dn": None, "read_shape": None}
+        return {name: [two.get(name, 0.0)] * 5 for name in EFFECTS if name != "full_well_e"}
+
+    def _number(self, name: str, physics: Physics) -> list[float | None]:
+        if getattr(self.config.effects, EFFECTS[name]) == "off":
+            return [0.0 if name != "full_well_e" else None] * 5
+        if name == "black_error_dn":
+            return [sum(physics.black_error_dn) / 4, *physics.black_error_dn]
+        if name == "read_shape" and physics.read_law == "gaussian":
+            return [NORMAL_SHAPE] * 5
+        value = getattr(physics, {"dark_e_per_s": "dark_e"}.get(name, name))
+        if name == "dn_per_e":
+            sites = [physics.gain_by_colour["RGB".index(colour)] for colour in self.config.sensor.pattern]
+            return [value, *(value * factor for factor in sites)]
+        return [value] * 5
+
+
+def check_list(to: Path) -> None:
+    """Refuse, before any work, a file to which the list of comparisons cannot be written."""
+    check_output_file(to, f"--to {to}", "an earlier list of --against", ",".join(FIELDS).encode())
+
+
+def write_list(found: Comparisons, to: Path) -> None:
+    """Write all comparisons as CSV."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerows([FIELDS, *(one.cells for one in found.numbers)])
+    with machine_errors(to):
+        to.write_text(file.getvalue(), encoding="utf-8")
