@@ -146,7 +146,7 @@ def fit_shape(histogram: Histogram, start: Shape | None = None) -> Shape:
 
 def _of_rounded_means(std: float, shape: float) -> float:
     """Return an error of λ because the mean of rounded values is not μ, which widens the histogram of weak noise."""
-    lattice = np.arange(-REACH, REACH) + 0.25
+    lattice = np.arange(-REACH, REACH, dtype=np.float64) + 0.25
     off = float(lattice @ probabilities(lattice, std, shape))
     return 2 * (off / std) ** 2
 
