@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
+from helpers.captures import BLACK, WHITE, Numbers, draw
 from helpers.commands import RunMain
 
 import unprocess_gen as ug
 from unprocess_gen.config.schema import Config
 from unprocess_gen.reports.against import compare_frames
 
-BLACK, WHITE = 512, 16383
 SETTINGS = ["noise=mine", "scene.iso=800", "sensor=generic_14bit", f"sensor.black_level_dn={BLACK}"]
 PROFILE = f"""name: mine
 scatter: "off"
@@ -29,38 +27,12 @@ branches:
 """
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Numbers of a simulated camera: those of the profile, or others."""
-
-    dn_per_e: float = 2.0
-    read_std_dn: float = 5.0
-    row_std_dn: float = 1.2
-    black_error_dn: float = 0.5
-    prnu_std: float = 0.0
-
-
 CHANGES = {
-    "read_std_dn": Truth(read_std_dn=5.5),
-    "row_std_dn": Truth(row_std_dn=0.0),
-    "black_error_dn": Truth(black_error_dn=2.5),
-    "dn_per_e": Truth(dn_per_e=2.06),
+    "read_std_dn": Numbers(read_std_dn=5.5),
+    "row_std_dn": Numbers(row_std_dn=0.0),
+    "black_error_dn": Numbers(black_error_dn=2.5),
+    "dn_per_e": Numbers(dn_per_e=2.06),
 }
-
-
-def record(folder: Path, truth: Truth, seed: int, side: int = 128) -> Path:
-    """Draw six darks, and two flats at each of eight levels."""
-    folder.mkdir(parents=True)
-    rng, lines = np.random.default_rng(seed), ["file,kind,iso,exposure_s,level"]
-    pattern = 1 + rng.normal(0, truth.prnu_std, (side, side))
-    for number, light in enumerate((*[0.0] * 6, *np.repeat(np.arange(0.04, 0.33, 0.04), 2))):
-        electrons = rng.poisson(light * (WHITE - BLACK) / truth.dn_per_e * pattern)
-        rows = rng.normal(0, truth.row_std_dn, (side, 1))
-        noise = rng.normal(BLACK + truth.black_error_dn, truth.read_std_dn, (side, side)) + rows
-        np.save(folder / f"{number}.npy", np.rint(electrons * truth.dn_per_e + noise).astype(np.uint16))
-        lines.append(f"{number}.npy,flat,800,0.01,{light:.2f}" if light else f"{number}.npy,dark,800,0.01,")
-    (folder / "captures.csv").write_text("\n".join(lines) + "\n")
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +54,9 @@ def out(config: Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_differences_are_named_in_sentences_and_a_list(out: Path, run_main: RunMain, tmp_path: Path) -> None:
     listed = tmp_path / "list.csv"
-    done = run_main("verify", out, "--against", record(tmp_path / "same", Truth(), 0))
+    done = run_main("verify", out, "--against", draw(tmp_path / "same", Numbers(), 0))
     assert (done.code, "0 wrong" in done.out) == (0, True), done.err
-    other = record(tmp_path / "other", Truth(2.2, 5.5, 0.0, 2.5, prnu_std=0.02), 0)
+    other = draw(tmp_path / "other", Numbers(2.2, 5.5, 0.0, 2.5, prnu_std=0.02), 0)
     done = run_main("verify", out, "--against", other, "--to", listed)
     assert done.code == 4
     rows = {(row["number"], row["iso"], row["site"]): row for row in csv.DictReader(listed.read_text().splitlines())}
@@ -106,7 +78,7 @@ def test_two_numbers_are_compared(tmp_path: Path) -> None:
     """The two numbers agree; what they do not describe is missing in the profile."""
     plain = ["noise=heteroscedastic", "noise.a=2", "noise.b=26.44", "sensor=generic_14bit"]
     config = ug.load_config([*plain, f"sensor.black_level_dn={BLACK}"])
-    found = compare_frames(config, record(tmp_path / "frames", Truth(black_error_dn=0), 0))
+    found = compare_frames(config, draw(tmp_path / "frames", Numbers(black_error_dn=0), 0))
     verdicts = {one.measured.name: one.verdict for one in found.numbers if one.measured.site is None}
     assert (verdicts["dn_per_e"], verdicts["b_dn2"], verdicts["row_std_dn"]) == (
         "agrees",
@@ -116,7 +88,7 @@ def test_two_numbers_are_compared(tmp_path: Path) -> None:
 
 
 def test_gain_of_darks_alone_is_not_compared(config: Config, tmp_path: Path) -> None:
-    folder = record(tmp_path / "frames", Truth(), 0)
+    folder = draw(tmp_path / "frames", Numbers(), 0)
     lines = [line for line in (folder / "captures.csv").read_text().splitlines() if "flat" not in line]
     (folder / "captures.csv").write_text("\n".join(lines))
     verdicts = {one.measured.name: one.verdict for one in compare_frames(config, folder).numbers}
@@ -132,7 +104,7 @@ def test_wrong_use_is_refused(flags: str, run_main: RunMain, out: Path) -> None:
 
 
 def test_frames_of_another_iso_are_refused(config: Config, tmp_path: Path) -> None:
-    folder = record(tmp_path / "frames", Truth(), 0)
+    folder = draw(tmp_path / "frames", Numbers(), 0)
     (folder / "captures.csv").write_text((folder / "captures.csv").read_text().replace(",800,", ",1600,"))
     with pytest.raises(ug.ConfigError, match="the frames are of ISO 1600"):
         compare_frames(config, folder)
@@ -142,6 +114,6 @@ def test_frames_of_another_iso_are_refused(config: Config, tmp_path: Path) -> No
 @pytest.mark.parametrize("number", [*CHANGES, "none"])
 def test_planted_differences_are_named_in_all_of_100_runs(number: str, config: Config, tmp_path: Path) -> None:
     for seed in range(100):
-        found = compare_frames(config, record(tmp_path / f"{seed}", CHANGES.get(number, Truth()), seed, 256))
+        found = compare_frames(config, draw(tmp_path / f"{seed}", CHANGES.get(number, Numbers()), seed, 256))
         named = {one.measured.name for one in found.differences}
         assert named == ({number} if number in CHANGES else set()), (seed, [str(one) for one in found.differences])

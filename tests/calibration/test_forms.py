@@ -14,6 +14,7 @@ from helpers.captures import Camera, record
 from helpers.commands import RunMain
 
 import unprocess_gen as ug
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.dataset.dng import encode
 from unprocess_gen.simulation.effects import dark_variance_dn2
 
@@ -26,14 +27,14 @@ WHITE, BLACK = 4095, 256
 Law = dict[int, tuple[float, float]]
 
 
-def stated(folder: Path, law: Law) -> Path:
+def stated(folder: Path, law: Law, black: int = BLACK, white: int = WHITE) -> Path:
     """Write DNG files without pixels worth reading, each with an ISO and S, O of its NoiseProfile."""
     import tifffile
 
     folder.mkdir()
     for iso, numbers in law.items():
         tags = [
-            (50706, "B", 4, (1, 4, 0, 0)), (50714, "I", 1, BLACK), (50717, "I", 1, WHITE),
+            (50706, "B", 4, (1, 4, 0, 0)), (50714, "I", 1, black), (50717, "I", 1, white),
             (34855, "H", 1, iso), (51041, "d", len(numbers), numbers),
         ]  # fmt: skip
         tifffile.imwrite(folder / f"{iso}.dng", np.zeros((32, 32), np.uint16), photometric=32803, extratags=tags)
@@ -95,6 +96,33 @@ def test_gain_between_isos_is_interpolated(run_main: RunMain, tmp_path: Path) ->
     assert between == pytest.approx(1.45e-5 * span, rel=FLOAT32)
 
 
+def test_tags_of_published_numbers_give_published_noise(run_main: RunMain, tmp_path: Path) -> None:
+    """S, O and levels of a Sony A7R IV at ISO 100, as Adobe's converter writes them."""
+    folder, profile = stated(tmp_path / "dng", {100: (2.649e-5, 8.906e-9)}, 512, 16383), profile_of(tmp_path)
+    done = run_main("calibrate", folder, "--from", "noise_profile", "--to", profile)
+    assert done.code == 0, done.err
+    found = listed(profile)
+    assert found["dn_per_e", 100, None]["value"] == pytest.approx(0.420, abs=5e-4)
+    assert found["b_dn2", 100, None]["value"] == pytest.approx(2.24, abs=5e-3)
+
+
+@pytest.mark.parametrize("text", ["[", "[{}", '[{"name": "dn_per_e", "iso": "x", "site": null}]', '{"a": 1}'])
+def test_damaged_list_next_to_a_profile_is_refused(text: str, run_main: RunMain, tmp_path: Path) -> None:
+    folder, other, profile = tmp_path / "darks", tmp_path / "other.yaml", profile_of(tmp_path)
+    other.write_text((conf_dir() / "noise" / "canon_70d.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    other.with_suffix(".json").write_text(text)
+    folder.mkdir()
+    (folder / "captures.csv").write_text(
+        "file,kind,iso,black_level_dn,white_level_dn,bits\na.npy,dark,100,100,4095,12\n"
+    )
+    np.save(folder / "a.npy", np.full((32, 32), 200, np.uint16))
+    done = run_main("calibrate", folder, "--from", "darks", "--gain", other, "--to", profile)
+    assert (done.code, "other.json: is not a list of estimates" in done.err, profile.exists()) == (2, True, False), (
+        done.err
+    )
+    assert done.err.count("\n") == 1
+
+
 @pytest.mark.skipif(not A7R4.is_file(), reason="DNGPY_SAMPLES names no folder with sample files of dngpy 0.1.3")
 def test_tags_of_a_real_file_are_read(run_main: RunMain, tmp_path: Path) -> None:
     profile = profile_of(tmp_path)
@@ -132,8 +160,10 @@ def test_implausible_laws_are_refused(law: Any, problem: str, run_main: RunMain,
 TOLERANCES = {"read_std_dn": 0.005, "row_std_dn": 0.03}
 
 
-def check_darks(run_main: RunMain, tmp_path: Path, camera: Camera, *flags: str, darks: int = 16) -> Path:
-    """Calibrate darks of a camera, and compare with what was simulated."""
+def check_darks(
+    run_main: RunMain, tmp_path: Path, camera: Camera, *flags: str, darks: int = 16, more: float = 1
+) -> Path:
+    """Calibrate darks of a camera, and compare with what was simulated, within a multiple of the tolerances."""
     folder, profile = tmp_path / f"{camera.profile}_{camera.iso:g}", profile_of(tmp_path)
     if not folder.exists():
         record(folder, camera, darks=darks, flats=0, long_s=(4.0, 16.0))
@@ -141,28 +171,31 @@ def check_darks(run_main: RunMain, tmp_path: Path, camera: Camera, *flags: str, 
     assert done.code == 0, done.err
     found, truth = listed(profile), camera.truth
     for name, tolerance in TOLERANCES.items():
-        assert found[name, camera.iso, None]["value"] == pytest.approx(truth[name], rel=tolerance), (camera, name)
+        assert found[name, camera.iso, None]["value"] == pytest.approx(truth[name], rel=more * tolerance), (
+            camera,
+            name,
+        )
     assert found["dn_per_e", camera.iso, None]["value"] == pytest.approx(truth["dn_per_e"], rel=1e-6)
     if camera.iso >= 800:  # below, read noise hides some electrons
-        assert found["dark_e_per_s", None, None]["value"] == pytest.approx(truth["dark_e"], rel=0.05)
+        assert found["dark_e_per_s", None, None]["value"] == pytest.approx(truth["dark_e"], rel=more * 0.05)
     assert found["prnu_std", None, None]["value"] is None
     return profile
 
 
 def test_darks_alone_give_a_profile(run_main: RunMain, tmp_path: Path) -> None:
     """The gain is that of the tags or stated, and `plan` shows which."""
-    camera = Camera("sony_a7s2", 3200, side=256)
+    camera = Camera("sony_a7s2", 3200, side=128)
     gain = camera.truth["dn_per_e"]
     ways = {
         "NoiseProfile tags of the darks": (),
         "gain stated by --dn-per-e": ("--dn-per-e", f"0.1@100,{gain}@3200"),
     }
     for source, flags in ways.items():
-        profile = check_darks(run_main, tmp_path, camera, *flags)
+        profile = check_darks(run_main, tmp_path, camera, *flags, darks=6, more=4)
         assert source in profile.read_text(encoding="utf-8")
     done = run_main("plan", "--config-dir", profile.parents[1], "noise=mine", "scene.iso=3200", "source.limit=1")
     shown = " ".join(done.out.split())
-    assert all(text in shown for text in (source, "calibrate --from darks", "uncertainty: read noise 0."))
+    assert all(text in shown for text in (source, "calibrate --from darks", "uncertainty: read_std_dn ±0."))
 
 
 @pytest.mark.slow

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,70 @@ from unprocess_gen.dataset.dng import encode
 
 LEVELS = (0.01, 0.02, 0.04, 0.06, 0.09, 0.12, 0.16, 0.2, 0.25, 0.3)
 SHORT_S = 0.001
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers of a sensor that is simulated with NumPy alone: 14 bits, RGGB, by default without fixed patterns."""
+
+    dn_per_e: float = 2.0
+    read_std_dn: float = 5.0
+    row_std_dn: float = 1.2
+    black_error_dn: float = 0.5
+    prnu_std: float = 0.0
+    dark_e_per_s: float = 0.0
+    full_well_e: float = math.inf
+    gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+BLACK, WHITE = 512, 16383
+
+
+class Shot(NamedTuple):
+    """A frame to draw: its light as a fraction of white above black, exposure and temperature."""
+
+    light: float
+    seconds: float = 0.01
+    celsius: float = 20.0
+
+
+LIGHTS = (0.04, 0.08, 0.12, 0.16, 0.2, 0.24, 0.28, 0.32)
+EIGHT_LEVELS = (*[Shot(0.0)] * 6, *(Shot(light) for light in LIGHTS for _ in range(2)))
+"""Six darks, and two flats at each of eight levels."""
+COLUMNS = "file,kind,iso,exposure_s,level,temperature_c"
+
+
+def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequence[Shot] = EIGHT_LEVELS) -> Path:
+    """Draw frames at ISO 800 with captures.csv, which states no levels; return the folder.
+
+    The dark current doubles every 6 degrees from 20 on; its mean is removed, as cameras do.
+    """
+    folder.mkdir(parents=True)
+    rng, lines = (
+        np.random.default_rng(seed),
+        ["file,kind,iso,exposure_s,level,temperature_c,black_level_dn,white_level_dn,bits"],
+    )
+    pattern = 1 + rng.normal(0, numbers.prnu_std, (side, side))
+    gains = np.tile([numbers.gains[:2], numbers.gains[1:]], (side // 2, side // 2)) * numbers.dn_per_e
+    for place, shot in enumerate(shots):
+        dark = numbers.dark_e_per_s * shot.seconds * 2 ** ((shot.celsius - 20) / 6)
+        light = shot.light * (WHITE - BLACK) / numbers.dn_per_e * pattern
+        electrons = np.minimum(rng.poisson(light + dark), numbers.full_well_e) - dark
+        rows = rng.normal(0, numbers.row_std_dn, (side, 1))
+        noise = rng.normal(BLACK + numbers.black_error_dn, numbers.read_std_dn, (side, side)) + rows
+        np.save(folder / f"{place}.npy", np.clip(np.rint(electrons * gains + noise), 0, WHITE).astype(np.uint16))
+        kind = f"flat,800,{shot.seconds},{shot.light:.2f}" if shot.light else f"dark,800,{shot.seconds},"
+        lines.append(f"{place}.npy,{kind},{shot.celsius}")
+    (folder / "captures.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder
+
+
+def with_levels(folder: Path) -> Path:
+    """State black, white and bits in the list of a folder; return the folder."""
+    first, *lines = (folder / "captures.csv").read_text(encoding="utf-8").splitlines()
+    text = [f"{first},black_level_dn,white_level_dn,bits", *(f"{line},{BLACK},{WHITE},14" for line in lines)]
+    (folder / "captures.csv").write_text("\n".join(text) + "\n", encoding="utf-8")
+    return folder
 
 
 @functools.cache
@@ -54,12 +119,13 @@ class Camera:
 
 
 def frames(
-    darks: int, flats: int, levels: Sequence[float], long_s: Sequence[float]
+    darks: int, flats: int, levels: Sequence[float], long_s: Sequence[float], bright: int
 ) -> Iterator[tuple[str, float, float]]:
     """Yield kind, light and exposure of each frame."""
     yield from (("dark", 0.0, SHORT_S) for _ in range(darks))
     yield from (("dark", 0.0, seconds) for seconds in long_s for _ in range(4))
     yield from (("flat", light, SHORT_S) for light in levels for _ in range(flats))
+    yield from (("flat", 0.25, SHORT_S) for _ in range(bright))
 
 
 def record(
@@ -69,13 +135,17 @@ def record(
     flats: int = 2,
     levels: Sequence[float] = LEVELS,
     long_s: Sequence[float] = (),
+    bright: int = 0,
     as_dng: bool = True,
 ) -> Path:
-    """Write the captures of cameras that differ in ISO into a folder, with captures.csv; return the folder."""
+    """Write the captures of cameras that differ in ISO into a folder, with captures.csv; return the folder.
+
+    ``bright`` more flats at 25 % of white show fixed patterns.
+    """
     folder.mkdir(parents=True)
     lines = ["file,kind,iso,exposure_s,level" + ("" if as_dng else ",black_level_dn,white_level_dn,bits,pattern")]
     for camera in cameras:
-        for number, (kind, light, seconds) in enumerate(frames(darks, flats, levels, long_s)):
+        for number, (kind, light, seconds) in enumerate(frames(darks, flats, levels, long_s, bright)):
             pair = camera.pair(light, seconds, number)
             name = f"{camera.iso:g}_{kind}_{number:03d}.{'dng' if as_dng else 'npy'}"
             if as_dng:

@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unprocess_gen.calibration.gain import (
-    NORMAL_95,
-    SIGNIFICANT,
     Estimate,
     combined,
     estimate,
@@ -98,24 +96,18 @@ def _positive(number: Estimate) -> Estimate | None:
 
 def _prnu(results: Sequence[IsoResult], planes: Sequence[int]) -> Estimate:
     """Return the PRNU of planes: √((fixed variance of flats - that of darks) / signal²), weighted over levels."""
-    values, errors = list[float](), list[float]()
-    sites = 0
-    for result in results:
-        dark = result.dark.measured
-        for flat in usable(result.flats):
-            sites = flat.measured.sites
-            for plane in planes:
-                signal = flat.measured.mean_dn[plane] - dark.mean_dn[plane]
-                noise = math.hypot(flat.measured.fixed_error[plane], dark.fixed_error[plane])
-                values.append((flat.measured.fixed[plane] - dark.fixed[plane]) / signal**2)
-                errors.append(noise / signal**2)
-    weights = 1 / np.array(errors) ** 2
+    measured = [
+        (*result.prnu_squares[plane], result.dark.measured.sites)
+        for result in results
+        if result.prnu_squares
+        for plane in planes
+    ]
+    values, errors, sites = np.array(measured).T
+    weights = 1 / errors**2
     square = float(weights @ values / weights.sum())
     # the pixels are a sample of the sensor's
-    error = math.hypot(float(weights.sum()) ** -0.5, square * math.sqrt(2 / max(sites * len(planes), 1)))
-    if square <= SIGNIFICANT * error:
-        return Estimate(0.0, 0.0, math.sqrt(max(square + NORMAL_95 * error, 0.0)))
-    return estimate(math.sqrt(square), error / 2 / math.sqrt(square))
+    error = math.hypot(float(weights.sum()) ** -0.5, square * math.sqrt(2 / (sites[0] * len(planes))))
+    return root_estimate(square, error)
 
 
 def _dark_currents(results: Sequence[IsoResult]) -> dict[float, list[Estimate]]:

@@ -20,10 +20,10 @@ from unprocess_gen.calibration.profile import (
     KnownGain,
     estimates,
     estimates_json,
-    profile_yaml,
+    measured_yaml,
     unknown_numbers,
 )
-from unprocess_gen.calibration.stated_noise import STATED, StatedNoise, stated_estimates, stated_profile
+from unprocess_gen.calibration.stated_noise import STATED, StatedNoise, stated_estimates, stated_yaml
 from unprocess_gen.config.limits import NAME
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
@@ -92,12 +92,12 @@ def _merged(notes: Iterable[str]) -> list[str]:
 
 def write_profile(found: Calibration, to: Path, two_parameter: bool = False) -> None:
     """Write the profile and, with the suffix .json, the list of all estimates."""
-    _write(to, profile_yaml(found, to.stem, two_parameter), estimates_json(estimates(found)))
+    _write(to, measured_yaml(found, to.stem, two_parameter), estimates_json(estimates(found)))
 
 
 def write_stated_profile(stated: StatedNoise, to: Path) -> None:
     """Write the profile of NoiseProfile tags and, with the suffix .json, the list of all estimates."""
-    _write(to, stated_profile(stated, to.stem), estimates_json(stated_estimates(stated), STATED.digits))
+    _write(to, stated_yaml(stated, to.stem), estimates_json(stated_estimates(stated), STATED.digits))
 
 
 def _write(to: Path, profile: str, listed: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,25 +12,69 @@ from unprocess_gen.calibration.captures import Capture, Sensor
 from unprocess_gen.calibration.frame_sums import Measured
 from unprocess_gen.core.errors import ConfigError
 
-LEAST_DARK_STD_DN = 0.4
-"""Least noise of darks without rounding: below it, the variance of rounded values is no measure of the noise."""
-LEAST_DARK_STD_8_BITS_DN = 1.0
-"""The same for 8 bits, whose curve is mostly rounding."""
-CLIPPED_SHARE = 0.005
-GAPS_REFUSED, GAPS_DOUBTFUL = 0.25, 0.02
-"""Shares of values that never occur within the noise of a frame."""
-SMOOTHED_REFUSED, SMOOTHED_DOUBTFUL = 0.08, 0.025
-"""Correlations of neighbouring sites; real sensors reach 0.03 (EMVA 1288 reference set 001)."""
-CHANGE_REFUSED, CHANGE_DOUBTFUL = 0.02, 0.005
-"""Relative changes of the light between frames of a level."""
-BANDS_REFUSED, BANDS_DOUBTFUL = 0.01, 0.002
-"""Standard deviations of bands of rows, relative to the light."""
-BLOCKS_REFUSED, BLOCKS_DOUBTFUL = 0.5, 0.8
-"""Least light of a sixteenth of the frame over the largest."""
-NOISE_CHANGE = 1.2
-"""Largest ratio of the variances of darks of one ISO and exposure."""
-BRIGHTEST_DARK = 0.05
-"""Largest mean of darks above black, as a fraction of white above black."""
+
+class Limit(NamedTuple):
+    """Limits of a statistic: from which value frames are doubtful, and refused; what it means, and what is expected."""
+
+    doubtful: float
+    refused: float
+    meaning: str
+    expected: str
+
+
+LIMITS = {
+    "light in darks": Limit(
+        math.inf,
+        0.05,
+        "the mean is {value:.1%} of white away from black",
+        "frames without light; correct kind, or black_level_dn in captures.csv",
+    ),
+    "clipped black": Limit(
+        math.inf,
+        0.005,
+        "{value:.1%} of the values are the lowest that occurs: black is clipped, and a part of the noise is missing",
+        "raw frames with an offset",
+    ),
+    "frames differ": Limit(
+        math.inf,
+        1.2,
+        "the variances of the frames differ by a factor of {value:.2f}",
+        "frames of one ISO and exposure; remove those of another",
+    ),
+    "missing codes": Limit(
+        0.02,
+        0.25,
+        "{value:.0%} of the values within the noise never occur: the camera scales its values",
+        "values of the converter, not scaled ones, or ones of fewer bits",
+    ),
+    "neighbours": Limit(
+        0.025,  # real sensors reach 0.03 (EMVA 1288 reference set 001)
+        0.08,
+        "the noise of neighbouring sites has a correlation of {value:.3f}; a profile has none",
+        "raw frames without noise reduction or sharpening; switch off long-exposure and high-ISO noise reduction",
+    ),
+    "flicker": Limit(
+        0.005,
+        0.02,
+        "the mean differs by {value:.1%} between the frames",
+        "one exposure in steady light; correct level and exposure_s, or use a lamp that does not flicker",
+    ),
+    "bands": Limit(
+        0.002,
+        0.01,
+        "rows change by {value:.2%} from frame to frame: the lamp flickers",
+        "steady light, or exposures of many periods of the mains",
+    ),
+    "vignetting": Limit(
+        0.2,
+        0.5,
+        "the darkest sixteenth of the frame has {value:.0%} less light than the brightest",
+        "even light; defocus, use a diffuser, or stop down",
+    ),
+}
+"""Limits of the statistics of one measurement, by name."""
+LEAST_DARK_STD_DN, LEAST_DARK_STD_8_BITS_DN = 0.4, 1.0
+"""Least noise of darks without rounding, which hides the noise below; values of 8 bits are mostly rounding."""
 
 
 def place(frames: Sequence[Capture]) -> str:
@@ -39,28 +84,30 @@ def place(frames: Sequence[Capture]) -> str:
     return f"calibrate: {first.path} ({first.kind}, ISO {first.iso:g}{light}, {len(frames)} frames)"
 
 
+def _check(frames: Sequence[Capture], values: dict[str, float], notes: list[str]) -> None:
+    """Compare statistics with `LIMITS`: raise ConfigError, or add a note."""
+    for name, value in values.items():
+        limit = LIMITS[name]
+        text = f"{place(frames)}: {limit.meaning.format(value=value)}"
+        if value > limit.refused:
+            raise ConfigError(f"{text}; expected {limit.expected}")
+        if value > limit.doubtful:
+            notes.append(text)
+
+
 def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes: list[str]) -> None:
     """Refuse darks that are clipped, contain light or differ; warn of doubtful ones."""
-    start = place(frames)
-    if abs(float(dark.mean_dn.mean()) - sensor.black_dn) > BRIGHTEST_DARK * sensor.span_dn:
-        raise ConfigError(
-            f"{start}: the mean is {dark.mean_dn.mean():.1f} DN, and black is {sensor.black_dn:g} DN; expected frames "
-            "without light; correct kind, or black_level_dn in captures.csv"
-        )
-    clipped = clipped_share(dark)
-    if clipped > CLIPPED_SHARE:
-        raise ConfigError(
-            f"{start}: {clipped:.1%} of the values are the lowest that occurs: black is clipped, and a part of the "
-            "noise is missing; expected raw frames with an offset"
-        )
-    variances = dark.frame_variances
-    if variances.max() > NOISE_CHANGE * variances.min():
-        factor = math.sqrt(variances.max() / variances.min())
-        raise ConfigError(
-            f"{start}: the noise of the frames differs by a factor of {factor:.2f};"
-            " expected frames of one ISO and exposure; remove those of another"
-        )
-    check_pixels(frames, dark, notes)
+    values = {
+        "light in darks": abs(float(dark.mean_dn.mean()) - sensor.black_dn) / sensor.span_dn,
+        "clipped black": clipped_share(dark),
+        "frames differ": float(dark.frame_variances.max() / max(dark.frame_variances.min(), 1e-9)),
+    }
+    _check(frames, values | _of_pixels(dark), notes)
+
+
+def is_clipped(dark: Measured) -> bool:
+    """Return whether black is clipped."""
+    return clipped_share(dark) > LIMITS["clipped black"].refused
 
 
 def clipped_share(dark: Measured) -> float:
@@ -73,25 +120,11 @@ def clipped_share(dark: Measured) -> float:
     return float(max(shares))
 
 
-def check_pixels(frames: Sequence[Capture], measured: Measured, notes: list[str]) -> None:
-    """Refuse frames whose values have gaps or whose neighbours are correlated; warn of doubtful ones."""
-    start, gaps = place(frames), max(map(_gaps, measured.codes))
-    if gaps > GAPS_REFUSED:
-        raise ConfigError(
-            f"{start}: {gaps:.0%} of the values within the noise never occur; expected values of the "
-            "converter, not scaled ones, or ones of fewer bits"
-        )
-    if gaps > GAPS_DOUBTFUL:
-        notes.append(f"{start}: {gaps:.0%} of the values within the noise never occur; the camera scales its values")
-    name, correlation = max(measured.correlation.items(), key=lambda item: abs(item[1]))
+def _of_pixels(measured: Measured) -> dict[str, float]:
+    """Return the share of missing values, and the largest correlation of neighbours beyond its own noise."""
     noise = 6 / math.sqrt(4 * measured.sites) + 1 / min(measured.shape)
-    if abs(correlation) > SMOOTHED_REFUSED + noise:
-        raise ConfigError(
-            f"{start}: the noise of {name} has a correlation of {correlation:.2f}; expected raw frames without noise "
-            "reduction or sharpening; switch off long-exposure and high-ISO noise reduction"
-        )
-    if abs(correlation) > SMOOTHED_DOUBTFUL + noise:
-        notes.append(f"{start}: the noise of {name} has a correlation of {correlation:.3f}; the profile has none")
+    correlation = max(map(abs, measured.correlation.values()))
+    return {"missing codes": max(map(_gaps, measured.codes)), "neighbours": correlation - noise}
 
 
 def _gaps(codes: np.ndarray) -> float:
@@ -115,33 +148,12 @@ def check_dark_noise(frames: Sequence[Capture], sensor: Sensor, std_dn: float) -
 
 def check_flat(frames: Sequence[Capture], sensor: Sensor, flat: Measured, dark: Measured, notes: list[str]) -> None:
     """Refuse flats whose light changes in time or over the frame; warn of doubtful ones."""
-    start = place(frames)
-    signal = float(flat.mean_dn.mean() - dark.mean_dn.mean())
-    means = flat.frame_means.mean(axis=1)
+    signal, means = max(float(flat.mean_dn.mean() - dark.mean_dn.mean()), 1.0), flat.frame_means.mean(axis=1)
     jitter = 4 * math.sqrt(max(float(dark.frame_means.mean(axis=1).var(ddof=1)), flat.total.mean() / flat.sites / 4))
-    change = (float(np.ptp(means)) - jitter) / max(signal, 1.0)
-    if change > CHANGE_REFUSED:
-        raise ConfigError(
-            f"{start}: the mean differs by {np.ptp(means) / max(signal, 1.0):.1%} between the frames; expected one "
-            "exposure in steady light; correct level and exposure_s, or use a lamp that does not flicker"
-        )
-    if change > CHANGE_DOUBTFUL:
-        notes.append(f"{start}: the light changes by {change:.1%} between the frames")
-    bands = flat.row[0] - dark.row[0] - 5 * flat.row[1]
-    share = math.sqrt(max(bands, 0.0)) / max(signal, 1.0)
-    if share > BANDS_REFUSED:
-        raise ConfigError(
-            f"{start}: rows change by {share:.1%} from frame to frame: the lamp flickers; expected steady light, or "
-            "exposures of many periods of the mains"
-        )
-    if share > BANDS_DOUBTFUL:
-        notes.append(f"{start}: rows change by {share:.2%} from frame to frame: the lamp flickers")
     darkest, brightest = (block - sensor.black_dn for block in flat.blocks)
-    if darkest < BLOCKS_REFUSED * brightest:
-        raise ConfigError(
-            f"{start}: the darkest sixteenth of the frame has {darkest / brightest:.0%} of the light of the brightest; "
-            "expected even light; defocus, use a diffuser, or stop down"
-        )
-    if darkest < BLOCKS_DOUBTFUL * brightest:
-        notes.append(f"{start}: the darkest sixteenth of the frame has {darkest / brightest:.0%} of the brightest")
-    check_pixels(frames, flat, notes)
+    values = {
+        "flicker": (float(np.ptp(means)) - jitter) / signal,
+        "bands": math.sqrt(max(flat.row[0] - dark.row[0] - 5 * flat.row[1], 0.0)) / signal,
+        "vignetting": 1 - darkest / brightest if brightest > 0 else 0.0,
+    }
+    _check(frames, values | _of_pixels(flat), notes)

@@ -41,6 +41,8 @@ def plane_names(pattern: str) -> list[str]:
 
 WINDOW = 11
 """Side of the squares of sites of a plane whose mean is subtracted before fixed patterns are measured."""
+SMOOTH = 1 - 1 / WINDOW**2
+"""Part of the variance of independent sites that this leaves."""
 FAR = 8.0
 """Distance of defects from the other pixels, in robust standard deviations."""
 FIXED = 3.0
@@ -171,8 +173,7 @@ class FrameSums:
         noise = variance / width
         row, correlation = _row_offsets(own[0], float(noise.mean()) / 2)
         column = _offsets(own[1], float(variance.mean()) / height / 2)
-        smooth = 1 - 1 / WINDOW**2
-        temporal = (variance * smooth + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
+        temporal = (variance * SMOOTH + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
         return Measured(
             count=count,
             shape=(height, width),
@@ -188,7 +189,7 @@ class FrameSums:
                 own[1].mean(axis=0), float(variance.mean()) / height / count, max(column[0], 0.0) / count
             ),
             row_correlation=correlation,
-            fixed=(patterns - temporal) / smooth,
+            fixed=(patterns - temporal) / SMOOTH,
             fixed_error=np.sqrt(2 / good) * patterns + total_error / count,
             codes=self._codes,
             correlation=_correlations(self._pair),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,11 +32,11 @@ class Precision(NamedTuple):
 MEASURED = Precision()
 
 
-def branches(isos: Sequence[float], reads: Sequence[Estimate]) -> list[list[int]]:
+def modes(isos: Sequence[float], reads: Sequence[Estimate]) -> list[list[int]]:
     """Return the places of the ISOs of each gain mode."""
-    modes = [[0]]
+    result = [[0]]
     for place in range(1, len(isos)):
-        mode = modes[-1]
+        mode = result[-1]
         last = reads[mode[-1]].value ** 2
         slope = 0.0
         if len(mode) > 1:
@@ -45,10 +45,25 @@ def branches(isos: Sequence[float], reads: Sequence[Estimate]) -> list[list[int]
         read = reads[place]
         margin = SWITCH if len(mode) > 1 else 1.0
         if read.value + SIGNIFICANT * math.hypot(read.error, reads[mode[-1]].error) < margin * least:
-            modes.append([place])
+            result.append([place])
         else:
             mode.append(place)
-    return modes
+    return result
+
+
+def joined_branches(
+    isos: Sequence[float], gains: Sequence[Estimate], places: Iterable[list[int]], precision: Precision = MEASURED
+) -> list[list[int]]:
+    """Return the places of the ISOs of each branch: a mode whose gains are on one line, or else pairs of neighbours."""
+
+    def is_line(chosen: Sequence[int]) -> bool:
+        return gain_law([isos[one] for one in chosen], [gains[one] for one in chosen], precision) is not None
+
+    result: list[list[int]] = []
+    for mode in places:
+        pairs = [mode] if is_line(mode) else [[*pair] for pair in itertools.pairwise(mode) if is_line(pair)]
+        result += sorted([*pairs, *([one] for one in mode if not any(one in pair for pair in pairs))])
+    return result
 
 
 def gain_law(isos: Sequence[float], gains: Sequence[Estimate], precision: Precision = MEASURED) -> Any:

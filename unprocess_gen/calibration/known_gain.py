@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from unprocess_gen.calibration.captures import CaptureSet
 from unprocess_gen.calibration.gain import Estimate
@@ -16,12 +17,16 @@ from unprocess_gen.config.noise_validation import check_noise
 from unprocess_gen.config.option_files import group_options
 from unprocess_gen.config.schema import NoiseConfig, SceneConfig
 from unprocess_gen.config.serialization import read_option
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.config.values import error_in_one_line
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.records import Amount, check_record, parse_record
 from unprocess_gen.core.suggestions import did_you_mean
 from unprocess_gen.planning.noise_profile import number
 from unprocess_gen.sources.raw.metadata import read_tags
 
 UNKNOWN_INTERVAL = (-math.inf, math.inf)
+LARGEST_LIST = 2**24
+"""Bytes of the largest list of estimates that is read."""
 
 
 def known_gain(captures: CaptureSet, profile: str | None, stated: str | None) -> KnownGain:
@@ -99,14 +104,34 @@ def _read_profile(profile: str) -> tuple[NoiseConfig, dict[float, tuple[float, f
     return read_option("noise", path), _intervals(path.with_suffix(".json"))
 
 
+class ListedEstimate(msgspec.Struct):
+    """Line of a list of estimates that is read back."""
+
+    name: Annotated[str, msgspec.Meta(max_length=64)]
+    iso: Amount | None
+    site: Annotated[str, msgspec.Meta(max_length=2)] | None
+    low: Amount | None
+    high: Amount | None
+
+
 def _intervals(path: Path) -> dict[float, tuple[float, float]]:
-    """Return the intervals of the gain by ISO from the list of estimates next to a profile, if there is one."""
+    """Return the intervals of the gain by ISO from the list of estimates next to a profile; none without a list."""
     try:
-        rows: Any = json.loads(path.read_text(encoding="utf-8"))
-        return {
-            float(row["iso"]): (float(row["low"]), float(row["high"]))
-            for row in rows
-            if row["name"] == "dn_per_e" and row["site"] is None and row["low"] is not None
-        }
-    except (OSError, ValueError, TypeError, KeyError):
+        with path.open("rb") as file:
+            content = file.read(LARGEST_LIST + 1)
+        if len(content) > LARGEST_LIST:
+            raise ValueError(f"has more than {LARGEST_LIST} bytes")
+        rows = [row for row in parse_record(content, list[dict[str, Any]]) if row.get("name") == "dn_per_e"]
+        listed = [check_record(row, ListedEstimate) for row in rows]
+    except FileNotFoundError:
         return {}
+    except OSError as error:
+        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        problem = f"is not a list of estimates ({error_in_one_line(error)})"
+        raise ConfigError(f"--gain: {path}: {problem}; calibrate again, or delete the list") from error
+    return {
+        one.iso: (one.low, one.high)
+        for one in listed
+        if one.site is None and one.iso is not None and one.low is not None and one.high is not None
+    }

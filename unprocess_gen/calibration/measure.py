@@ -11,7 +11,17 @@ import numpy as np
 
 from unprocess_gen.calibration import checks
 from unprocess_gen.calibration.captures import Capture, CaptureSet, Sensor, with_measured_levels
-from unprocess_gen.calibration.frame_sums import FAR, ROBUST, TILE, FrameSums, Measured, high_passed, summed
+from unprocess_gen.calibration.frame_sums import (
+    FAR,
+    ROBUST,
+    SMOOTH,
+    TILE,
+    WINDOW,
+    FrameSums,
+    Measured,
+    high_passed,
+    summed,
+)
 from unprocess_gen.calibration.gain import Estimate, Gain, Transfer, emva_gain, estimate, fit_gain, root_estimate
 from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms, joined
 from unprocess_gen.core.errors import ConfigError
@@ -88,6 +98,7 @@ class IsoResult:
     column_temporal: Estimate
     black: list[Estimate]
     dsnu_dn: Estimate
+    prnu_squares: list[tuple[float, float]]
     full_well_dn: Estimate | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -128,6 +139,7 @@ def measure_iso(
         shape=shapes[0],
         shapes=shapes[1:],
         histogram=histogram,
+        prnu_squares=_prnu_squares(usable(flats), darks, watch) if flats else [],
         full_well_dn=_full_well(flats, sensor) if flats else None,
         notes=notes,
         **_of_darks(darks[reference], sensor, shapes),
@@ -139,7 +151,7 @@ def measure_darks(captures: CaptureSet, iso: float, notes: list[str], watch: Wat
     darks = list[Dark]()
     for frames in _groups(captures, "dark", iso, notes):
         dark = _dark(frames, captures.sensor, watch)
-        if darks and checks.clipped_share(dark.measured) > checks.CLIPPED_SHARE:
+        if darks and checks.is_clipped(dark.measured):
             notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
             continue
         checks.check_dark(frames, captures.sensor, dark.measured, notes)
@@ -341,6 +353,35 @@ def usable(flats: Sequence[Flat]) -> list[Flat]:
         for number, (flat, variance) in enumerate(zip(below, variances, strict=True))
         if number <= peak or variance > variances[peak] * STILL_RISING
     ]
+
+
+def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) -> list[tuple[float, float]]:
+    """Return the square of the PRNU of each plane, and its standard error, from the mean of all frames of all levels.
+
+    Frames have the weight signal/variance, which gives the mean of frame/signal the least noise. The variance of its
+    fixed pattern contains that of darks, c² times, and the temporal noise.
+    """
+    total, squares = np.zeros(1), list[tuple[float, float]]()
+    signals = [flat.measured.mean_dn.mean() - darks[flat.dark].measured.mean_dn.mean() for flat in flats]
+    weights = [signal / flat.measured.variance.mean() for signal, flat in zip(signals, flats, strict=True)]
+    counts = np.array([flat.measured.count for flat in flats])
+    for flat, weight in zip(flats, weights, strict=True):
+        for frame in watch(flat.frames):
+            total = total + np.float32(weight) * frame.pixels()
+    scale = float(counts * weights @ signals)
+    share = counts * np.square(weights) / scale**2
+    rows = sum(one * max(flat.measured.row[0], 0.0) for one, flat in zip(share, flats, strict=True)) * (1 - 1 / WINDOW)
+    for plane, (y, x) in enumerate(TILE):
+        pattern = high_passed(total[y::2, x::2] / scale)
+        deviation = np.abs(pattern - np.median(pattern))
+        pattern = pattern[deviation <= FAR * ROBUST * np.median(deviation)]
+        noise = sum(one * flat.measured.variance[plane] for one, flat in zip(share, flats, strict=True))
+        of_dark = float(counts @ weights / scale) ** 2
+        dark = darks[flats[-1].dark].measured
+        square = (float(pattern.var()) - rows) / SMOOTH - noise - of_dark * dark.fixed[plane]
+        error = math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt((counts - 1).sum()))
+        squares.append((square, math.hypot(error, of_dark * dark.fixed_error[plane])))
+    return squares
 
 
 def _full_well(flats: Sequence[Flat], sensor: Sensor) -> Estimate | None:

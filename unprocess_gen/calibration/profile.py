@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+import yaml
 
 from unprocess_gen.calibration.body import BodyResult
 from unprocess_gen.calibration.captures import CaptureSet, Sensor
 from unprocess_gen.calibration.frame_sums import plane_names
 from unprocess_gen.calibration.gain import Estimate, estimate
-from unprocess_gen.calibration.iso_laws import DIGITS, black_law, branches, gain_law, rounded, shape_law, std_law
+from unprocess_gen.calibration.iso_laws import (
+    DIGITS,
+    black_law,
+    gain_law,
+    joined_branches,
+    modes,
+    rounded,
+    shape_law,
+    std_law,
+)
 from unprocess_gen.calibration.measure import IsoResult
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 
@@ -116,6 +127,8 @@ def estimates_json(named: Sequence[Named], digits: int = DIGITS) -> str:
 
 
 ENDS = ("value", "low", "high")
+ASSUMED_C = 25.0
+"""Temperature of darks that do not state it."""
 
 UNKNOWN = {
     "prnu_std": "more flats of each level show it",
@@ -140,54 +153,52 @@ def unknown_numbers(found: Calibration) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------- YAML
 
 
-def head(start: str, isos: Sequence[float], sha256: str, notes: Sequence[str], name: str, sensor: Sensor) -> list[str]:
-    """Return the comments and the first keys of a profile."""
-    return [
-        f"# {start}, ISO {', '.join(f'{iso:g}' for iso in isos)}.",
+def profile_yaml(start: str, sha256: str, notes: Sequence[str], profile: Mapping[str, Any]) -> str:
+    """Return a profile as YAML, with the source and notes in comments; ``start`` is the source in words."""
+    lines = [
+        f"# {start}.",
         "# SHA-256 of the list of their SHA-256, one a line in ascending order:",
         f"# {sha256}",
-        "# Ranges in comments are 95 % intervals, systematic errors included. The JSON file of this name has all.",
+        "# The JSON file of this name lists all estimates with their 95 % intervals, systematic errors included.",
         *(f"# Note: {note}" for note in notes),
-        f"name: {name}",
-        'scatter: "off"',
-        "units: dn",
-        "black: subtracted",
-        f"bits: {sensor.bits}",
-        f"black_level_dn: {sensor.black_dn:.0f}",
-        f"white_level_dn: {sensor.white_dn:.0f}",
     ]
+    text = yaml.safe_dump(profile, sort_keys=False, allow_unicode=True, width=120, default_flow_style=None)
+    return "\n".join(lines) + "\n" + text
 
 
-def profile_yaml(found: Calibration, name: str, two_parameter: bool) -> str:
-    """Return the noise profile, with uncertainties and the digest of the captures in comments."""
-    sensor, isos = found.sensor, [result.iso for result in found.isos]
-    start = f"Measured {MARK} on {len(found.captures.captures)} raw frames"
-    lines = head(start, isos, found.captures.sha256, found.notes, name, sensor)
+def profile_head(name: str, sensor: Sensor) -> dict[str, Any]:
+    """Return the first keys of a profile."""
+    levels = {"bits": sensor.bits, "black_level_dn": round(sensor.black_dn), "white_level_dn": round(sensor.white_dn)}
+    return {"name": name, "scatter": "off", "units": "dn", "black": "subtracted", **levels}
+
+
+def provenance(numbers: Sequence[str], isos: Sequence[float], source: str, uncertainty: str) -> dict[str, Any]:
+    """Return a statement of sources, which `plan` prints."""
+    return {"numbers": [*numbers], "iso": [isos[0], isos[-1]], "source": source, "uncertainty": uncertainty}
+
+
+def measured_yaml(found: Calibration, name: str, two_parameter: bool) -> str:
+    """Return the noise profile of measured frames."""
+    profile, isos = profile_head(name, found.sensor), [result.iso for result in found.isos]
     if two_parameter and len(isos) == 1:
         result = found.isos[0]
-        b = dark_variance(result)
-        lines += [
-            f"a: {yaml_text(rounded(result.gain.sensor.value))}   # {_range(result.gain.sensor)} DN per electron",
-            f"b: {yaml_text(rounded(b.value))}   # {_range(b)} DN², without rounding",
-            "negative_variance: refuse",
-        ]
-        return "\n".join(lines) + "\n"
-    lines.append("branches:")
-    for branch in iso_branches(found.isos):
-        lines += _branch_lines([found.isos[place] for place in branch], sensor, two_parameter, found.known)
-    if not two_parameter:
-        lines += _body_lines(found)
-    return "\n".join([*lines, *_provenance(found, two_parameter)]) + "\n"
+        numbers = {"a": result.gain.sensor, "b": dark_variance(result)}
+        profile |= {key: rounded(number.value) for key, number in numbers.items()} | {"negative_variance": "refuse"}
+    else:
+        branches = [[found.isos[place] for place in places] for places in iso_branches(found.isos)]
+        profile["branches"] = [_branch(results, found.sensor, two_parameter) for results in branches]
+        if not two_parameter:
+            profile |= _of_all_isos(found)
+        written = {*profile, *(key for branch in profile["branches"] for key in branch)}
+        profile["provenance"] = _provenance(found, written)
+    start = f"Measured {MARK} on {len(found.captures.captures)} raw frames, ISO {', '.join(f'{iso:g}' for iso in isos)}"
+    return profile_yaml(start, found.captures.sha256, found.notes, profile)
 
 
-def iso_branches(isos: Sequence[IsoResult]) -> list[list[int]]:
-    """Return the places of the ISOs of each branch: those of a gain mode whose gains follow one law."""
-    result = []
-    for mode in branches([one.iso for one in isos], [one.read for one in isos]):
-        chosen = [isos[place] for place in mode]
-        law = gain_law([one.iso for one in chosen], [one.gain.sensor for one in chosen])
-        result += [mode] if law is not None else [[place] for place in mode]
-    return result
+def iso_branches(results: Sequence[IsoResult]) -> list[list[int]]:
+    """Return the places of the ISOs of each branch."""
+    isos = [one.iso for one in results]
+    return joined_branches(isos, [one.gain.sensor for one in results], modes(isos, [one.read for one in results]))
 
 
 def dark_variance(result: IsoResult) -> Estimate:
@@ -198,79 +209,52 @@ def dark_variance(result: IsoResult) -> Estimate:
     return estimate(value, error, 0.0)
 
 
-def _branch_lines(
-    results: Sequence[IsoResult], sensor: Sensor, two_parameter: bool, known: KnownGain | None
-) -> list[str]:
-    """Return the lines of a branch."""
-    isos = [result.iso for result in results]
-    gains, reads = [one.gain.sensor for one in results], [one.read for one in results]
-    gain_by_iso = gain_law(isos, gains)
-    origin = known.source if known else _ranges(isos, gains)
-    lines = [f"  - iso: [{isos[0]:g}, {isos[-1]:g}]", f"    dn_per_e: {yaml_text(gain_by_iso)}   # {origin}"]
+def _branch(results: Sequence[IsoResult], sensor: Sensor, two_parameter: bool) -> dict[str, Any]:
+    """Return a branch; the keys of two numbers are gain, and noise without light."""
+    isos, reads = [result.iso for result in results], [one.read for one in results]
+    gains = [one.gain.sensor for one in results]
+    branch = {"iso": [isos[0], isos[-1]], "dn_per_e": gain_law(isos, gains), "read_law": "gaussian"}
     if two_parameter:
         variances = [dark_variance(result) for result in results]
         reads = [estimate(math.sqrt(b.value), b.error / 2 / math.sqrt(b.value)) for b in variances]
-        law = std_law(isos, reads)
-        return [*lines, "    read_law: gaussian", f"    read_std_dn: {yaml_text(law)}   # {_ranges(isos, reads)}"]
+        return branch | {"read_std_dn": std_law(isos, reads)}
     if any(result.shape.is_tukey for result in results):
         shapes = [result.shape.shape if result.shape.is_tukey else NORMAL_SHAPE for result in results]
-        errors = [result.shape.interval for result in results]
-        lines += ["    read_law: tukey_lambda"]
-        lines += [f"    read_shape: {yaml_text(shape_law(isos, shapes))}   # {_ranges(isos, errors)}"]
-    else:
-        lines += ["    read_law: gaussian"]
-    lines.append(f"    read_std_dn: {yaml_text(std_law(isos, reads))}   # {_ranges(isos, reads)}")
-    for name, values in (
-        ("row_std_dn", [one.row for one in results]),
-        ("column_std_dn", [one.column for one in results]),
-        ("column_temporal_std_dn", [one.column_temporal for one in results]),
-    ):
-        law = std_law(isos, values)
-        if name == "column_temporal_std_dn":  # the key takes no table
-            law = (
-                law if not isinstance(law, list) or law[0] == "root" else rounded(max(value.value for value in values))
-            )
-            if not any(value.value for value in values):
-                continue
-        lines.append(f"    {name}: {yaml_text(law)}   # {_ranges(isos, values)}")
+        branch |= {"read_law": "tukey_lambda", "read_shape": shape_law(isos, shapes)}
+    branch["read_std_dn"] = std_law(isos, reads)
+    branch |= {name: std_law(isos, [getattr(one, name.removesuffix("_std_dn")) for one in results]) for name in LINES}
+    if (temporal := max(result.column_temporal.value for result in results)) > 0:  # the key takes no table
+        branch["column_temporal_std_dn"] = rounded(temporal)
     blacks = [_by_colour([one.value for one in result.black], sensor) for result in results]
-    lines.append(f"    black_error_dn: {yaml_text(black_law(isos, blacks, bool(site_names(sensor))))}")
-    return lines
+    return branch | {"black_error_dn": black_law(isos, blacks, bool(site_names(sensor)))}
+
+
+LINES = ("row_std_dn", "column_std_dn")
 
 
 def _by_colour(values: Sequence[float], sensor: Sensor) -> list[float]:
     """Return the values of planes as R, G1, B, G2; their mean for a monochrome sensor."""
     names = site_names(sensor)
-    if not names:
-        return [sum(values) / len(values)]
-    return [values[names.index(name)] for name in ("R", "Gr", "B", "Gb")]
+    return [values[names.index(name)] for name in ("R", "Gr", "B", "Gb")] if names else [sum(values) / len(values)]
 
 
-def _body_lines(found: Calibration) -> list[str]:
-    """Return the lines of the numbers that do not depend on ISO."""
+WITH_DEFAULTS = ("dark_doubling_c", "dead_pixel_level", "dsnu_std_e", "hot_pixel_e_per_s")
+"""Keys that are left out if the captures do not show them: null is no value of theirs."""
+
+
+def _of_all_isos(found: Calibration) -> dict[str, Any]:
+    """Return the keys that do not depend on ISO; null for numbers that the captures do not show."""
     known = {one.name: one.number for one in _of_body(found) if one.site is None}
-    lines = []
-    gains = _gains_by_colour(found)
-    if gains is not None:
-        lines.append(f"gain_by_colour: {yaml_text(gains)}   # red, green, blue, relative to dn_per_e")
+    keys: dict[str, Any] = {} if (gains := _gains_by_colour(found)) is None else {"gain_by_colour": gains}
     row = max((result.row_correlation for result in found.isos), key=lambda one: abs(one.value) / max(one.error, 1e-9))
     if abs(row.value) > 4 * row.error and abs(row.value) > 0.02:
-        lines.append(f"row_correlation: {yaml_text(rounded(max(min(row.value, 0.95), -0.95)))}   # {_range(row)}")
+        keys["row_correlation"] = rounded(max(min(row.value, 0.95), -0.95))
     for name, number in known.items():
-        if name in ("dark_doubling_c", "dead_pixel_level", "dsnu_std_e", "hot_pixel_e_per_s") and number is None:
-            continue
-        comment = "not known" if number is None else _range(number)
-        lines.append(f"{name}: {'null' if number is None else yaml_text(rounded(number.value))}   # {comment}")
+        if number is not None or name not in WITH_DEFAULTS:
+            keys[name] = None if number is None else rounded(number.value)
     if known["dark_e_per_s"] is not None:
-        celsius = found.body.dark_reference_c
-        comment = "of the captures" if celsius else "assumed: the captures do not state their temperature"
-        lines.append(f"dark_reference_c: {celsius or 25.0:g}   # {comment}")
-        lines.append(
-            "# the camera subtracts the mean dark signal (sensor.dark_offset=removed)"
-            if found.body.is_mean_removed
-            else "# the camera keeps the mean dark signal: set sensor.dark_offset=kept"
-        )
-    return lines
+        keys["dark_reference_c"] = found.body.dark_reference_c or ASSUMED_C
+    return keys
 
 
 def _gains_by_colour(found: Calibration) -> list[float] | None:
@@ -280,55 +264,26 @@ def _gains_by_colour(found: Calibration) -> list[float] | None:
     if not names or 2 * len(differing) <= len(found.isos):
         return None
     relative = [[plane.value / gain.sensor.value for plane in gain.planes] for gain in differing]
-    means = [sum(values) / len(values) for values in zip(*relative, strict=True)]
-    by_name = dict(zip(names, means, strict=True))
+    by_name = dict(zip(names, (sum(values) / len(values) for values in zip(*relative, strict=True)), strict=True))
     return [rounded(by_name["R"]), rounded((by_name["Gr"] + by_name["Gb"]) / 2), rounded(by_name["B"])]
 
 
-def _provenance(found: Calibration, two_parameter: bool) -> list[str]:
-    """Return the statements of sources, which `plan` prints: the form of the calibration, and its uncertainty."""
-    isos, known = [result.iso for result in found.isos], found.known
-    numbers = ["read_std_dn"] + ([] if two_parameter else ["row_std_dn", "column_std_dn", "black_error_dn"])
-    gain = max((one.gain.sensor.high - one.gain.sensor.low) / 2 / one.gain.sensor.value for one in found.isos)
-    read = max((one.read.high - one.read.low) / 2 / max(one.read.value, 1e-9) for one in found.isos)
+ABSOLUTE = ("black_error_dn", "read_shape", "row_correlation")
+"""Numbers whose errors are not stated relative to them, because they may be near 0."""
+
+
+def _provenance(found: Calibration, written: Iterable[str]) -> list[dict[str, Any]]:
+    """Return the sources of the numbers of a profile: the form of the calibration, and the largest error of each."""
+    isos, known, widths = [result.iso for result in found.isos], found.known, dict[str, tuple[float, str]]()
+    for one in estimates(found):
+        if one.site is None and one.number is not None and one.number.value and one.name in written:
+            half = (one.number.high - one.number.low) / 2
+            width, unit = (half, one.unit) if one.name in ABSOLUTE else (100 * half / abs(one.number.value), "%")
+            widths[one.name] = max(widths.get(one.name, (0.0, unit)), (width, unit))
     form = "calibrate --from darks, own darks" if known else "calibrate, own flats and darks"
-    frames = f"{form}, {len(found.captures.captures)} frames, SHA-256 {found.captures.sha256[:16]}"
-    measured = f"read noise {read:.2%} (95 %, systematic errors included)"
-    statements = [(numbers, frames, measured)]
     if known:
-        statements.insert(0, (["dn_per_e"], known.source, known.uncertainty))
-    else:
-        statements = [(["dn_per_e", *numbers], frames, f"gain {gain:.2%}, {measured}")]
-    return ["provenance:", *(line for one in statements for line in provenance_lines(*one, isos))]
-
-
-def provenance_lines(numbers: Sequence[str], source: str, uncertainty: str, isos: Sequence[float]) -> list[str]:
-    """Return the lines of a statement of the source of numbers."""
-    return [
-        f"  - numbers: [{', '.join(numbers)}]",
-        f"    iso: [{isos[0]:g}, {isos[-1]:g}]",
-        f"    source: {json.dumps(source, ensure_ascii=False)}",
-        f"    uncertainty: {json.dumps(uncertainty, ensure_ascii=False)}",
-    ]
-
-
-def _ranges(isos: Sequence[float], numbers: Sequence[Estimate]) -> str:
-    """Return the intervals at each ISO as text."""
-    if len(isos) == 1:
-        return _range(numbers[0])
-    return "; ".join(f"ISO {iso:g}: {_range(number)}" for iso, number in zip(isos, numbers, strict=True))
-
-
-def _range(number: Estimate) -> str:
-    return f"{number.low:.4g} to {number.high:.4g}"
-
-
-def yaml_text(value: Any) -> str:
-    """Return a number or a list as YAML."""
-    if isinstance(value, list):
-        return f"[{', '.join(map(yaml_text, value))}]"
-    if isinstance(value, float):
-        text = repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
-        mantissa, e, exponent = text.partition("e")  # YAML reads a number with an exponent only if it has a point
-        return f"{mantissa if '.' in mantissa or not e else mantissa + '.0'}{e}{exponent}"
-    return str(value)
+        del widths["dn_per_e"]
+    source = f"{form}, {len(found.captures.captures)} frames, SHA-256 {found.captures.sha256[:16]}"
+    errors = ", ".join(f"{name} ±{width:.2g} {unit}".strip() for name, (width, unit) in widths.items())
+    measured = provenance([*widths], isos, source, f"{errors} (95 %, systematic errors included)")
+    return [provenance(["dn_per_e"], isos, known.source, known.uncertainty), measured] if known else [measured]

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 from unprocess_gen.calibration.captures import Sensor
 from unprocess_gen.calibration.gain import Estimate
-from unprocess_gen.calibration.iso_laws import Precision, gain_law, rounded, std_law
-from unprocess_gen.calibration.profile import MARK, Named, head, provenance_lines, yaml_text
+from unprocess_gen.calibration.iso_laws import Precision, gain_law, joined_branches, rounded, std_law
+from unprocess_gen.calibration.profile import MARK, Named, profile_head, profile_yaml, provenance
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.raw_files import RAW_FILES
@@ -153,29 +153,14 @@ def _check_law(isos: Sequence[StatedIso]) -> None:
                 raise ConfigError(f"{where}: again less variance without light {expected}")
 
 
-def _modes(isos: Sequence[StatedIso]) -> Iterator[list[StatedIso]]:
-    """Yield the ISOs of each gain mode; the variance without light falls where a mode begins."""
-    mode = [isos[0]]
-    for one in isos[1:]:
-        if one.b[1] < mode[-1].b[1] * (1 - SAME) or (one.b[1] > 0) != (mode[-1].b[1] > 0):
-            yield mode
-            mode = []
-        mode.append(one)
-    yield mode
-
-
-def _branches(isos: Sequence[StatedIso]) -> Iterator[list[StatedIso]]:
-    """Yield the ISOs of each branch: a mode on one line, or else pairs of neighbours, which share their ends."""
-    for mode in _modes(isos):
-        if _gain_law(mode) is not None:
-            yield mode
-            continue
-        pairs = [[*pair] for pair in pairwise(mode) if _gain_law([*pair]) is not None]
-        yield from sorted([*pairs, *([one] for one in mode if not any(one in pair for pair in pairs))])
-
-
-def _gain_law(isos: Sequence[StatedIso]) -> object:
-    return gain_law([one.iso for one in isos], [_exact(one.a[1]) for one in isos], STATED)
+def _modes(isos: Sequence[StatedIso]) -> list[list[int]]:
+    """Return the places of the ISOs of each gain mode; the variance without light falls where a mode begins."""
+    modes = [[0]]
+    for place, (before, one) in enumerate(pairwise(isos), start=1):
+        if one.b[1] < before.b[1] * (1 - SAME) or (one.b[1] > 0) != (before.b[1] > 0):
+            modes.append([])
+        modes[-1].append(place)
+    return modes
 
 
 def _exact(value: float) -> Estimate:
@@ -204,30 +189,24 @@ def stated_estimates(stated: StatedNoise) -> list[Named]:
     return named
 
 
-def stated_profile(stated: StatedNoise, name: str) -> str:
-    """Return the noise profile as YAML."""
-    isos = [one.iso for one in stated.isos]
-    lines = head(
-        f"Read {MARK} from the NoiseProfile tags of {stated.camera}, {stated.files} files",
-        isos, stated.sha256, stated.notes, name, stated.sensor,
-    )  # fmt: skip
-    lines.append("branches:")
-    for branch in _branches(stated.isos):
-        own = [one.iso for one in branch]
-        reads = [_exact(math.sqrt(one.b[1])) for one in branch]
-        lines += [
-            f"  - iso: [{own[0]:g}, {own[-1]:g}]",
-            f"    dn_per_e: {yaml_text(_gain_law(branch))}",
-            "    read_law: gaussian",
-            f"    read_std_dn: {yaml_text(std_law(own, reads, STATED))}",
-        ]
+def stated_yaml(stated: StatedNoise, name: str) -> str:
+    """Return the noise profile of NoiseProfile tags."""
+    isos, profile = [one.iso for one in stated.isos], profile_head(name, stated.sensor)
+    gains = [_exact(one.a[1]) for one in stated.isos]
+    profile["branches"] = []
+    for places in joined_branches(isos, gains, _modes(stated.isos), STATED):
+        own = [isos[place] for place in places]
+        gain = gain_law(own, [gains[place] for place in places], STATED)
+        read = std_law(own, [_exact(math.sqrt(stated.isos[place].b[1])) for place in places], STATED)
+        branch = {"iso": [own[0], own[-1]], "dn_per_e": gain, "read_law": "gaussian", "read_std_dn": read}
+        profile["branches"].append(branch)
     spreads = _spreads(stated.isos)
     if spreads["a"] > SAME:
         middle = stated.isos[len(isos) // 2]
-        relative = [rounded(value / middle.a[1], STATED.digits) for value in middle.a]
-        lines.append(f"gain_by_colour: {yaml_text(relative)}   # red, green, blue, at ISO {middle.iso:g}")
+        profile["gain_by_colour"] = [rounded(value / middle.a[1], STATED.digits) for value in middle.a]
     differ = ", ".join(f"{number} by {spread:.1%}" for number, spread in spreads.items())
     source = f"{FORM}, tags of {stated.camera}, {stated.files} files, SHA-256 {stated.sha256[:16]}"
     uncertainty = f"the tags state none; planes differ from green, {differ}"
-    lines += ["provenance:", *provenance_lines(["dn_per_e", "read_std_dn"], source, uncertainty, isos)]
-    return "\n".join(lines) + "\n"
+    profile["provenance"] = [provenance(["dn_per_e", "read_std_dn"], isos, source, uncertainty)]
+    start = f"Read {MARK} from the NoiseProfile tags of {stated.camera}, {stated.files} files"
+    return profile_yaml(f"{start}, ISO {', '.join(f'{iso:g}' for iso in isos)}", stated.sha256, stated.notes, profile)
