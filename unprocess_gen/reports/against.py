@@ -12,7 +12,7 @@ import io
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from unprocess_gen.calibration.calibrate import measure_all
 from unprocess_gen.calibration.captures import Sensor, read_captures
@@ -32,27 +32,11 @@ from unprocess_gen.planning.plan import TwoNumberLevel
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.noise_check.checks import FALSE_ALARM
 from unprocess_gen.reports.noise_check.scores import Score
-from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.effects import Physics, profile_keys
 
-EFFECTS = {
-    "dn_per_e": "shot",
-    "read_std_dn": "read",
-    "read_shape": "read",
-    "row_std_dn": "row",
-    "row_correlation": "row",
-    "column_std_dn": "column",
-    "column_temporal_std_dn": "column_temporal",
-    "black_error_dn": "black_error",
-    "prnu_std": "prnu",
-    "dsnu_std_e": "dsnu",
-    "dark_e_per_s": "dark_current",
-    "hot_pixel_share": "hot_pixels",
-    "dead_pixel_share": "dead_pixels",
-    "full_well_e": "full_well",
-    "b_dn2": "heteroscedastic",
-}
+EFFECTS = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
 """Effect of each number that is compared, by its name in the list of estimates."""
-AT_TEMPERATURE = ("dark_e_per_s", "hot_pixel_share")
+AT_TEMPERATURE = ("dark_e_per_s", "hot_pixel_share", "hot_pixel_e_per_s")
 """Numbers that can be compared only if the frames state their temperature."""
 FIELDS = (
     *("number", "iso", "site", "unit", "measured", "low", "high"),
@@ -221,7 +205,7 @@ class Profile:
             return [sum(physics.black_error_dn) / 4, *physics.black_error_dn]
         if name == "read_shape" and physics.read_law == "gaussian":
             return [NORMAL_SHAPE] * 5
-        value = getattr(physics, {"dark_e_per_s": "dark_e"}.get(name, name))
+        value: Any = getattr(physics, name.removesuffix("_per_s"), getattr(self.config.noise, name, None))
         if name == "dn_per_e":
             sites = [physics.gain_by_colour["RGB".index(colour)] for colour in self.config.sensor.pattern]
             return [value, *(value * factor for factor in sites)]
