@@ -90,10 +90,6 @@ FAULTS: dict[str, tuple[Change, str]] = {
         lambda shot, pixels: replace(shot, number=0).pixels() if shot.kind == "flat" else pixels,
         "has the bytes",
     ),
-    "8 bits": (
-        lambda shot, pixels: np.clip(np.rint(pixels / 16), 0, 255),
-        "at 8 bits; expected 1 DN or more",
-    ),
     "too few bits": (
         lambda shot, pixels: BLACK + np.rint((pixels - BLACK) / 16 + 0.3),
         "rounding hides it",
@@ -112,6 +108,13 @@ def refused(run_main: RunMain, folder: Path, reason: str, *flags: str) -> None:
     assert (done.code, len(done.err.splitlines())) == (2, 1), done.err
     assert reason in done.err
     assert not list(folder.parent.glob("mine.*"))
+
+
+def test_8_bits_are_refused(run_main: RunMain, tmp_path: Path) -> None:
+    folder = write(tmp_path / "captures", shots(), lambda shot, pixels: np.rint(pixels / 16))
+    text = (folder / "captures.csv").read_text()
+    (folder / "captures.csv").write_text(text.replace(f",{BLACK},4095,12,", ",16,255,8,"))
+    refused(run_main, folder, "at 8 bits; expected 1 DN or more")
 
 
 FEW = {
@@ -150,6 +153,7 @@ LINES = {
     "iso": ("00.npy,dark,fast,,", "iso=fast"),
     "missing file": ("99.npy,dark,100,,", "no such frame"),
     "no ISO": ("00.npy,dark,,,", "iso is empty"),
+    "column twice": ("", "occurs twice"),
 }
 
 
@@ -157,7 +161,7 @@ LINES = {
 def test_wrong_line_of_list_is_refused(line: str, run_main: RunMain, tmp_path: Path) -> None:
     folder = write(tmp_path / "captures", shots())
     text, reason = LINES[line]
-    (folder / "captures.csv").write_text(f"file,kind,iso,exposure_s,level\n{text}\n")
+    (folder / "captures.csv").write_text(f"file,kind,iso,exposure_s,level{',iso' * (not text)}\n{text}\n")
     refused(run_main, folder, reason)
 
 

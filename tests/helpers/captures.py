@@ -56,10 +56,7 @@ def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequ
     The dark current doubles every 6 degrees from 20 on; its mean is removed, as cameras do.
     """
     folder.mkdir(parents=True)
-    rng, lines = (
-        np.random.default_rng(seed),
-        ["file,kind,iso,exposure_s,level,temperature_c,black_level_dn,white_level_dn,bits"],
-    )
+    rng, lines = np.random.default_rng(seed), [COLUMNS]
     pattern = 1 + rng.normal(0, numbers.prnu_std, (side, side))
     gains = np.tile([numbers.gains[:2], numbers.gains[1:]], (side // 2, side // 2)) * numbers.dn_per_e
     for place, shot in enumerate(shots):

@@ -82,7 +82,11 @@ def without_dark_current(result: IsoResult, body: BodyResult) -> IsoResult:
     """Return a result whose read noise does not contain the dark current of its darks: K²·D·t less variance."""
     if body.dark_e_per_s is None:
         return result
-    added = body.dark_e_per_s.scaled(result.gain.sensor.value**2 * result.dark.exposure_s)
+    celsius, doubling = result.dark.frames[0].temperature_c, body.dark_doubling_c
+    warmth = 1.0
+    if celsius is not None and body.dark_reference_c is not None and doubling is not None:
+        warmth = 2 ** ((celsius - body.dark_reference_c) / doubling.value)
+    added = body.dark_e_per_s.scaled(result.gain.sensor.value**2 * result.dark.exposure_s * warmth)
 
     def corrected(read: Estimate) -> Estimate:
         return root_estimate(read.value**2 - added.value, math.hypot(2 * read.value * read.error, added.error))
@@ -188,9 +192,7 @@ def share_estimate(count: int, sites: int) -> Estimate:
 
 def _dead(results: Sequence[IsoResult], black_dn: float) -> tuple[Estimate | None, Estimate | None]:
     """Return share of dead pixels and their value relative to black, from the brightest flats."""
-    bright = [
-        flat for result in results for flat in result.flats[-1:] if flat.signal_dn > 0 and flat in usable(result.flats)
-    ]
+    bright = [flat for result in results for flat in usable(result.flats) if flat.is_bright]
     if not bright:
         return None, None
     flat = max(bright, key=lambda one: one.signal_dn / math.sqrt(float(one.measured.variance.mean())))

@@ -160,9 +160,12 @@ def _from_list(folder: Path) -> Iterator[Capture]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             missing = [name for name in REQUIRED if name not in (reader.fieldnames or ())]
-            unknown = [name for name in reader.fieldnames or () if name not in (*REQUIRED, *OPTIONAL)]
+            names = list(reader.fieldnames or ())
+            unknown = [name for name in names if name not in (*REQUIRED, *OPTIONAL) or names.count(name) > 1]
             if missing or unknown:
-                problem = f"the column {missing[0]} is missing" if missing else f"{unknown[0]!r} is no column"
+                problem = (
+                    f"the column {missing[0]} is missing" if missing else f"{unknown[0]!r} is unknown or occurs twice"
+                )
                 raise ConfigError(f"{path}: {problem}; expected {','.join(REQUIRED)} and any of {','.join(OPTIONAL)}")
             rows = [(number, row) for number, row in enumerate(reader, start=2) if any(row.values())]
     except UnicodeDecodeError as error:

@@ -97,10 +97,12 @@ def _check(frames: Sequence[Capture], values: dict[str, float], notes: list[str]
 
 def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes: list[str]) -> None:
     """Refuse darks that are clipped, contain light or differ; warn of doubtful ones."""
+    variances = dark.frame_variances
+    noise = 7 * math.sqrt(6 / dark.sites)  # of the ratio of two of them
     values = {
         "light in darks": abs(float(dark.mean_dn.mean()) - sensor.black_dn) / sensor.span_dn,
         "clipped black": clipped_share(dark),
-        "frames differ": float(dark.frame_variances.max() / max(dark.frame_variances.min(), 1e-9)),
+        "frames differ": float(variances.max() / max(variances.min(), 1e-9)) - noise,
     }
     _check(frames, values | _of_pixels(dark), notes)
 

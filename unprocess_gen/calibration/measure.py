@@ -67,12 +67,13 @@ class Dark:
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """Flats of one level: frames, noise, the darks of the nearest exposure, and values of dead pixels in DN."""
+    """Flats of one level: frames, noise, darks of the nearest exposure, and values of dead pixels (DN) if it is bright."""
 
     frames: list[Capture]
     measured: Measured
     dark: int
     dead_dn: Float
+    is_bright: bool
     signal_dn: float
 
 
@@ -227,11 +228,11 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
             )
         else:
             checks.check_flat(frames, sensor, measured, dark, notes)
-        dead = np.zeros(0)
-        if DEAD_SIGNAL * sensor.span_dn < signal:
+        dead, is_bright = np.zeros(0), DEAD_SIGNAL * sensor.span_dn < signal
+        if is_bright:
             above = sums.mean_frame() - dark.mean_dn.mean()
             dead = above[above < DEAD_RESPONSE * signal] + dark.mean_dn.mean()
-        flats.append(Flat(frames, measured, nearest, dead, signal))
+        flats.append(Flat(frames, measured, nearest, dead, is_bright, signal))
     return sorted(flats, key=lambda flat: flat.signal_dn)
 
 
