@@ -67,7 +67,7 @@ class Dark:
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """Flats of one level: frames, noise, darks of the nearest exposure, and values of dead pixels (DN) if it is bright."""
+    """Flats of one level: frames, noise, darks of the nearest exposure, and if it is bright, values of dead pixels (DN)."""
 
     frames: list[Capture]
     measured: Measured
@@ -119,9 +119,6 @@ def measure_iso(
     sensor, notes = captures.sensor, list[str]()
     darks = measure_darks(captures, iso, notes, watch)
     reference = max(range(len(darks)), key=lambda number: (darks[number].measured.count, -number))
-    moment = float(darks[reference].measured.variance.mean()) - ROUNDING_DN2
-    if moment < LEAST_FITTED_DN2:
-        checks.check_dark_noise(darks[reference].frames, sensor, math.sqrt(max(moment, 0.0)))
     flats = list[Flat]()
     if known is None:
         flats = _flats(captures, iso, darks, watch, notes)
@@ -152,6 +149,9 @@ def measure_darks(captures: CaptureSet, iso: float, notes: list[str], watch: Wat
     darks = list[Dark]()
     for frames in _groups(captures, "dark", iso, notes):
         dark = _dark(frames, captures.sensor, watch)
+        moment = max(float(dark.measured.variance.mean()) - ROUNDING_DN2, 0.0)
+        if captures.sensor.bits <= 8 or moment < LEAST_FITTED_DN2:
+            checks.check_dark_noise(frames, captures.sensor, math.sqrt(moment))
         if darks and checks.is_clipped(dark.measured):
             notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
             continue
