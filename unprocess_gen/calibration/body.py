@@ -56,11 +56,7 @@ def measure_body(results: Sequence[IsoResult], black_dn: float) -> BodyResult:
         current = None
     hot_share, hot_e_per_s = _hot(results)
     dead_share, dead_level = _dead(results, black_dn)
-    wells = [
-        Estimate(*(end / result.gain.sensor.value for end in (well.value, well.low, well.high)))
-        for result in results
-        if (well := result.full_well_dn) is not None
-    ]
+    wells = [_in_electrons(result.full_well_dn, result.gain.sensor) for result in results if result.full_well_dn]
     dsnu = [result.dsnu_dn.scaled(1 / result.gain.sensor.value) for result in results if result.dsnu_dn.value]
     return BodyResult(
         prnu=_positive(_prnu(results, range(4))) if has_flats else None,
@@ -92,6 +88,13 @@ def without_dark_current(result: IsoResult, body: BodyResult) -> IsoResult:
         return root_estimate(read.value**2 - added.value, math.hypot(2 * read.value * read.error, added.error))
 
     return replace(result, read=corrected(result.read), reads=[corrected(read) for read in result.reads])
+
+
+def _in_electrons(number: Estimate, gain: Estimate) -> Estimate:
+    """Return a number in DN in electrons; its interval contains the error of the gain."""
+    value, of_gain = number.value / gain.value, (gain.high - gain.low) / 2 / gain.value
+    below, above = (math.hypot(end / number.value - 1, of_gain) * value for end in (number.low, number.high))
+    return Estimate(value, value - below, value + above)
 
 
 def _positive(number: Estimate) -> Estimate | None:

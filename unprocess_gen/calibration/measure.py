@@ -67,7 +67,7 @@ class Dark:
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """Flats of one level: frames, noise, darks of the nearest exposure, and if it is bright, values of dead pixels (DN)."""
+    """Flats of one level: frames, noise, number of the darks of the nearest exposure, and values of dead pixels, DN."""
 
     frames: list[Capture]
     measured: Measured
