@@ -170,7 +170,7 @@ class Profile:
             bits=sensor.bits,
             black_level_dn=round(sensor.black_dn),
             white_level_dn=round(sensor.white_dn),
-            pattern=config.sensor.pattern if sensor.pattern == "MONO" else sensor.pattern,
+            pattern=sensor.pattern,
         )
         noise = config.noise
         if is_physical(noise):
@@ -207,8 +207,8 @@ class Profile:
             return [NORMAL_SHAPE] * 5
         value: Any = getattr(physics, name.removesuffix("_per_s"), getattr(self.config.noise, name, None))
         if name == "dn_per_e":
-            sites = [physics.gain_by_colour["RGB".index(colour)] for colour in self.config.sensor.pattern]
-            return [value, *(value * factor for factor in sites)]
+            colours = "GGGG" if self.config.sensor.pattern == "MONO" else self.config.sensor.pattern
+            return [value, *(value * physics.gain_by_colour["RGB".index(colour)] for colour in colours)]
         return [value] * 5
 
 
