@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import dataclasses
 from pathlib import Path
 
 import pytest
@@ -43,37 +41,6 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
     return ug.load_config(SETTINGS, folder)
 
 
-@pytest.fixture(scope="module")
-def out(config: Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a dataset of one pair with the profile."""
-    folder = tmp_path_factory.mktemp("against") / "ds"
-    source = dataclasses.replace(config.source, limit=1)
-    ug.generate(dataclasses.replace(config, out=str(folder), n_jobs=1, source=source))
-    return folder
-
-
-def test_differences_are_named_in_sentences_and_a_list(out: Path, run_main: RunMain, tmp_path: Path) -> None:
-    listed = tmp_path / "list.csv"
-    done = run_main("verify", out, "--against", draw(tmp_path / "same", Numbers(), 0))
-    assert (done.code, "0 wrong" in done.out) == (0, True), done.err
-    other = draw(tmp_path / "other", Numbers(2.2, 5.5, 0.0, 2.5, prnu_std=0.02), 0)
-    done = run_main("verify", out, "--against", other, "--to", listed)
-    assert done.code == 4
-    rows = {(row["number"], row["iso"], row["site"]): row for row in csv.DictReader(listed.read_text().splitlines())}
-    assert rows["read_std_dn", "800", ""]["verdict"] == "differs"
-    assert float(rows["read_std_dn", "800", ""]["difference_percent"]) == pytest.approx(10, abs=1.5)
-    assert rows["row_std_dn", "800", ""]["verdict"] == "missing in the frames"
-    assert rows["column_std_dn", "800", ""]["verdict"] == "agrees"
-    for text in (
-        "ISO 800: dn_per_e of the frames is",
-        "the profile lacks it: effect prnu",
-        "ISO 800: read_std_dn of the frames is 5.",
-        "ISO 800: black_error_dn of the frames is 2.",
-        "the camera does not show it",
-    ):
-        assert text in done.err
-
-
 def test_two_numbers_are_compared(tmp_path: Path) -> None:
     """The two numbers agree; what they do not describe is missing in the profile."""
     plain = ["noise=heteroscedastic", "noise.a=2", "noise.b=26.44", "sensor=generic_14bit"]
@@ -98,8 +65,8 @@ def test_gain_of_darks_alone_is_not_compared(config: Config, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "flags", ["--to list.csv", "--against frames --noise", "--against no_folder", "--against frames --to ds/list.csv"]
 )
-def test_wrong_use_is_refused(flags: str, run_main: RunMain, out: Path) -> None:
-    done = run_main("verify", out, *flags.replace("ds/", f"{out}/").split())
+def test_wrong_use_is_refused(flags: str, run_main: RunMain, dataset: Path) -> None:
+    done = run_main("verify", dataset, *flags.replace("ds/", f"{dataset}/").split())
     assert (done.code, len(done.err.splitlines())) == (2, 1), done.err
 
 

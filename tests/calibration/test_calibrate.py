@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -60,27 +61,32 @@ def test_simulated_camera_is_measured(calibrated: Any, tmp_path: Path) -> None:
 
 
 def test_profile_is_used_as_it_was_written(calibrated: Any, run_main: RunMain, tmp_path: Path) -> None:
-    """Its darks are kept for ``noise.dark_frames``, and the noise of data made with both passes the check."""
-    folder, page, kept = (
-        with_levels(draw(tmp_path / "captures", Numbers(), 0)),
-        tmp_path / "page.html",
-        tmp_path / "kept",
-    )
+    """Noise of data made with it and with the darks that are kept passes the check; so do the captures."""
+    folder, page, kept, listed = (tmp_path / name for name in ("captures", "page.html", "kept", "list.csv"))
+    with_levels(draw(folder, Numbers(), 0))
     profile = calibrated(folder, "--keep-darks", str(kept), "--report", str(page))
     assert "Next to known sensors" in page.read_text(encoding="utf-8")
-    settings = [
-        "--config-dir",
-        profile.parents[1],
-        "noise=mine",
-        "scene.iso=800",
-        "sensor=generic_14bit",
-        "source.limit=1",
-    ]
+    scene = ["scene.iso=800", "sensor=generic_14bit", "source.limit=1"]
+    settings = ["--config-dir", profile.parents[1], "noise=mine", *scene]
     for number, more in enumerate(([], [f"noise.dark_frames={kept / 'iso800'}"])):
         out = tmp_path / f"ds{number}"
         assert run_main(*settings, *more, f"out={out}", "n_jobs=1").code == 0
         assert run_main("verify", out, "--noise").code == 0
     assert run_main("plan", *settings[:3], "scene.iso=1600").code == 2  # one ISO is not extrapolated
+    done = run_main("verify", out, "--against", folder)
+    assert (done.code, "0 wrong" in done.out) == (0, True), done.err
+    other = with_levels(draw(tmp_path / "other", Numbers(2.2, 5.5, 0.0, 2.5, prnu_std=0.02), 0))
+    done = run_main("verify", out, "--against", other, "--to", listed)
+    rows = {(row["number"], row["site"]): row for row in csv.DictReader(listed.read_text().splitlines())}
+    assert (done.code, rows["read_std_dn", ""]["verdict"], rows["column_std_dn", ""]["verdict"]) == (
+        4,
+        "differs",
+        "agrees",
+    )
+    assert float(rows["read_std_dn", ""]["difference_percent"]) == pytest.approx(10, abs=2)
+    assert rows["row_std_dn", ""]["verdict"] == "missing in the frames"
+    for text in ("dn_per_e of the frames is 2.", "lacks it: effect prnu", "black_error_dn of the frames is 2."):
+        assert text in done.err
 
 
 def test_numbers_of_the_body_are_measured(calibrated: Any, tmp_path: Path) -> None:

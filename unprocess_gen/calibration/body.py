@@ -121,17 +121,18 @@ def _dark_currents(results: Sequence[IsoResult]) -> dict[float, list[Estimate]]:
     """Return the dark currents of all ISOs by temperature (0 if it is not stated): slope of σ²/K² over the exposure."""
     currents = defaultdict(list)
     for result in results:
-        by_temperature = defaultdict(list)
+        gain, by_temperature = result.gain, defaultdict(list)
+        gains = np.array([plane.value for plane in gain.planes] if gain.has_colours else [gain.sensor.value] * 4)
         for dark in result.darks:
             by_temperature[dark.frames[0].temperature_c or 0.0].append(dark)
         for temperature, darks in by_temperature.items():
             seconds = np.array([dark.exposure_s for dark in darks])
             if seconds.max() < LEAST_EXPOSURE_RATIO * seconds.min() or seconds.max() == 0:
                 continue
-            electrons = np.array([dark.measured.variance.mean() for dark in darks]) / result.gain.sensor.value**2
-            errors = np.array([np.linalg.norm(dark.measured.error) / 4 for dark in darks]) / result.gain.sensor.value**2
+            electrons = np.array([(dark.measured.variance / gains**2).mean() for dark in darks])
+            errors = np.array([np.linalg.norm(dark.measured.error / gains**2) / 4 for dark in darks])
             slope, error = weighted_slope(seconds, electrons, errors)
-            gain_error = 2 * slope * result.gain.sensor.error / result.gain.sensor.value
+            gain_error = 2 * slope * gain.sensor.error / gain.sensor.value
             currents[temperature].append(estimate(slope, math.hypot(error, gain_error)))
     return dict(currents)
 
