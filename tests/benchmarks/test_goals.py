@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from benchmarks import bench_goals as goals
 
 
+@pytest.mark.slow
 def test_every_goal_is_measured() -> None:
     frame = np.ascontiguousarray(goals.synthetic_frame()[::8, ::8])
     bench = goals.Bench(frame, patch_side=16)

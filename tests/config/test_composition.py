@@ -108,6 +108,10 @@ REFUSED = [
     ("noise.branches=[{iso: x}]", r"noise.branches: iso: expected the lowest and the highest ISO, \[100, 6400\]$"),
     ("source.include=*.jpg", r"source.include=\*.jpg: expected a list, such as \[\*.jpg\]"),
     ("camera=sony_a7r,leica", "camera=sony_a7r,leica: several values; expected one$"),
+    (
+        "gains.red.x=1",
+        "gains.red.x=1: gains.red has no key x; expected gains.red=…: a gain above 0, from 0.001 to 1000",
+    ),
     ("seed=-1", r"seed=-1: expected 0 to "),
     ("seed=[1", r"seed=\[1: not a valid override"),
     ("seed", r"seed: expected a setting key=value"),

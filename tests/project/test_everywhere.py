@@ -166,6 +166,7 @@ def test_all_settings_together_change_no_byte(flags: tuple[str, ...], make: Make
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
+@pytest.mark.slow
 def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
     made = make(NUMBA_DISABLE_JIT="1")
 

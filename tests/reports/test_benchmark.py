@@ -364,7 +364,7 @@ def test_documentation_has_the_recommendations() -> None:
     [
         ("noise=sony_a7s2", "scene=night", "effects.prnu=on"),
         pytest.param(("noise=brooks2019", "sensor=generic_10bit", "gains.highlight=gray_mean"), marks=pytest.mark.slow),
-        ("noise.law=poisson", "accuracy.name=mine", "accuracy.normal_error=1e-4"),
+        pytest.param(("noise.law=poisson", "accuracy.name=mine", "accuracy.normal_error=1e-4"), marks=pytest.mark.slow),
         pytest.param(("noise=none", "accuracy=fast", "source.dequantize=dither"), marks=pytest.mark.slow),
         ("noise.levels=[{a: 1, b: 2}, {a: 3, b: 4}]", "effects.heteroscedastic=on"),
     ],

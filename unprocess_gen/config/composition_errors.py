@@ -47,9 +47,12 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
                 return unknown_key(key, overrides)
             return f"{assignment(key, overrides)}: {_wrong_value(link, key, overrides)}"
     text = error_in_one_line(error)
-    ambiguous = next((one for one in overrides if text.startswith(f"Ambiguous value for argument '{one}'")), None)
-    if ambiguous:
-        return several_values(ambiguous)
+    for override in overrides:
+        if text.startswith(f"Ambiguous value for argument '{override}'"):
+            return several_values(override)
+        parent, _, name = override.lstrip("+").partition("=")[0].rpartition(".")
+        if (setting := _setting(parent)) is not None:  # OmegaConf takes the name for the number of an item
+            return f"{override}: {parent} has no key {name}; expected {parent}=…: {setting.allowed}"
     return text
 
 
