@@ -104,7 +104,12 @@ def test_mlcroissant_reads_rows_and_arrays_without_warnings(
 
 @pytest.mark.parametrize(
     "overrides",
-    [("noise.draws=2",), ("mixture=[{weight: 1, noise: none}]",), ("source.max_pixels=1", "source.max_failed=9")],
+    [
+        ("noise.draws=2",),
+        ("output.frames=false",),
+        ("mixture=[{weight: 1, noise: none}]",),
+        ("source.max_pixels=1", "source.max_failed=9"),
+    ],
 )
 def test_every_kind_of_dataset_has_a_valid_card(
     overrides: tuple[str, ...], make: Make, run_main: RunMain, tmp_path: Path

@@ -39,6 +39,11 @@ CITATIONS = (
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Categories of Hugging Face: numbers of pairs below which each applies."""
 
+TEMPLATE = Path(__file__).parent / "templates" / "card.md"
+
+SHARDS = "- `shards/`: uncompressed tar files in WebDataset layout: `KEY.clean.npy`, `KEY.noisy.npy`, `KEY.json`\n"
+"""Line about the files with frames."""
+
 LEFT_TO_AUTHOR = "The author states here the licence of the source photographs, and of this dataset."
 
 
@@ -69,7 +74,7 @@ class _Described:
     def summary(self) -> str:
         """One sentence about the dataset."""
         return (
-            f"{self.facts['pairs']:,} pairs of clean and noisy raw frames, simulated by unprocess_gen "
+            f"{counted(self.facts['pairs'], 'pair')} of a clean and a noisy raw frame, simulated by unprocess_gen "
             f"{self.version} from {self.sources}."
         )
 
@@ -81,8 +86,8 @@ class _Described:
     @property
     def sources(self) -> str:
         """Number and kind of the sources."""
-        kind = "sRGB photographs" if self.facts["source"]["kind"] == "folder" else "built-in scenes"
-        return f"{self.statistics.images:,} {kind}"
+        kind = "sRGB photograph" if self.facts["source"]["kind"] == "folder" else "built-in scene"
+        return counted(self.statistics.images, kind)
 
 
 def write_card(folder: AnyPath, to: Path | None = None, statements: Statements | None = None) -> Path:
@@ -131,13 +136,15 @@ def _readme(described: _Described, given: Statements) -> str:
     contents = {
         "pairs": f"{facts['pairs']:,}, of {described.sources}",
         "failed sources": f"{sum(facts['failed'].values()):,}",
-        "size": f"{byte_size(sum(entry['bytes'] for entry in shards))} in {counted(len(shards), 'shard')}",
+        "size": f"{byte_size(sum(entry['bytes'] for entry in shards))} in {counted(len(shards), 'shard')}"
+        if config.output.frames
+        else "no frames stored; ug.LivePairs makes them from the sources",
         "width × height": values_text(statistics.sizes),
         "pattern": values_text(statistics.texts["pattern"]),
         **{name: values_text(statistics.texts[name]) for name in ("camera", "noise", "scene")},
         "effects": values_text(statistics.effects),
     }
-    return README.format(
+    return TEMPLATE.read_text(encoding="utf-8").format(
         title=html.escape(described.name, quote=False),
         name=json.dumps(described.name, ensure_ascii=False),
         quoted=shlex.quote(described.name),
@@ -146,6 +153,8 @@ def _readme(described: _Described, given: Statements) -> str:
         summary=described.summary,
         contents=_table("property", "value", contents),
         settings=_table("setting", "value", shown_settings(config)),
+        shards=SHARDS if config.output.frames else "",
+        reader="RawPairs" if config.output.frames else "LivePairs",
         fingerprint=facts["fingerprint"],
         licence=licence,
         citations="\n".join(f"- {text}" for text in CITATIONS),
@@ -157,61 +166,6 @@ def _table(first: str, second: str, rows: Mapping[str, str]) -> str:
     return "\n".join([f"| {first} | {second} |", "|---|---|", *cells])
 
 
-README = """\
----
-pretty_name: {name}
-{licence_key}task_categories: [image-to-image]
-tags: [raw, denoising, image-restoration, synthetic]
-size_categories: [{size}]
----
-
-# {title}
-
-{summary}
-
-{contents}
-
-## Files
-
-- `shards/shard-00000.tar`, …: uncompressed tar files in WebDataset layout: `KEY.clean.npy`, `KEY.noisy.npy`, `KEY.json`
-- `manifest.csv`: a row for each pair, with every parameter from which it was drawn
-- `config.yaml`: all settings; `dataset.json`: counts, versions and the SHA-256 of every file
-- `croissant.json`: this description for programs (Croissant 1.1)
-
-## How it was made
-
-Each source is unprocessed to linear raw light (tone curve, gamma, colour matrix and white balance are inverted),
-sampled by the sensor's pattern, and recorded with simulated noise. Clean and noisy frame differ by random draws only.
-These settings and the others in `config.yaml` decide every byte:
-
-{settings}
-
-From the same sources, this command makes the dataset again, bit for bit: `gen-dataset again {quoted} out=again`
-
-## Read it
-
-```python
-import unprocess_gen as ug
-
-for clean, noisy, row in ug.RawPairs({name}):  # uint16 mosaics in DN, and the row of the manifest
-    ...
-```
-
-`gen-dataset verify {quoted}` checks every byte. The fingerprint is `{fingerprint}`.
-
-mlcroissant reads `croissant.json`. It keeps unpacked shards by their names, so set `CROISSANT_CACHE` to another folder
-for each dataset.
-
-## Licence
-
-{licence}
-
-## Citation
-
-{citations}
-"""
-
-
 # ------------------------------------------------------------------------------------------------------ croissant.json
 
 
@@ -220,33 +174,14 @@ def _croissant(described: _Described, given: Statements) -> str:
     import mlcroissant as mlc  # optional library, extra "card"
 
     facts = described.facts
-    manifest = mlc.FileObject(
-        id="manifest.csv",
-        name="manifest.csv",
-        content_url="manifest.csv",
-        encoding_formats=["text/csv"],
-        sha256=facts["manifest_sha256"],
-    )
-    shards = [
-        mlc.FileObject(
-            id=entry["file"],
-            name=entry["file"],
-            content_url=entry["file"],
-            content_size=f"{entry['bytes']} B",
-            encoding_formats=["application/x-tar"],
-            sha256=entry["sha256"],
-        )
-        for entry in facts["shards"]
-        if entry["file"] is not None
+    listed = {"manifest.csv": ("text/csv", facts["manifest_sha256"])}
+    shards = {one["file"]: ("application/x-tar", one["sha256"]) for one in facts["shards"] if one["file"] is not None}
+    files = [
+        mlc.FileObject(id=file, name=file, content_url=file, encoding_formats=[kind], sha256=sha256)
+        for file, (kind, sha256) in (listed | shards).items()
     ]
-    arrays = mlc.FileSet(
-        id="arrays",
-        name="arrays",
-        description="Arrays of the pairs, NumPy's NPY format.",
-        contained_in=[shard.id for shard in shards],
-        encoding_formats=["application/x-npy"],
-        includes=["*.npy"],
-    )
+    arrays = {"encoding_formats": ["application/x-npy"], "includes": ["*.npy"]}
+    sets = [mlc.FileSet(id="arrays", name="arrays", contained_in=[*shards], **arrays)] if shards else []
     metadata = mlc.Metadata(
         name=described.name,
         description=described.summary,
@@ -257,18 +192,16 @@ def _croissant(described: _Described, given: Statements) -> str:
         cite_as=" ".join(CITATIONS),
         version="1.0.0",
         data_collection=f"Simulated by unprocess_gen {described.version}; fingerprint {facts['fingerprint']}.",
-        distribution=[manifest, *shards, *([arrays] if shards else [])],
-        record_sets=[_rows(described.columns), *([_arrays()] if shards else [])],
+        distribution=[*files, *sets],
+        record_sets=[_rows(mlc, described.columns), *([_arrays(mlc)] if shards else [])],
     )
     content = metadata.to_json()
     content["@context"]["containedIn"] = "cr:containedIn"  # a term of 1.1 that mlcroissant reads and does not write
     return json.dumps(content, indent=1, default=str) + "\n"
 
 
-def _rows(names: tuple[str, ...]) -> Any:
+def _rows(mlc: Any, names: tuple[str, ...]) -> Any:
     """Describe the rows of the manifest, with a field for each of its columns."""
-    import mlcroissant as mlc
-
     types: dict[object, Any] = {int: mlc.DataType.INTEGER, float: mlc.DataType.FLOAT}
     fields = [
         mlc.Field(
@@ -285,27 +218,19 @@ def _rows(names: tuple[str, ...]) -> Any:
     return mlc.RecordSet(id="pairs", name="pairs", description=description, key="pairs/key", fields=fields)
 
 
-def _arrays() -> Any:
+def _arrays(mlc: Any) -> Any:
     """Describe the arrays in the shards: key, name of the array, and the content of the file."""
-    import mlcroissant as mlc
-
-    extracts = {
-        "key": ("key of the sample: source index, and patch if there is one", "fullpath", r"^([^.]+)\."),
-        "array": ("clean, noisy, or another array of the pair", "fullpath", r"^[^.]+\.(.+)\.npy$"),
-        "content": ("NPY file: numpy.load(io.BytesIO(content))", "content", None),
+    regex = {"key": r"^([^.]+)\.", "array": r"^[^.]+\.(.+)\.npy$"}
+    meanings = {
+        "key": "key of the sample: source index, and patch if there is one",
+        "array": "clean, noisy, or another array of the pair",
+        "content": "NPY file: numpy.load(io.BytesIO(content))",
     }
-    fields = [
-        mlc.Field(
-            id=f"frames/{name}",
-            name=name,
-            description=description,
-            data_types=[mlc.DataType.TEXT],
-            source=mlc.Source(
-                file_set="arrays",
-                extract=mlc.Extract(file_property=part),
-                transforms=[mlc.Transform(regex=regex)] if regex else [],
-            ),
-        )
-        for name, (description, part, regex) in extracts.items()
-    ]
+    fields = []
+    for name, meaning in meanings.items():
+        extract = mlc.Extract(file_property="fullpath" if name in regex else "content")
+        transforms = [mlc.Transform(regex=regex[name])] if name in regex else []
+        source = mlc.Source(file_set="arrays", extract=extract, transforms=transforms)
+        text = [mlc.DataType.TEXT]
+        fields.append(mlc.Field(id=f"frames/{name}", name=name, description=meaning, data_types=text, source=source))
     return mlc.RecordSet(id="frames", name="frames", description="Arrays in the shards.", fields=fields)
