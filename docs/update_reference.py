@@ -22,6 +22,7 @@ from unprocess_gen.config.values import value_text
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
+from light_page import light_tables  # noqa: E402
 from reference_pages import PAGES  # noqa: E402
 
 PACKAGE = "unprocess_gen"
@@ -124,6 +125,7 @@ def purpose(package: str) -> str:
 
 GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
     "packages": ("docs/design/architecture.md", package_table),
+    "lights": ("docs/guides/physical_scenes.md", light_tables),
 }
 """Generated parts: name of the markers, page, function that returns the text."""
 

@@ -16,9 +16,11 @@ from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
 from PIL import Image
 
+from unprocess_gen.config.composition import load_config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.pipeline import repair
+from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.sources import loader
 
@@ -296,3 +298,14 @@ def test_rerun_with_a_missing_shard_names_the_repair(copy: Path, sources: Path, 
 
     assert done.code == 4
     assert "gen-dataset verify ds --repair" in done.err
+
+
+def test_drawn_lights_return_with_a_lost_manifest(tmp_path: Path) -> None:
+    overrides = ["gains=by_light", "scene=night", "source.limit=2", "source.patch=[random,32,2]", "n_jobs=1"]
+    generate(load_config([*overrides, f"out={tmp_path / 'ds'}"]))
+    before = (tmp_path / "ds/manifest.csv").read_bytes()
+    assert b",tungsten," in before or b",daylight," in before
+    (tmp_path / "ds/manifest.csv").unlink()
+    steps = list(repair.repair(tmp_path / "ds", None))
+    assert [step.what for step in steps] == ["restored from the rows in the shards"]
+    assert (tmp_path / "ds/manifest.csv").read_bytes() == before

@@ -86,6 +86,14 @@ def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: Da
     return redrawn.replace(draw=noise.draw, frame=noise.frame, dark=noise.dark)
 
 
+def drawn_light(config: Config, key: int) -> tuple[str, float]:
+    """Draw the light of an image again, and its colour temperature; empty and 0 if the gains follow from no light."""
+    if config.source.kind == "raw":
+        return "", 0.0
+    camera = _planner(config).draw_camera(parameter_uniforms(key, COUNT))
+    return camera.light, camera.cct_k
+
+
 def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
     """Replace the dark frame of a pair by another one in each epoch, at the same place: the body does not move."""
     digests = [frame.sha256 for frame in dark_frames.frames]
@@ -207,7 +215,7 @@ class Planner:
         raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
         source, isp = self._source, self._isp
         if raw is None:
-            camera = self._draw_camera(uniforms)
+            camera = self.draw_camera(uniforms)
         else:
             source, camera, isp = own_noise(raw, scene.exposure, span_dn), raw.camera, raw.isp
         steep = self._steep_accuracy != self._accuracy
@@ -236,7 +244,7 @@ class Planner:
         names, ends = list(self._splits), list(itertools.accumulate(self._splits.values()))
         return names[bisect.bisect_right(ends[:-1], split_uniform(seed, source_sha256))]
 
-    def _draw_camera(self, uniforms: Sequence[float]) -> types.CameraPlan:
+    def draw_camera(self, uniforms: Sequence[float]) -> types.CameraPlan:
         """Draw colours and gains."""
         name, weights, rgb2cam = plan_camera(self._camera, uniforms)
         red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
