@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         UnprocessGenError,
     )
     from unprocess_gen.core.types import Plan
+    from unprocess_gen.dataset.clips import Clip, RawClips
     from unprocess_gen.dataset.reader import RawPairs, Sample
     from unprocess_gen.dataset.sampler import EpochSampler
     from unprocess_gen.dataset.training import noise_std, pack, random_crop, to_light
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 __all__ = [
+    "Clip",
     "Config",
     "ConfigError",
     "DamageError",
@@ -43,6 +45,7 @@ __all__ = [
     "LockedError",
     "MachineError",
     "Plan",
+    "RawClips",
     "RawPair",
     "RawPairs",
     "Sample",
@@ -70,6 +73,7 @@ _MODULES = {
         *("ConfigError", "DamageError", "LockedError", "MachineError", "SourceError", "UnprocessGenError"),
     ),
     "core.types": ("Plan",),
+    "dataset.clips": ("Clip", "RawClips"),
     "dataset.reader": ("RawPairs", "Sample"),
     "dataset.sampler": ("EpochSampler",),
     "dataset.training": ("noise_std", "pack", "random_crop", "to_light"),

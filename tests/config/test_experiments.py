@@ -61,7 +61,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("recipe", slow_except(("brooks2019_training", "crvd_like"), RECIPES))
 def test_experiment_runs_unmodified(recipe: str, clip: Path, run_main: RunMain, tmp_path: Path) -> None:
     assert run_main(f"+{RECIPE}={recipe}", f"source.root={clip}", "n_jobs=1", "out=ds").code == 0
-    assert len(RawPairs(tmp_path / "ds")) == (16 if recipe == "brooks2019_training" else 1)
+    assert len(RawPairs(tmp_path / "ds")) == {"brooks2019_training": 16, "rvdd_like": 2}.get(recipe, 1)
 
 
 @pytest.mark.slow
@@ -117,6 +117,16 @@ def test_ipol_demo_has_the_defaults_of_the_article(settings: Settings) -> None:
     noise = config.noise
     assert (noise.a, noise.b, noise.black, noise.law) == (8.0034, -2043.51144, "included", "gaussian")
     assert (config.output.dtype, config.output.layout) == ("uint16", "mosaic")  # 16-bit integers
+
+
+def test_rvdd_has_the_lines_of_its_author(settings: Settings) -> None:
+    """generate_raw_from_RGB.py: (8.0034·u - 2043.51144).clip(0) and (28.3015·u - 6307.62081).clip(0); GBRG; dither."""
+    config = settings(f"+{RECIPE}=rvdd_like")
+    lines = [(level["a"], level["b"]) for level in config.noise.levels]
+    assert lines == [(8.0034, -2043.51144), (28.3015, -6307.62081)]
+    assert (config.noise.black, config.noise.negative_variance) == ("included", "clip")
+    assert (config.sensor.pattern, config.gains.highlight, config.source.dequantize) == ("GBRG", "none", "dither")
+    assert (config.source.clips, config.output.clips) == (True, "together")
 
 
 # Brooks et al. --------------------------------------------------------------------------------------------------------

@@ -95,7 +95,7 @@ isp: smoothstep_gamma22 gamma22 srgb linear
 sensor: sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x imx385_gbrg
 sensor: imx385_12bit generic_10bit generic_12bit generic_14bit generic_16bit
 noise: imx385_iso1600 imx385_iso3200 imx385_iso6400 imx385_iso12800 imx385_iso25600 imx385_iso3200_rvdd brooks2019
-noise: heteroscedastic none imx385 sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x
+noise: imx385_rvdd heteroscedastic none imx385 sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x
 scene: daylight indoor long_exposure low_light night video_night
 effects: default
 accuracy: reference exact fast

@@ -646,6 +646,9 @@ class AccuracyConfig(Group):
         return self.normal_shot and self.law_distance > 0
 
 
+TOGETHER = "together"
+"""Value of ``output.clips`` that keeps the frames of a clip in one shard."""
+
 AUTO = "auto"
 """Value of ``output.pairs_per_shard`` that lets a run choose the number."""
 
@@ -673,6 +676,9 @@ class OutputConfig(Group):
     targets
         more arrays for a training: linear_rgb is the scene before the mosaic, srgb the photograph, variance that
         of the noise at each site, noise_std its standard deviation as estimated from the noisy frame
+    clips
+        with source.clips: divided puts the same number of sources into each shard, together keeps each clip in one
+        shard, which then has pairs_per_shard sources or more
     frames
         store frames; false writes a manifest only, as the verb manifest does: ug.LivePairs makes the pairs of it
     """
@@ -683,6 +689,7 @@ class OutputConfig(Group):
     pairs_per_shard: Any = key(8, NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"))
     parquet: bool = key(False, limits.BOOLEAN, since="0.2")
     targets: tuple[str, ...] = key((), limits.TARGET_NAMES, since="0.3")
+    clips: str = key("divided", Choice("divided", TOGETHER), since="0.3")
     frames: bool = key(True, limits.BOOLEAN, since="0.3")
 
     def __post_init__(self) -> None:

@@ -23,7 +23,7 @@ from typing import Annotated
 import msgspec
 
 from unprocess_gen.config.interpretation import shading_place
-from unprocess_gen.config.schema import Config, at_place, replaced
+from unprocess_gen.config.schema import TOGETHER, Config, at_place, replaced
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line
@@ -71,6 +71,8 @@ class FrozenPlan(msgspec.Struct, frozen=True):
         Absolute places of the sources, the dark frames and their map; None without them.
     roots : tuple of str
         Absolute places of the sources, if there are several.
+    starts : tuple of int
+        Index of the first source of each shard, if shards have complete clips; else empty.
     not_matched, skipped_links : int
         What the listing left out.
     canary_source : int or None
@@ -96,6 +98,7 @@ class FrozenPlan(msgspec.Struct, frozen=True):
     dark_shading: str | None = None
     parts: Positive | None = None
     roots: tuple[str, ...] = ()
+    starts: tuple[Count, ...] = ()
 
     def __post_init__(self) -> None:
         if self.parts is not None and self.parts > self.shards:
@@ -104,7 +107,15 @@ class FrozenPlan(msgspec.Struct, frozen=True):
     @property
     def shards(self) -> int:
         """Number of shards."""
-        return -(-self.sources // self.pairs_per_shard)
+        return len(self.starts) or -(-self.sources // self.pairs_per_shard)
+
+    def sources_of(self, shard: int) -> tuple[int, int]:
+        """Index of the first source of a shard, and of the one after its last."""
+        if self.starts:
+            first, end = (*self.starts, self.sources)[shard : shard + 2]
+            return first, end
+        first = shard * self.pairs_per_shard
+        return first, min(first + self.pairs_per_shard, self.sources)
 
     @property
     def text(self) -> str:
@@ -148,6 +159,7 @@ def _new_plan(workspace: Workspace, run: Run, on_compiling: OnCompiling | None, 
         pairs_per_shard=config.output.pairs_per_shard,
         root=None if isinstance(place, tuple) else place,
         roots=place if isinstance(place, tuple) else (),
+        starts=tuple(run.starts()) if config.output.clips == TOGETHER else (),
         max_failed=config.source.max_failed,
         n_jobs=config.n_jobs,
         self_test=config.self_test,
@@ -278,8 +290,7 @@ class FrozenRun:
 
     def task(self, shard: int) -> ShardTask:
         """Read the sources of a shard."""
-        size = self.plan.pairs_per_shard
-        return ShardTask(shard, tuple(self._listing.sources(shard * size, min((shard + 1) * size, self.plan.sources))))
+        return ShardTask(shard, tuple(self._listing.sources(*self.plan.sources_of(shard))))
 
     def make(self, shard: int) -> ShardReport | None:
         """Make and commit a shard, or return None if it is committed; one at a time in a process.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -28,8 +29,9 @@ from unprocess_gen.dataset.manifest import (
 )
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import PairRegenerator, dark_places, source_of, source_root
+from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.sources.dark_frames import with_dark_places
-from unprocess_gen.sources.loader import list_photographs, load_source
+from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.pixel_cache import PixelCache
 
 KEPT = 4096
@@ -158,9 +160,9 @@ class PlannedPairs:
                 "expected random patches or null; give LivePairs a finished dataset"
             )
         self.name, self._cache = "", cache
-        self.settings = PairSettings.read(config)
-        listed = list_photographs(config.source).sources
-        self._sources = [source for source in listed if source.reason is None]
+        run = resolve(config)
+        self.settings, self._starts = run.settings, run.starts()
+        self._sources = [source for source in run.sources if source.reason is None]
         self._patches = 1 if rule is None else rule.count
         self._plans = len(noise_levels(config.noise)) * config.noise.draws
         self._planned: Recent[int, tuple[str, int, tuple[Plan, ...], tuple[Patch, ...]]] = Recent(KEPT)
@@ -182,7 +184,8 @@ class PlannedPairs:
         patch, plan = patches[rest // self._plans], plans[rest % self._plans]
         sample = patch_key(source.index, patch, several=config.source.patch is not None)
         key = pair_key(sample, plan, several=self._plans > 1)
-        return LiveImage(source, sha256, orientation, source.index // config.output.pairs_per_shard, key, plan, patch)
+        shard = bisect.bisect_right(self._starts, source.index) - 1
+        return LiveImage(source, sha256, orientation, shard, key, plan, patch)
 
     def pixels(self, image: LiveImage) -> Srgb:
         """Return the decoded image of a pair; raise as `load_source`."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.interpretation import entry_configs
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import TOGETHER, Config, OutputConfig
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.sizes import resolve_pairs_per_shard, shards_warning
@@ -40,7 +40,11 @@ class Run:
 
     def tasks(self) -> list[ShardTask]:
         """Divide the sources into shards."""
-        return shard_tasks(self.sources, self.config.output.pairs_per_shard)
+        return shard_tasks(self.sources, self.starts())
+
+    def starts(self) -> Sequence[int]:
+        """Index of the first source of each shard."""
+        return shard_starts(self.sources, self.config.output)
 
     def warnings(self) -> tuple[str, ...]:
         """Collect what the user should know before the run begins, a sentence each."""
@@ -61,7 +65,29 @@ def resolve(config: Config) -> Run:
     return Run(replace(settings, config=complete), listing)
 
 
-def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[ShardTask]:
-    """Split the listing into tasks: shard s holds source indices [s·N, (s+1)·N), N = ``pairs_per_shard``."""
-    starts = range(0, len(sources), pairs_per_shard)
-    return [ShardTask(shard, tuple(sources[first : first + pairs_per_shard])) for shard, first in enumerate(starts)]
+def shard_starts(sources: Sequence[Source], output: OutputConfig) -> Sequence[int]:
+    """Return the index of the first source of each shard.
+
+    Shard s begins at source s·N, N = ``pairs_per_shard``. With ``output.clips=together``, a shard ends with the clip
+    that gives it N sources.
+    """
+    size = int(output.pairs_per_shard)
+    if output.clips != TOGETHER:
+        return range(0, len(sources), size)
+    last = {source.clip: index for index, source in enumerate(sources)}
+    starts: list[int] = []
+    end = -1  # of the clips that have begun
+    for index, source in enumerate(sources):
+        if index > end and (not starts or index - starts[-1] >= size):
+            starts.append(index)
+        end = max(end, last[source.clip])
+    return starts
+
+
+def shard_tasks(sources: Sequence[Source], starts: Sequence[int]) -> list[ShardTask]:
+    """Split the listing into tasks, by the index of the first source of each shard."""
+    ends = *starts[1:], len(sources)
+    return [
+        ShardTask(shard, tuple(sources[place[0] : place[1]]))
+        for shard, place in enumerate(zip(starts, ends, strict=True))
+    ]

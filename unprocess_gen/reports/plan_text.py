@@ -10,7 +10,7 @@ import numpy as np
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.bodies import body_sentence
-from unprocess_gen.config.schema import BRANCH_FIELDS, AccuracyConfig, Config, NoiseConfig
+from unprocess_gen.config.schema import BRANCH_FIELDS, TOGETHER, AccuracyConfig, Config, NoiseConfig
 from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Patch, Plan
 from unprocess_gen.pipeline.sizes import shards_warning
@@ -35,7 +35,8 @@ def format_estimate(estimate: RunEstimate) -> str:
     lines = [
         f"sources   {len(run.sources)} in {config.source.list or place}; {len(read)} of them read",
         *(f"          {note}" for note in notes if note),
-        f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}",
+        f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}"
+        + (" or more, with complete clips" if config.output.clips == TOGETHER else ""),
         *_labelled("splits", [_split_sentence(config, len(run.sources))]),
         *_patch_lines(config, read),
         f"bytes     {about}{estimate.bytes:,} in shards, {byte_size(estimate.bytes)}{basis}",
