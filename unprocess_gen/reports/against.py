@@ -18,7 +18,15 @@ from unprocess_gen.calibration.calibrate import measure_all
 from unprocess_gen.calibration.captures import Sensor, read_captures
 from unprocess_gen.calibration.gain import NORMAL_95, Estimate
 from unprocess_gen.calibration.measure import Watch
-from unprocess_gen.calibration.profile import Calibration, KnownGain, Named, dark_variance, estimates, site_names
+from unprocess_gen.calibration.profile import (
+    ABSOLUTE,
+    Calibration,
+    KnownGain,
+    Named,
+    dark_variance,
+    estimates,
+    site_names,
+)
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 from unprocess_gen.config.interpretation import entry_configs, is_physical, noise_distributions
 from unprocess_gen.config.noise_validation import check_noise
@@ -68,7 +76,7 @@ class Comparison(NamedTuple):
             return f"{text}; the profile has {short_number(self.profile, 4)}: the camera does not show it"
         side = "above" if self.score.total > 0 else "below"
         off = f"{short_number(abs(self.score.total), 3)}{unit}"
-        off += f" or {abs(self.percent):.1f} %" if one.name != "black_error_dn" else ""
+        off += f" or {abs(self.percent):.1f} %" if one.name not in ABSOLUTE else ""
         errors = f"{abs(self.score.errors):,.0f} standard errors"
         return f"{text}, {off} {side} that of the profile, {short_number(self.profile, 4)} ({errors})"
 
