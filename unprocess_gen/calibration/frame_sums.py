@@ -171,8 +171,8 @@ class FrameSums:
         variance = (total - of_rows) * width / (width - 1)
         error = np.hypot(total_error, of_rows * math.sqrt(2 / (height * (count - 1))))
         noise = variance / width
-        row, correlation = _row_offsets(own[0], float(noise.mean()) / 2)
-        column = _offsets(own[1], float(variance.mean()) / height / 2)
+        row, correlation = _line_offsets(own[0], 2, float(noise.mean()) / 2)
+        column, _ = _line_offsets(own[1], 1, float(variance.mean()) / height / 2)
         temporal = (variance * SMOOTH + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
         return Measured(
             count=count,
@@ -239,29 +239,20 @@ def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, flo
     )
 
 
-def _row_offsets(rows: Float, noise: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return variance of the offsets of rows, and the correlation of neighbouring rows, each with its error.
+def _line_offsets(lines: Float, axis: int, noise: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return variance of offsets that are new in every frame, and the correlation of neighbours, each with its error.
 
-    ``rows`` [frames, 4, H] are means of rows of a plane; the planes of a row share its offset. ``noise`` is the
-    variance of the mean of both.
+    ``lines`` [frames, 4, N] are means of rows or columns of a plane. The planes of a row or column of the sensor share
+    its offset: ``axis`` 2 for rows, 1 for columns. ``noise`` is the variance of the mean of both.
     """
-    full = rows.reshape(len(rows), 2, 2, -1).mean(axis=2).transpose(0, 2, 1).reshape(len(rows), -1)
+    full = lines.reshape(len(lines), 2, 2, -1).mean(axis=axis).transpose(0, 2, 1).reshape(len(lines), -1)
     offsets = full - full.mean(axis=0)
-    degrees = (len(rows) - 1) * (offsets.shape[1] - 2)
+    degrees = (len(lines) - 1) * (offsets.shape[1] - 2)
     variance = float((offsets**2).sum()) / degrees
     lagged = float((offsets[:, 1:] * offsets[:, :-1]).sum()) / degrees
-    row = variance - noise
-    correlation = (lagged / row, variance / row / math.sqrt(degrees)) if row > 0 else (0.0, math.inf)
-    return (row, variance * math.sqrt(2 / degrees)), correlation
-
-
-def _offsets(columns: Float, noise: float) -> tuple[float, float]:
-    """Return the variance of offsets of columns that are new in every frame, and its error."""
-    full = columns.reshape(len(columns), 2, 2, -1).mean(axis=1).reshape(len(columns), -1)
-    offsets = full - full.mean(axis=0)
-    degrees = (len(columns) - 1) * (offsets.shape[1] - 2)
-    variance = float((offsets**2).sum()) / degrees
-    return variance - noise, variance * math.sqrt(2 / degrees)
+    own = variance - noise
+    correlation = (lagged / own, variance / own / math.sqrt(degrees)) if own > 0 else (0.0, math.inf)
+    return (own, variance * math.sqrt(2 / degrees)), correlation
 
 
 def _fixed_offsets(columns: Float, noise: float, temporal: float) -> tuple[float, float]:

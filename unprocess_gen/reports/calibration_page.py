@@ -50,7 +50,7 @@ def write_page(found: Calibration, name: str, command: str, page: Path) -> None:
         frames=len(found.captures.captures),
         notes=found.notes,
         figures=figures,
-        against_iso=data_uri(_against_iso(found)),
+        against_iso=data_uri(_against_iso(found)) if len(found.isos) > 1 else "",
         table=_table(estimates(found)),
         sensors=_sensors(found, name),
     )
