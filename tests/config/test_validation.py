@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf, open_dict
 
 from unprocess_gen.config import distributions
-from unprocess_gen.config.composition import compose_node
+from unprocess_gen.config.composition import compose_node, load_config
 from unprocess_gen.config.distributions import parse_distribution
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.limits import Choice
@@ -105,6 +105,19 @@ experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_l
 sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
 """
 """Options that commands of users name."""
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (["camera.weights=[0,0,0,0]"], "their sum is 0"),
+        (["camera=sony_a7r", "camera.weights=[1,0,0,0]"], "weights need camera.law=convex, not fixed"),
+        (["camera.weights=[1,1]"], "a list of 4 numbers"),
+    ],
+)
+def test_wrong_weights_are_refused(overrides: list[str], sentence: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        load_config(overrides)
 
 
 def test_options_are_those_of_the_contract() -> None:

@@ -184,6 +184,12 @@ def test_mixed_camera_is_named_convex(settings: Settings) -> None:
     assert all(0 < weight < 1 for weight in plan.camera.weights)
 
 
+def test_chosen_weights_are_divided_by_their_sum(settings: Settings) -> None:
+    plan = plan_of(settings, "camera.weights=[1,2,0,1]")
+    assert plan.camera.weights == (0.25, 0.5, 0, 0.25)
+    assert plan.camera.rgb2cam == colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), plan.camera.weights))
+
+
 def test_identity_has_no_weights_and_changes_nothing(settings: Settings) -> None:
     plan = plan_of(settings, "camera=identity")
     assert (plan.camera.name, plan.camera.weights, plan.camera.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)

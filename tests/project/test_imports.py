@@ -16,7 +16,7 @@ PACKAGE = Path(unprocess_gen.__file__).parent
 ONLY_IN = {
     "hydra": {
         *("cli.jobs", "config.composition", "config.composition_errors", "config.sweep_expansion"),
-        "cli.sweep_plugins",
+        *("cli.sweep_plugins", "config.recomposition"),
     },
     "omegaconf": {
         *(
@@ -26,7 +26,7 @@ ONLY_IN = {
             "config.composition_errors",
             "config.serialization",
         ),
-        *("cli.sweep_plugins", "config.sweep_expansion"),
+        *("cli.sweep_plugins", "config.recomposition", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},
@@ -34,7 +34,7 @@ ONLY_IN = {
     "cv2": {
         *("sources.image.decode", "sources.mosaics", "simulation.reference.isp", "pipeline.worker"),
         *("reports.dataset_page.page", "reports.sheets.contact_sheet", "reports.sheets.panels"),
-        "reports.benchmark.complete_runs",
+        *("reports.benchmark.complete_runs", "reports.explorer.views"),
     },
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},

@@ -101,6 +101,7 @@ class Place:
     metavar: str
     expected: str
     completes: str = "folders"
+    optional: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,12 +210,16 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
             raise ConfigError(f"{verb.name}: {problem}")
     if verb.composes:
         hydra = {flag.flags[-1]: values.pop(flag.key) for flag in HYDRA_FLAGS if flag.key in values}
-        return Call(verb, values, overrides=_with_source(others, values.get("source")), hydra=hydra)
+        return Call(verb, values, _any_path(path), _with_source(others, values.get("source")), hydra)
+    return Call(verb, values, _any_path(path), words=others)
+
+
+def _any_path(path: str | None) -> AnyPath | None:
     if path is None:
-        return Call(verb, values, words=others)
+        return None
     from unprocess_gen.core.paths import any_path  # imports NumPy, too slow for --help
 
-    return Call(verb, values, any_path(path), words=others)
+    return any_path(path)
 
 
 def _read(argument: Argument, spelling: str, text: Any) -> Any:
@@ -233,7 +238,10 @@ def _take_place(verb: Verb, words: list[str]) -> str | None:
     if verb.place is None:
         return None
     existing = None if verb.extra else next((word for word in words if os.path.lexists(word)), None)
-    path = existing or next((word for word in words if word and word.partition("=")[0] not in verb.settings), None)
+    own = (word for word in words if word and word.partition("=")[0] not in verb.settings)
+    path = existing or next((word for word in own if not verb.composes or ("=" not in word and word[0] != "~")), None)
+    if path is None and verb.place.optional:
+        return None
     if path is None:
         raise ConfigError(f"{verb.name}: expected {verb.place.expected}")
     words.remove(path)

@@ -152,7 +152,7 @@ def verb_help(verb: Verb) -> str:
 
 def synopsis(verb: Verb) -> str:
     """Return the command line of a verb with its required arguments."""
-    words = [verb.place.metavar] if verb.place else []
+    words = [f"[{verb.place.metavar}]" if verb.place.optional else verb.place.metavar] if verb.place else []
     words += [f"[{verb.extra.metavar}]"] if verb.extra else []
     words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
     words += [argument.spelled for argument in verb.arguments if argument.required]

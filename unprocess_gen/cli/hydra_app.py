@@ -41,7 +41,7 @@ def compose(
     A job of a sweep that fails does not stop the others. With ``sweep_csv``, a sweep writes ``sweep.csv`` in ``out``.
     ``totals`` returns the text to print after a sweep, from the results of its jobs.
     """
-    _check_overrides(call.overrides)
+    check_overrides(call.overrides)
     if PRINTING & call.hydra.keys():
         return run_hydra(call, call.overrides)
     prints_config = "--cfg" in call.hydra
@@ -50,7 +50,7 @@ def compose(
     from unprocess_gen.config.composition import validated_config
     from unprocess_gen.config.sweep_expansion import expand
 
-    folders = _option_folders(call.hydra)
+    folders = option_folders(call.hydra)
     expansion = expand(call.overrides, folders, "--multirun" in call.hydra, sweep_csv and not prints_config)
     if prints_config:
         jobs = [call.overrides] if expansion.node is not None else [job.overrides for job in expansion.jobs]
@@ -66,7 +66,7 @@ def compose(
     return run_sweep(folders, expansion.jobs, task, sweep_csv, totals)
 
 
-def _check_overrides(overrides: Sequence[str]) -> None:
+def check_overrides(overrides: Sequence[str]) -> None:
     """Refuse what is not an override, and overrides of Hydra's settings that have no effect."""
     from unprocess_gen.config.option_files import check_override
 
@@ -79,7 +79,7 @@ def _check_overrides(overrides: Sequence[str]) -> None:
             )
 
 
-def _option_folders(hydra: Mapping[str, Any]) -> OptionFolders:
+def option_folders(hydra: Mapping[str, Any]) -> OptionFolders:
     """Return the folders and the primary config that flags choose."""
     from unprocess_gen.config.composition import OptionFolders
 

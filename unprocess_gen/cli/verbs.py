@@ -160,6 +160,27 @@ _VERBS = (
         DATASET,
     ),
     Verb(
+        "explore",
+        "try settings on a photograph or a row, in a page of the browser on this machine",
+        "explore.explore",
+        (
+            KEYS,
+            _integer("--port", "number of the port on 127.0.0.1; default: a free one", 0),
+            Argument(("--no-browser",), "print the address, and open no browser"),
+            Argument(
+                ("--save",),
+                "write FILE, a page of this state without controls, and stop",
+                "FILE",
+                _local_path,
+                "a local file",
+                "files",
+            ),
+            SETTINGS_SOURCE,
+        ),
+        Place("PHOTO", "a photograph, a folder of photographs, or a dataset", "files", optional=True),
+        composes=True,
+    ),
+    Verb(
         "preview",
         "draw contact sheets of pairs, and of each processing step",
         "reports.preview",

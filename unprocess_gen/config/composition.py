@@ -143,14 +143,14 @@ def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
         settings = node.pop("hydra", None) or HydraConfig.get()
         if "body" in node:
             node.body.replaced = replaced_parts(node, settings)
-    config = _typed(node, overrides)
+    config = typed_config(node, overrides)
     if config.mixture is not None:
         config = _with_entries(config, node, settings, overrides)
     validate_config(config)
     return config
 
 
-def _typed(node: DictConfig, overrides: Sequence[str]) -> Config:
+def typed_config(node: DictConfig, overrides: Sequence[str]) -> Config:
     """Resolve a composed config without checking its values."""
     for key in _unknown_keys(node, Config()):
         raise ConfigError(unknown_key(key, overrides))
@@ -191,7 +191,7 @@ def _with_entries(config: Config, node: DictConfig, settings: Any, overrides: Se
                 raise ConfigError(explain(error, written)) from error
             with open_dict(entry):
                 entry.pop("hydra")
-            groups = {group: getattr(_typed(entry, written), group) for group in ENTRY_GROUPS}
+            groups = {group: getattr(typed_config(entry, written), group) for group in ENTRY_GROUPS}
             entries.append(MixtureEntry(weight, **groups))
     return replace(config, mixture=tuple(entries), **{group: getattr(entries[0], group) for group in ENTRY_GROUPS})
 

@@ -187,12 +187,17 @@ class CameraConfig(Group):
         of the four, identity linear sRGB, custom xyz2cam
     xyz2cam
         matrix from XYZ (D65) to the camera, row by row, for law=custom
+    weights
+        weights of nexus_6p, sony_a7r, olympus_em10 and sony_rx100 in the mix of law=convex, divided by their sum
     """
 
     name: str = key("convex", limits.NAME)
     law: str = key("convex", limits.CAMERA_LAWS)
     xyz2cam: Optional[tuple[float, ...]] = key(
         None, Limit("nine numbers of an invertible matrix"), null="a law other than custom"
+    )
+    weights: Optional[tuple[float, ...]] = key(
+        None, NumberList(4, Numbers(0)), null="drawn for each image", since="0.3"
     )
 
 

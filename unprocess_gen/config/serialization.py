@@ -91,7 +91,7 @@ def dataset_yaml(config: Config) -> str:
 
 def _canonical_settings(config: Config) -> dict[str, Any]:
     """Return the keys that decide the bytes of a dataset, as mappings; entries of a mixture are left as they are."""
-    settings: dict[str, Any] = _recorded(config)
+    settings: dict[str, Any] = recorded(config)
     settings["source"] = {"kind": source_kind(config)} | settings["source"]
     settings["sensor"]["saturated"] = saturated_as(config)
     settings["source"]["patch"] = canonical_patch(config.source)
@@ -115,16 +115,16 @@ def _canonical_settings(config: Config) -> dict[str, Any]:
     return settings
 
 
-def _recorded(group: Any) -> Any:
+def recorded(group: Any) -> Any:
     """Return a dataclass of the schema as mappings, without keys that ``config.yaml`` omits."""
     if isinstance(group, list | tuple):
-        return [_recorded(item) for item in group]
+        return [recorded(item) for item in group]
     if isinstance(group, dict):
-        return {name: _recorded(value) for name, value in group.items()}
+        return {name: recorded(value) for name, value in group.items()}
     if not dataclasses.is_dataclass(group) or isinstance(group, type):
         return group
     settings = settings_of(group)
-    recorded: dict[str, Any] = {}
+    mapping: dict[str, Any] = {}
     for one in dataclasses.fields(group):
         setting, value = settings.get(one.name), getattr(group, one.name)
         if setting is None:
@@ -132,8 +132,8 @@ def _recorded(group: Any) -> Any:
         else:
             omitted = not setting.decides_data or bool(setting.since and value == one.default)
         if not omitted and not (one.name in _NESTED_KEYS and value == type(value)()):
-            recorded[one.name] = _recorded(value)
-    return recorded
+            mapping[one.name] = recorded(value)
+    return mapping
 
 
 _NESTED_KEYS = frozenset(group.rpartition(".")[2] for group in NESTED)

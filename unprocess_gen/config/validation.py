@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import operator
 import re
 from collections.abc import Iterator
@@ -227,7 +228,11 @@ def _check_source(source: SourceConfig) -> None:
 
 
 def _check_camera(camera: CameraConfig) -> None:
-    matrix = camera.xyz2cam
+    matrix, weights = camera.xyz2cam, camera.weights
+    if weights is not None and camera.law != "convex":
+        raise refusal("camera.weights", weights, f"weights need camera.law=convex, not {camera.law}; set camera=convex")
+    if weights is not None and not 0 < sum(weights) < math.inf:
+        raise refusal("camera.weights", weights, "their sum is 0 or infinite; expected at least one above 0")
     if camera.law != "custom":
         one_of("camera.name", camera.name, tuple(colour.CAMERAS) if camera.law == "fixed" else (camera.law,))
         if matrix is not None:

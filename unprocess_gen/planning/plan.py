@@ -395,7 +395,7 @@ def plan_camera(camera: CameraConfig, uniforms: Sequence[float]) -> tuple[str, W
     if camera.law == "custom":
         return camera.name, (0.0, 0.0, 0.0, 0.0), colour.rgb2cam(colour.matrix(camera.xyz2cam or ()))
     if camera.law == "convex":
-        weights = convex_weights(uniforms)
+        weights = convex_weights(uniforms if camera.weights is None else camera.weights)
         return camera.name, weights, colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), weights))
     name = names[int(uniforms[Draw.CHOICE] * len(names))] if camera.law == "choice" else camera.name
     w0, w1, w2, w3 = (float(name == other) for other in names)
@@ -427,7 +427,7 @@ def draw_light(
 
 
 def convex_weights(uniforms: Sequence[float]) -> Weights:
-    """Return four uniforms, each divided by their sum (Brooks et al. 2019, random_ccm())."""
+    """Return the first four uniforms, each divided by their sum (Brooks et al. 2019, random_ccm())."""
     u0, u1, u2, u3 = uniforms[Draw.WEIGHT_0 : Draw.WEIGHT_3 + 1]
     total = u0 + u1 + u2 + u3
     return u0 / total, u1 / total, u2 / total, u3 / total

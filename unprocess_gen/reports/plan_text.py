@@ -57,7 +57,7 @@ def _entry_lines(estimate: RunEstimate) -> list[str]:
     config, dark_frames = estimate.run.config, estimate.run.settings.dark_frames
     readable = [source for source in estimate.source_estimates if source.levels]
     if config.mixture is None:
-        return _noise_lines(config, readable, dark_frames)
+        return noise_lines(config, readable, dark_frames)
     total, sources, lines = sum(entry.weight for entry in config.mixture), len(estimate.run.sources), list[str]()
     for number, entry in enumerate(interpretation.entry_configs(config)):
         weight = config.mixture[number].weight
@@ -65,7 +65,7 @@ def _entry_lines(estimate: RunEstimate) -> list[str]:
         drawn = "" if estimate.entries is None else f", {estimate.entries.count(number)} in this listing"
         names = f"camera={entry.camera.name} noise={entry.noise.name} scene={entry.scene.name}"
         lines += _labelled("mixture", [f"entry {number}, {names}; {expected}{drawn}"])
-        lines += _noise_lines(entry, [image for image in readable if image.levels[0].mixture == number], dark_frames)
+        lines += noise_lines(entry, [image for image in readable if image.levels[0].mixture == number], dark_frames)
     return lines
 
 
@@ -136,7 +136,7 @@ def _accuracy_line(chosen: AccuracyConfig, tier_ns: dict[str, float]) -> str:
 # ------------------------------------------------------------------------------------------------------ scene and noise
 
 
-def _noise_lines(config: Config, estimates: Sequence[SourceEstimate], dark_frames: DarkFrames | None) -> list[str]:
+def noise_lines(config: Config, estimates: Sequence[SourceEstimate], dark_frames: DarkFrames | None) -> list[str]:
     """Scene, noise, effects and warnings for the sources that can be read."""
     plans = [plan for source in estimates for plan in source.levels]
     if not plans:

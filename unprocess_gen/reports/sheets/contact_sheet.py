@@ -161,7 +161,7 @@ def _frame_panels(name: str, raw: Mosaic, planes: Float, plan: Plan, window: Win
     common = (np.sqrt(np.clip(to_light(dn, plan), 0, 1)) for dn in (overview, detail))
     rgb = process(to_light(panels.planes_to_rgb(planes, sensor.pattern), plan), plan)
     has_all_colours = min(raw.shape) > 1
-    developed = rgb, _develop_detail(raw, plan, window) if has_all_colours else None
+    developed = rgb, develop_detail(raw, plan, window) if has_all_colours else None
     return [
         SheetPanel(f"{name} raw, own stretch", f"{ranges[0]} (averaged), {ranges[1]} (detail)", *stretched),
         SheetPanel(
@@ -185,7 +185,7 @@ DEMOSAIC_REACH_PX = 2
 """Distance from which sites influence a demosaicked pixel (`isp.KERNELS`)."""
 
 
-def _develop_detail(raw: Mosaic, plan: Plan, window: Window) -> Float:
+def develop_detail(raw: Mosaic, plan: Plan, window: Window) -> Float:
     """Develop the detail with a border as wide as the demosaicking filter, as if the complete frame were developed."""
     y, x = (max(0, part.start - DEMOSAIC_REACH_PX) for part in window)  # even, as the reach is
     rows, columns = window

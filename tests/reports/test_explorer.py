@@ -1,0 +1,247 @@
+"""Tests of the explorer: its pair is the one that its command generates, and its page works in a browser."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import unprocess_gen as ug
+from unprocess_gen.config.composition import OptionFolders
+from unprocess_gen.config.recomposition import Recomposition, overrides_of
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.paths import any_path
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.reports.explorer.exploration import Exploration
+from unprocess_gen.reports.explorer.opening import open_place
+
+pytest.importorskip("bokeh", reason="the explorer needs the extra explore")
+
+ON_PAGE = (
+    "key",
+    "source_sha256",
+    "stream_key",
+    "w_sony_a7r",
+    "red_gain",
+    "a_dn",
+    "effects",
+    "clean_xxh3",
+    "noisy_xxh3",
+)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos with spaces"
+    folder.mkdir()
+    for number, name in enumerate(("a.png", "b.png", "twin.png")):
+        picture = np.random.default_rng(min(number, 1)).integers(0, 256, (96, 128, 3), dtype=np.uint8)
+        cv2.imwrite(str(folder / name), cv2.blur(picture, (9, 9)))
+    return folder
+
+
+def explorations(place: Path | None, *overrides: str, keys: str | None = None) -> list[Exploration]:
+    choices = open_place(None if place is None else any_path(place), keys, overrides, (), OptionFolders())
+    return [choice() for choice in choices.values()]
+
+
+def row_of_command(command: str, key: str, out: Path) -> dict[str, Any]:
+    """Generate the dataset of a command in this process and return the row with a key."""
+    words = [word for word in shlex.split(command)[1:] if not word.startswith("out=")]
+    ug.generate(ug.load_config([*words, f"out={out}", "n_jobs=1"]))
+    return next(dict(row) for row in read_rows(out / "manifest.csv") if row["key"] == key)
+
+
+CASES = {
+    "scene": (None, 2, ["gains.red=2.05", "camera.weights=[1,2,0,1]"]),
+    "photograph": ("photos", 1, ["body=sony_a7s2", "scene=night", "effects.prnu=on"]),
+    "dark": ("photos", 0, ["noise=heteroscedastic", "noise.a=2", "noise.b=9", "sensor.pattern=GBRG"]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_command_generates_the_pair_shown(case: str, photos: Path, tmp_path: Path) -> None:
+    place, number, overrides = CASES[case]
+    state = explorations(None if place is None else photos, *overrides)[number]
+    shown = state.shown()
+    row = row_of_command(state.command, str(shown.row["key"]), tmp_path / "out")
+    assert {name: row[name] for name in ON_PAGE} == {name: shown.row[name] for name in ON_PAGE}
+
+
+def test_row_of_a_dataset_opens_with_its_parameters(photos: Path, tmp_path: Path) -> None:
+    """Twins, patches and levels too: the pair is that of the row, and its command generates it."""
+    settings = ["source.patch=[grid,64]", "noise=nikon_d850", "noise.levels=[200,800]", "noise.draws=2"]
+    mixture = "mixture=[{weight: 1, camera: sony_a7r}, {weight: 1, camera: nexus_6p}]"
+    ug.generate(ug.load_config([f"source.root={photos}", f"out={tmp_path / 'ds'}", "n_jobs=1", mixture, *settings]))
+    for key in ("00000001-p0001-l01d01", "00000002-p0000-l00d01"):
+        (state,) = explorations(tmp_path / "ds", keys=key)
+        shown = state.shown()
+        assert state.digests == (shown.row["clean_xxh3"], shown.row["noisy_xxh3"]), key
+        again = row_of_command(state.command, str(shown.row["key"]), tmp_path / key)
+        assert again["noisy_xxh3"] == shown.row["noisy_xxh3"]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["gains.red=2", "seed=3"],
+        ["body=sony_a7s2", "scene.iso=800", "gains.blue=[uniform, 1, 2]"],
+        ["noise=heteroscedastic", "noise.a=2", "noise.b=3", "sensor.bits=14", "sensor.white_level_dn=16383"],
+        ["camera.weights=[1,2,3,4]", "split={a: 0.5, b: 0.5}", "+experiment=crvd_like", "source.clips=false"],
+    ],
+)
+def test_recomposition_equals_composition(overrides: list[str]) -> None:
+    composition = Recomposition()
+    composition.config([])
+    assert composition.config(overrides) == ug.load_config(overrides)
+    texts = [f"{key}={text}" for key, text in overrides_of(ug.load_config(overrides)).items()]
+    assert overrides_of(ug.load_config(texts)) == overrides_of(ug.load_config(overrides))
+
+
+@pytest.mark.parametrize("override", ["gains.red=-1", "camera=foo", "gains.foo=1", "sensor.bits=x", "source.limit=0"])
+def test_recomposition_has_the_sentence_of_the_command_line(override: str) -> None:
+    composition = Recomposition()
+    composition.config([])
+    with pytest.raises(ug.ConfigError) as direct:
+        ug.load_config([override])
+    with pytest.raises(ug.ConfigError, match=re.escape(str(direct.value))):
+        composition.config([override])
+
+
+def test_archives_contain_the_frames(photos: Path, tmp_path: Path) -> None:
+    shown = explorations(photos)[0].shown()
+    for form in ("npy", "dng"):
+        (tmp_path / f"{form}.zip").write_bytes(shown.archive(form))
+        shutil.unpack_archive(tmp_path / f"{form}.zip", tmp_path / form)
+    assert np.array_equal(np.load(tmp_path / "npy" / "00000000.noisy.npy"), shown.pair.noisy)
+    tifffile = pytest.importorskip("tifffile")
+    assert np.array_equal(tifffile.imread(tmp_path / "dng" / "00000000.clean.dng"), shown.pair.clean)
+
+
+# ------------------------------------------------------------------------------------------------------------ browser
+
+
+@pytest.fixture
+def address(photos: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "unprocess_gen", "explore", str(photos), "--no-browser", "noise=imx385_iso12800"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().split()[0]
+        process.terminate()
+        assert process.wait(30) == 143
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Any]:
+    driver, chromium = shutil.which("chromedriver"), shutil.which("chromium")
+    if driver is None or chromium is None:
+        pytest.skip("chromium and chromedriver are not installed")
+    from helpers.browser import FLAGS
+    from selenium.webdriver import Chrome, ChromeOptions
+    from selenium.webdriver.chrome.service import Service
+
+    options = ChromeOptions()
+    options.binary_location = chromium
+    for flag in (*FLAGS[:-1], f"--user-data-dir={tempfile.mkdtemp(dir=tmp_path)}"):
+        options.add_argument(flag)
+    options.add_experimental_option("prefs", {"download.default_directory": str(tmp_path / "saved")})
+    options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "ALL"})
+    chrome = Chrome(options, Service(driver))
+    yield chrome
+    chrome.quit()
+
+
+def model(browser: Any, name: str, code: str) -> Any:
+    """Run JavaScript on the model with a name, ``it``."""
+    return browser.execute_script(f"const it = Bokeh.documents[0].get_model_by_name({name!r}); {code}")
+
+
+def wait(browser: Any, name: str, code: str, timeout_s: float = 60) -> Any:
+    """Wait until a script on a model returns something."""
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        try:
+            if found := model(browser, name, code):
+                return found
+        except Exception as error:  # the page is still loading
+            last = error
+        time.sleep(0.1)
+    raise AssertionError(f"{name}: {code}: {locals().get('last')}")
+
+
+BUTTON = """
+const search = root => {
+  for (const one of root.querySelectorAll("*")) {
+    if (one.tagName === "BUTTON" && one.textContent.trim() === arguments[0]) return one;
+    const found = one.shadowRoot && search(one.shadowRoot);
+    if (found) return found;
+  }
+};
+return search(document);
+"""
+
+
+def press(browser: Any, label: str, key: str = "") -> None:
+    """Press a button by the mouse, or with a key after focusing it."""
+    button = browser.execute_script(BUTTON, label)
+    if key:
+        browser.execute_script("arguments[0].focus()", button)
+        browser.switch_to.active_element.send_keys(key)
+    else:
+        button.click()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1200, 390])
+def test_page_works_in_a_browser_without_network(width: int, address: str, browser: Any, tmp_path: Path) -> None:
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 800}
+    from selenium.webdriver.common.keys import Keys
+
+    grants = {"origin": address.rstrip("/"), "permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]}
+    browser.execute_cdp_cmd("Browser.grantPermissions", grants)
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    browser.get(address)
+    wait(browser, "command", "return it.value.includes('iso12800')")
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+
+    model(browser, "camera", "it.value = 'sony_a7r'")
+    model(browser, "gains.red", "it.value = 2.05")
+    command = wait(browser, "command", "return it.value.includes('gains.red=2.05') && it.value")
+    assert "camera=sony_a7r" in command
+    facts = model(browser, "facts", "return it.text")
+    row = row_of_command(command, "00000000", tmp_path / "made")
+    assert row["noisy_xxh3"] in facts and row["clean_xxh3"] in facts
+
+    model(browser, "sensor.bits", "it.value = 'many'")
+    sentence = wait(browser, "message", "return it.text")
+    assert "sensor.bits=many: expected 1 to 16" in sentence
+
+    model(browser, "sensor.bits", "it.value = '12'")
+    wait(browser, "message", "return it.text === ''")
+    press(browser, "+", Keys.ENTER)
+    wait(browser, "clean", "return Math.abs(it.x_range.end - it.x_range.start - 64) < 1")
+    press(browser, "Copy the command")
+    assert browser.execute_async_script("navigator.clipboard.readText().then(arguments[0])") == model(
+        browser, "command", "return it.value"
+    )
+    press(browser, "Save the pair as NPY")
+    saved = tmp_path / "saved" / "00000000.npy.zip"
+    end = time.monotonic() + 60
+    while not saved.is_file() and time.monotonic() < end:
+        time.sleep(0.1)
+    shutil.unpack_archive(saved, tmp_path / "frames")
+    assert array_xxh3(np.load(tmp_path / "frames" / "00000000.noisy.npy")) == row["noisy_xxh3"]
+    requests = [entry["message"] for entry in browser.get_log("performance") if "requestWillBeSent" in entry["message"]]
+    urls = {url for text in requests for url in re.findall(r'"url":"(https?://[^"]+)"', text)}
+    assert urls and all(url.startswith(address) for url in urls), urls

@@ -1,0 +1,62 @@
+"""Run the verb explore: a page in the browser that shows what settings do."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.hydra_app import check_overrides, option_folders
+from unprocess_gen.cli.messages import print_result
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.libraries import require
+from unprocess_gen.core.paths import any_path
+
+if TYPE_CHECKING:
+    from unprocess_gen.reports.explorer.opening import Choices
+
+REFUSED = ("--multirun", "--cfg", "--resolve", "--package", "--info", "--hydra-help", "--shell-completion", "--run")
+"""Flags of Hydra that make no sense for a page."""
+
+HIGHEST_PORT = 65535
+
+
+def explore(call: Call) -> int:
+    """Serve a page on this machine until it is interrupted, or save one."""
+    for library in ("bokeh", "jinja2"):
+        require(library, f"explore: the page needs {library}", "explore")
+    for flag in REFUSED:
+        if flag in call.hydra:
+            raise ConfigError(f"explore: {flag}: a page shows one config; expected settings; leave it out")
+    port = call.values.get("port", 0)
+    if port > HIGHEST_PORT:
+        raise ConfigError(f"--port {port}: is no port; expected 0 to {HIGHEST_PORT}")
+    check_overrides(call.overrides)
+    from unprocess_gen.reports.explorer import server
+
+    choices = _choices(call)
+    if "save" in call.values:
+        to = Path(call.values["save"])
+        server.save(choices, to)
+        print_result(to)
+        return 0
+    server.serve(choices, port, "no_browser" not in call.values, _started)
+    return 0
+
+
+def _choices(call: Call) -> Choices:
+    from unprocess_gen.reports.explorer.opening import open_place
+
+    place = call.path
+    if place is not None and not any_path(place).is_listed():
+        raise ConfigError(f"explore: {place}: no such file or folder; expected a photograph, a folder or a dataset")
+    if place is not None and place.is_dir() and (place / "sweep.csv").is_file():
+        raise ConfigError(f"explore: {place}: is the folder of a sweep; expected one of its datasets")
+    folders = option_folders(call.hydra)
+    return open_place(place, call.values.get("keys"), call.overrides, call.hydra_arguments, folders)
+
+
+def _started(address: str) -> None:
+    print_result(f"{address} shows the page on this machine; stop with Ctrl-C")
+    sys.stdout.flush()

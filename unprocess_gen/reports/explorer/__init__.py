@@ -1,0 +1,1 @@
+"""Show what settings do to a photograph, in a page of the browser."""

@@ -1,0 +1,96 @@
+"""Describe the controls of the page: each is a group or a key of the settings, as the command line has it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from bokeh.models import InputWidget, Select, Slider, TextInput
+
+from unprocess_gen.config.limits import Choice
+from unprocess_gen.config.option_files import conf_dir, group_options, option_summary
+from unprocess_gen.config.recomposition import override_text
+from unprocess_gen.config.schema import all_settings
+from unprocess_gen.config.settings import Setting
+from unprocess_gen.core.types import Plan
+from unprocess_gen.simulation.effects import EFFECTS
+
+SECTIONS = {
+    "Camera": ("body", "camera", "camera.weights"),
+    "Gains and highlights": (
+        *("gains", "gains.light", "gains.red", "gains.blue", "gains.inverse_rgb"),
+        *("gains.highlight", "gains.threshold"),
+    ),
+    "Tone curve": ("isp", "isp.tone", "isp.gamma"),
+    "Sensor": ("sensor", "sensor.bits", "sensor.black_level_dn", "sensor.white_level_dn", "sensor.pattern"),
+    "Scene": ("scene", "scene.iso", "scene.exposure_s", "scene.temperature_c", "scene.exposure_ratio"),
+    "Noise": ("noise", "noise.a", "noise.b", "noise.iso", "accuracy", "seed"),
+    "Effects": (
+        *("effects.all", "effects.tolerance"),
+        *(f"effects.{effect.name}" for effect in EFFECTS if effect.has_switch),
+    ),
+}
+"""Groups and keys by the title of their section."""
+
+WEIGHTS = ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
+
+
+class Range(NamedTuple):
+    """The ends and the step of a slider."""
+
+    start: float
+    end: float
+    step: float
+
+
+SLIDERS = {
+    "gains.red": Range(0.5, 4, 0.01),
+    "gains.blue": Range(0.5, 4, 0.01),
+    "gains.inverse_rgb": Range(0.3, 2.2, 0.01),
+    "gains.threshold": Range(0, 0.99, 0.01),
+    **{f"camera.weights.{name}": Range(0, 1, 0.01) for name in WEIGHTS},
+}
+"""Sliders by key; those of the weights have a slider for each camera."""
+
+NONE = "(none)"
+DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}
+"""Keys of which sliders show the value in the plan, which may be drawn."""
+
+SETTINGS: dict[str, Setting] = {f"{group}.{name}".lstrip("."): setting for group, name, setting in all_settings()}
+
+
+def names_of(section: str) -> list[str]:
+    """Return the names of the controls of a section."""
+    weights = [f"camera.weights.{name}" for name in WEIGHTS]
+    return [name for key in SECTIONS[section] for name in (weights if key == "camera.weights" else [key])]
+
+
+def widget(name: str, folders: list[Any]) -> InputWidget:
+    """Return the control of a group or key, without a value."""
+    if name in SLIDERS:
+        place = SLIDERS[name]
+        return Slider(title=name, start=place.start, end=place.end, step=place.step, value=place.start)
+    setting = SETTINGS.get(name)
+    if setting is None:
+        options = group_options(name, conf_dir(), *folders)
+        summary = "; ".join(f"{one}: {option_summary(name, one)}" for one in group_options(name))
+        return Select(title=name, options=[*([NONE] if name == "body" else []), *options], description=summary or None)
+    meaning = f"{setting.meaning}{f', in {setting.unit}' if setting.unit else ''}. Allowed: {setting.allowed}"
+    if isinstance(setting.limit, Choice):
+        words = [*(["null"] if setting.null else []), *setting.limit.words]
+        return Select(title=name, options=words, description=meaning)
+    return TextInput(title=name, description=meaning)
+
+
+def shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], config: Any, plan: Plan) -> Any:
+    """Return the value of a control: an option, the number in the plan, or the text of a setting."""
+    if name in DRAWN:
+        return float(getattr(plan.camera, DRAWN[name]))
+    if name.startswith("camera.weights."):
+        return plan.camera.weights[WEIGHTS.index(name.rpartition(".")[2])]
+    group, _, key = name.rpartition(".")
+    if name not in SETTINGS:
+        return choices.get(name) or NONE
+    if name in settings and name not in SLIDERS:
+        return settings[name].strip("'\"")
+    value = getattr(getattr(config, group) if group else config, key)
+    return float(value) if name in SLIDERS else override_text(value).strip("'")

@@ -1,0 +1,184 @@
+"""Hold the settings of a page, make their pair with the functions that make datasets, and write their command."""
+
+from __future__ import annotations
+
+import functools
+import io
+import shlex
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.config.recomposition import Recomposition
+from unprocess_gen.config.schema import Config, SourceConfig
+from unprocess_gen.config.values import refusal
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.libraries import require
+from unprocess_gen.core.types import PACKED, DarkPixels, Pair, Patch, Photograph, Plan, Row, Source, Srgb
+from unprocess_gen.dataset import dng
+from unprocess_gen.dataset.keys import pair_key, patch_key
+from unprocess_gen.dataset.manifest import pair_row, row_json
+from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
+from unprocess_gen.planning.mixture import image_config
+from unprocess_gen.planning.plan import plan_levels
+from unprocess_gen.reports.empty_bands import empty_bands
+from unprocess_gen.reports.estimate import SourceEstimate
+from unprocess_gen.reports.plan_text import noise_lines
+from unprocess_gen.reports.sheets.panels import Mosaic
+from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.simulation.reference.cfa import unpack
+from unprocess_gen.sources.loader import list_photographs, load_source
+from unprocess_gen.sources.patches import crop_patch
+
+OUT = "pair"
+"""Folder of the dataset that the command of a page makes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The pair of the settings, and what they follow from.
+
+    ``srgb`` are the pixels of its patch, ``clean`` and ``noisy`` its frames as mosaics in DN, ``saturated`` marks
+    sites of the clean one, ``keys`` those of all
+    pairs of the image, ``lines`` what ``plan`` says about the noise.
+    """
+
+    config: Config
+    srgb: Srgb
+    plan: Plan
+    patch: Patch
+    pair: Pair
+    clean: Mosaic
+    noisy: Mosaic
+    saturated: NDArray[np.bool_]
+    row: Row
+    keys: tuple[str, ...]
+    lines: tuple[str, ...]
+    dark_pixels: DarkPixels | None = None
+
+    def archive(self, form: str) -> bytes:
+        """Return a ZIP file of both frames as ``npy`` or ``dng``, with the row.
+
+        ConfigError if a frame cannot be a DNG, or tifffile is missing.
+        """
+        if form == "dng":
+            require("tifffile", "dng: tifffile is missing", "dng")
+        content, key = io.BytesIO(), self.row["key"]
+        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, frame in (("clean", self.pair.clean), ("noisy", self.pair.noisy)):
+                file = io.BytesIO(dng.encode(frame, self.row, name) if form == "dng" else b"")
+                if form == "npy":
+                    np.save(file, frame)
+                archive.writestr(f"{key}.{name}.{form}", file.getvalue())
+            archive.writestr(f"{key}.json", row_json([self.row]))
+        return content.getvalue()
+
+
+@dataclass
+class Exploration:
+    """The settings of a page, by key as texts, and which pair of them is shown.
+
+    ``others`` are overrides that add something (``+experiment=…``), ``flags`` those of Hydra, ``index`` the number of
+    the source in the listing, ``part`` what follows it in the key of the pair, ``digests`` those that a row records.
+    """
+
+    composition: Recomposition
+    settings: dict[str, str] = field(default_factory=dict)
+    others: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()
+    index: int = 0
+    part: str = ""
+    digests: tuple[str, str] | None = None
+
+    @property
+    def overrides(self) -> list[str]:
+        """The settings as a command line has them."""
+        return [*self.others, *(f"{key}={text}" for key, text in self.settings.items())]
+
+    @property
+    def command(self) -> str:
+        """The command that generates the pair, with the other pairs of its sources."""
+        out = [] if "out" in self.settings else [f"out={OUT}"]
+        return shlex.join(["gen-dataset", *self.flags, *self.overrides, *out])
+
+    def add(self, overrides: Sequence[str]) -> None:
+        """Apply overrides as the command line does."""
+        for override in overrides:
+            key, _, text = override.partition("=")
+            if key.startswith(("+", "~")) or not text:
+                self.others += (override,)
+            else:
+                self.settings.pop(key, None)
+                self.settings[key] = text
+
+    def choose(self, group: str, option: str | None) -> None:
+        """Choose an option of a group, None for none, and forget settings that it replaces."""
+        replaced_groups = (group, "camera", "sensor", "noise") if group == "body" else (group,)
+        self.settings = {
+            key: text for key, text in self.settings.items() if key.partition(".")[0] not in replaced_groups
+        }
+        self.settings[group] = "null" if option is None else option
+
+    def shown(self) -> Shown:
+        """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
+        config = self.composition.config(self.overrides)
+        if config.source.kind != "srgb":
+            raise refusal("source.kind", config.source.kind, "the page shows photographs; expected srgb; leave it out")
+        source = _sources(config.source)[self.index]
+        sha256, photograph = _loaded(config.source, source, config.output.layout)
+        settings = PairSettings.read(config)
+        image = plan_pixels(settings, photograph, source, sha256)
+        is_cut, several = config.source.patch is not None, len(image.plans) > 1
+        parts = {
+            pair_key(patch_key(source.index, patch, is_cut), plan, several): (patch, plan)
+            for patch in image.patches
+            for plan in image.plans
+        }
+        key = f"{source.index:08d}{self.part}"
+        key = key if key in parts else next(iter(parts))
+        patch, plan = parts[key]
+        self_test.check(self_test.kernels(plan))
+        srgb = crop_patch(image.srgb, patch)
+        pair = next(make_pairs(srgb, [plan], patch.origin, image.dark_folder))
+        digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
+        row = pair_row(key, source, sha256, photograph.orientation, 0, plan, pair, digests, patch)
+        frames = mosaic_dn(pair.clean, row), mosaic_dn(pair.noisy, row)
+        saturated = pair.clean == plan.saturated_value
+        if plan.output.layout == PACKED:
+            saturated = unpack(saturated, plan.sensor.pattern)
+        lines = tuple(_lines(settings, source.stream_identity(sha256), source, image, plan, pair))
+        keys = tuple(parts)
+        return Shown(config, srgb, plan, patch, pair, *frames, saturated, row, keys, lines, image.dark_folder)
+
+
+def _lines(
+    settings: PairSettings, identity: tuple[str, int], source: Source, image: PlannedImage, plan: Plan, pair: Pair
+) -> list[str]:
+    """Return what ``plan`` says about the scene and the noise of a pair."""
+    config = image_config(settings.config, *identity)
+    levels = plan_levels(config, *identity, image.facts, settings.dark_frames)
+    is_rounded = pair.clean.dtype == np.uint16
+    estimate = SourceEstimate(
+        source,
+        0.0,
+        levels=(plan,),
+        predictions=(levels[plan.noise.level][1],),
+        clean_levels=int(np.count_nonzero(np.bincount(pair.clean.ravel()))) if is_rounded else 0,
+        bands=empty_bands(image.srgb, plan),
+    )
+    return noise_lines(config, [estimate], settings.dark_frames)
+
+
+@functools.lru_cache(maxsize=4)
+def _sources(config: SourceConfig) -> tuple[Source, ...]:
+    return list_photographs(config).sources
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(config: SourceConfig, source: Source, layout: str) -> tuple[str, Photograph]:
+    return load_source(config, source, layout)

@@ -1,0 +1,455 @@
+"""Draw the page with Bokeh: controls, pictures with linked zoom, curves, and what ``plan`` says.
+
+A page on a server recomputes its pair when a control changes; a saved page shows one state. Both have the template
+``explorer.html`` and need no network: the scripts are those of the installed Bokeh.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from bokeh.core.templates import get_env
+from bokeh.document import Document
+from bokeh.embed import file_html
+from bokeh.models import (
+    Button,
+    ColumnDataSource,
+    CustomJS,
+    Div,
+    HoverTool,
+    PanTool,
+    Range1d,
+    ResetTool,
+    Select,
+    TextInput,
+    WheelZoomTool,
+)
+from bokeh.plotting import figure
+from bokeh.resources import INLINE
+
+from unprocess_gen.core.errors import UnprocessGenError
+from unprocess_gen.reports.explorer import views
+from unprocess_gen.reports.explorer.controls import NONE, SECTIONS, SETTINGS, WEIGHTS, names_of, shown_value, widget
+from unprocess_gen.reports.explorer.exploration import Exploration, Shown
+from unprocess_gen.reports.explorer.opening import Choices
+from unprocess_gen.reports.html_pages import visible
+
+TEMPLATES = Path(__file__).parents[1] / "templates"
+COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0072b2", "noisy": "#d55e00"}
+SMALLEST_PX = 8
+"""Fewest sites of a side of the window."""
+STRETCHES = ("common stretch", "own stretch")
+SAVED_PX = (240, 320)
+"""Most rows and columns of a picture in a saved page, of which each pixel takes 50 bytes."""
+
+TEXTS = """
+pre { margin: 0; font-size: 12px; overflow-x: auto; }
+pre.command { white-space: pre-wrap; }
+dl { display: grid; grid-template-columns: minmax(7rem, max-content) 1fr; gap: .1rem .8rem; margin: 0;
+  overflow-wrap: anywhere; }
+dt { font-weight: 600; }
+dd { margin: 0; }
+[role=alert] { background: #fdecea; color: #7a1c12; border-left: 4px solid #c0392b; padding: .5rem .8rem; }
+"""
+"""Style of texts, which Bokeh draws in shadow trees of their own."""
+
+WAIT_MS = 20
+"""Time in which changes are collected before the pair is computed."""
+
+
+class Page:
+    """The models of one page, and the state that they show."""
+
+    def __init__(self, choices: Choices, label: str, saved: bool = False) -> None:
+        self._choices, self._most = choices, SAVED_PX if saved else views.VIEW_PX
+        self._state: Exploration = choices[label]()
+        self._shown: Shown | None = None
+        self._document: Document | None = None
+        self._syncing, self._waiting = False, set[str]()
+        self._pixels = ColumnDataSource()
+        self._x, self._y = Range1d(0, 1), Range1d(1, 0)
+        self._message, self._facts, self._plan = Div(name="message"), Div(name="facts"), Div(name="plan")
+        for div in (self._message, self._facts, self._plan):
+            div.update(sizing_mode="stretch_width", stylesheets=[TEXTS])
+        self._pictures = {name: self._picture(name) for name in views.PICTURES}
+        self._curves = {
+            "source_histogram": _curve("Histogram of the source", "code", "share of the pixels"),
+            "raw_histogram": _curve("Histogram of the raw frames", "DN", "share of the sites", y_axis_type="log"),
+            "highlight": _curve("Highlight function (Figure 4)", "intensity i of grey light", "f(i)"),
+            "transfer": _curve("Photon transfer", "signal above black, DN", "variance of the noise, DN²"),
+        }
+        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in self._curves}
+        self._points = ColumnDataSource({"x": [], "y": []})
+        self._draw_curves()
+        self._command = TextInput(name="command", value="", sizing_mode="stretch_width", title="Command of this pair")
+        self._stretch = Select(name="stretch", title="raw and developed", options=list(STRETCHES), value=STRETCHES[0])
+        self._open = Select(name="open", title="photograph or row", options=list(choices), value=label)
+        self._part = Select(name="part", title="pair of the image", options=[])
+        self._other = TextInput(
+            name="other", title="other settings", placeholder="source.downscale=2 output.dtype=float32"
+        )
+        self._file = ColumnDataSource({"name": [], "content": []}, name="file")
+        self._widgets: dict[str, Any] = {}
+
+    # -------------------------------------------------------------------------------------------------------- figures
+
+    def _picture(self, name: str) -> Any:
+        drawn = figure(
+            name=name,
+            width=300,
+            height=200,
+            sizing_mode="scale_width",
+            x_range=self._x,
+            y_range=self._y,
+            min_border=0,
+            outline_line_color=None,
+            toolbar_location=None,
+            tools=[PanTool(), ResetTool()],
+        )
+        drawn.axis.visible = drawn.grid.visible = False
+        wheel = WheelZoomTool()
+        drawn.add_tools(wheel)
+        drawn.toolbar.active_scroll = wheel
+        place = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
+        renderer = drawn.image_rgba(image=name, source=self._pixels, **place)
+        tips = [
+            ("site", "column $x{0}, row $y{0}"),
+            ("source", "@r, @g, @b"),
+            ("clean", "@clean_dn{0.[0]} DN"),
+            ("noisy", "@noisy_dn{0.[0]} DN"),
+            ("values", "@note"),
+        ]
+        drawn.add_tools(HoverTool(renderers=[renderer], tooltips=tips, point_policy="follow_mouse"))
+        return drawn
+
+    def _draw_curves(self) -> None:
+        for name, curve in self._curves.items():
+            curve.multi_line("xs", "ys", source=self._lines[name], color="colour", line_width=1.5, legend_field="label")
+            place = "top_right" if "histogram" in name else "top_left"
+            curve.legend.update(location=place, background_fill_alpha=0.6, label_text_font_size="9pt", padding=3)
+            curve.legend.update(spacing=0, margin=3)
+        self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=COLOURS["clean"])
+
+    # ---------------------------------------------------------------------------------------------------------- state
+
+    def refresh(self) -> bool:
+        """Compute the pair and draw everything; show the sentence of an error, and return whether there is none."""
+        try:
+            shown = self._state.shown()
+        except UnprocessGenError as error:
+            self._say(str(error), is_error=True)
+            return False
+        is_new = self._shown is None or shown.clean.shape != self._shown.clean.shape
+        self._shown = shown
+        if is_new:
+            height, width = shown.clean.shape
+            for drawn in self._pictures.values():
+                drawn.aspect_ratio = width / height
+            self._go(views.whole(shown.clean.shape))
+        self._draw_view()
+        self._draw_statistics()
+        self._command.value = self._state.command
+        found = str(shown.row["clean_xxh3"]), str(shown.row["noisy_xxh3"])
+        differs = self._state.digests not in (None, found)
+        self._say("the pair differs from its row: its source or the settings have changed" if differs else "", differs)
+        return True
+
+    def _window(self) -> tuple[slice, slice]:
+        """The sites in view, from even rows and columns."""
+        assert self._shown is not None
+        ends = sorted((self._y.start, self._y.end)), sorted((self._x.start, self._x.end))
+        parts = []
+        for (low, high), length in zip(ends, self._shown.clean.shape, strict=True):
+            start = max(0, min(int(low), length - SMALLEST_PX)) // 2 * 2
+            parts.append(slice(start, max(start + 1, min(length, int(high) + 2))))
+        return parts[0], parts[1]
+
+    def _draw_view(self) -> None:
+        assert self._shown is not None
+        window = self._window()
+        columns = views.view(self._shown, window, self._stretch.value == STRETCHES[0], self._most)
+        side, (height, width) = views.block_side(window, self._most), columns["clean"].shape
+        self._pixels.data = {
+            **{name: [array] for name, array in columns.items()},
+            "x": [window[1].start],
+            "y": [window[0].start],
+            "dw": [width * side],
+            "dh": [height * side],
+            "note": ["of this site" if side == 1 else f"means of {side} × {side} sites; zoom in for single sites"],
+        }
+
+    def _draw_statistics(self) -> None:
+        shown = self._shown
+        assert shown is not None
+        transfer = views.photon_transfer(shown)
+        curves = {
+            "source_histogram": views.source_histogram(shown),
+            "raw_histogram": views.raw_histogram(shown),
+            "highlight": views.highlight_curves(shown),
+            "transfer": {"expected": transfer.line},
+        }
+        for name, lines in curves.items():
+            colours = [COLOURS.get(label.partition(",")[0], COLOURS["noisy"]) for label in lines]
+            xs, ys = ([list(line[axis]) for line in lines.values()] for axis in (0, 1))
+            if name == "raw_histogram":
+                ys = [[share or None for share in line] for line in ys]
+            self._lines[name].data = {"xs": xs, "ys": ys, "label": list(lines), "colour": colours}
+        self._points.data = {"x": transfer.points[0], "y": transfer.points[1]}
+        self._facts.text = _facts(shown, transfer.text)
+        self._plan.text = f"<pre>{_text(chr(10).join(shown.lines))}</pre>"
+
+    def _say(self, sentence: str, is_error: bool) -> None:
+        self._message.text = f"<div role='alert'>{_text(sentence)}</div>" if is_error else ""
+
+    # -------------------------------------------------------------------------------------------------------- controls
+
+    def _go(self, window: tuple[slice, slice]) -> None:
+        self._x.update(start=window[1].start, end=window[1].stop)
+        self._y.update(start=window[0].stop, end=window[0].start)
+
+    def _move(self, zoom: float, right: float, down: float) -> None:
+        """Zoom around the centre, or move by a share of the window; a zoom of 0 shows the complete frame."""
+        assert self._shown is not None
+        height, width = self._shown.clean.shape
+        if not zoom:
+            self._go(views.whole((height, width)))
+            return
+        x, y = (self._x.start + self._x.end) / 2, (self._y.start + self._y.end) / 2
+        half = max(abs(self._x.end - self._x.start) / zoom, SMALLEST_PX) / 2
+        tall = half * height / width
+        x, y = x + right * half, y + down * tall
+        self._x.update(start=x - half, end=x + half)
+        self._y.update(start=y + tall, end=y - tall)
+
+    def document(self, document: Document) -> None:
+        """Fill a document of the server."""
+        self._document = document
+        document.title, document.template = "unprocess_gen explorer", _template()
+        roots = [self._message, self._facts, self._plan, *self._pictures.values(), *self._curves.values()]
+        self._widgets = {
+            name: widget(name, self._state.composition.own_folders)
+            for section in SECTIONS
+            for name in names_of(section)
+        }
+        for name, control in self._widgets.items():
+            control.update(name=name, sizing_mode="stretch_width")
+            control.on_change("value", partial(self._changed, name))
+        buttons = self._buttons()
+        inputs = [self._open, self._part, self._other, self._stretch]
+        for control in inputs:
+            control.sizing_mode = "stretch_width"
+        self._open.on_change("value", self._opened)
+        self._part.on_change("value", self._chosen_part)
+        self._other.on_change("value", self._typed)
+        self._stretch.on_change("value", lambda attr, old, new: self._draw_view())
+        for end in (self._x, self._y):
+            for side in ("start", "end"):
+                end.on_change(side, lambda attr, old, new: self._later(self._draw_view, "view"))
+        for model in (*roots, *self._widgets.values(), *buttons, *inputs, self._command):
+            document.add_root(model)
+        document.template_variables.update(_variables(live=True))
+        if self.refresh():
+            self._sync()
+
+    def _buttons(self) -> list[Button]:
+        copy = Button(label="Copy the command", name="copy", button_type="primary")
+        copy.js_on_click(
+            CustomJS(args={"text": self._command, "file": self._file}, code="navigator.clipboard.writeText(text.value)")
+        )
+        found = [copy]
+        for form in ("npy", "dng"):
+            save = Button(label=f"Save the pair as {form.upper()}", name=f"save_{form}")
+            save.on_click(partial(self._save, form))
+            found.append(save)
+        self._file.js_on_change("data", CustomJS(args={"file": self._file}, code=SAVE))
+        moves = {
+            "+": (2, 0, 0), "−": (0.5, 0, 0), "←": (1, -0.5, 0), "→": (1, 0.5, 0),
+            "↑": (1, 0, -0.5), "↓": (1, 0, 0.5), "all": (0, 0, 0),
+        }  # fmt: skip
+        for number, (label, move) in enumerate(moves.items()):
+            button = Button(label=label, name=f"move_{number}", width=48)
+            button.on_click(lambda move=move: self._move(*move))
+            found.append(button)
+        return found
+
+    def _later(self, task: Callable[[], Any], name: str) -> None:
+        """Run a task once after the changes that have arrived."""
+        if name in self._waiting or self._document is None:
+            return
+        self._waiting.add(name)
+
+        def run() -> None:
+            self._waiting.remove(name)
+            task()
+
+        self._document.add_timeout_callback(run, WAIT_MS)
+
+    def _update(self) -> None:
+        if self.refresh():
+            self._sync()
+
+    def _changed(self, name: str, attr: str, old: Any, new: Any) -> None:
+        if self._syncing:
+            return
+        if name.startswith("camera.weights."):
+            values = [f"{self._widgets[f'camera.weights.{one}'].value:.6g}" for one in WEIGHTS]
+            self._state.settings["camera.weights"] = f"[{','.join(values)}]"
+        elif name not in SETTINGS:
+            self._state.choose(name, None if new == NONE else new)
+        elif name.startswith("effects.") and new == "null":
+            self._state.settings.pop(name, None)
+        else:
+            self._state.settings[name] = f"{new:.6g}" if isinstance(new, float | int) else new.strip() or "null"
+        self._later(self._update, "pair")
+
+    def _opened(self, attr: str, old: Any, new: str) -> None:
+        try:
+            self._state = self._choices[new]()
+        except UnprocessGenError as error:
+            self._say(str(error), is_error=True)
+            return
+        self._shown = None
+        self._later(self._update, "pair")
+
+    def _chosen_part(self, attr: str, old: Any, new: str) -> None:
+        if not self._syncing and "-" in new:
+            self._state.part = new[new.index("-") :]
+            self._later(self._update, "pair")
+
+    def _typed(self, attr: str, old: Any, new: str) -> None:
+        if not self._syncing:
+            self._state.add(new.split())
+            self._later(self._update, "pair")
+
+    def _sync(self) -> None:
+        """Set the controls to the values of the pair."""
+        assert self._shown is not None
+        self._syncing = True
+        with _held(self._document):
+            choices, shown = self._state.composition.choices, self._shown
+            for name, control in self._widgets.items():
+                value = shown_value(name, self._state.settings, choices, shown.config, shown.plan)
+                if isinstance(control, Select) and value not in control.options:
+                    control.options = [*control.options, value]
+                if isinstance(value, float) and not control.start <= value <= control.end:
+                    control.update(start=min(value, control.start), end=max(value, control.end))
+                control.value = value
+                control.disabled = name.startswith("camera.weights.") and shown.config.camera.law != "convex"
+            self._part.update(options=list(shown.keys), value=str(shown.row["key"]), disabled=len(shown.keys) == 1)
+        self._syncing = False
+
+    def _save(self, form: str) -> None:
+        if self._shown is None:
+            return
+        try:
+            content = self._shown.archive(form)
+        except UnprocessGenError as error:
+            self._say(str(error), is_error=True)
+            return
+        name = f"{self._shown.row['key']}.{form}.zip"
+        self._file.data = {"name": [name], "content": [base64.b64encode(content).decode()]}
+
+    def html(self) -> str:
+        """Return a page of the state, without controls; the error of the settings is raised."""
+        self._shown = None
+        if not self.refresh():
+            self._state.shown()
+        command = Div(name="command", text=f"<pre class='command'>{_text(self._state.command)}</pre>")
+        command.update(sizing_mode="stretch_width", stylesheets=[TEXTS])
+        models = [self._facts, self._plan, command, *self._pictures.values(), *self._curves.values()]
+        title = f"{self._shown.row['source']} as raw frames" if self._shown else ""
+        variables = _variables(live=False)
+        return str(file_html(models, INLINE, title=title, template=_template(), template_variables=variables))
+
+
+SAVE = """
+if (file.data.name.length) {
+  const bytes = Uint8Array.from(atob(file.data.content[0]), letter => letter.charCodeAt(0));
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([bytes], {type: "application/zip"}));
+  link.download = file.data.name[0];
+  link.click();
+}
+"""
+
+
+@contextmanager
+def _held(document: Document | None) -> Iterator[None]:
+    """Send all changes of models in one message."""
+    if document is not None:
+        document.hold("combine")
+    yield
+    if document is not None:
+        document.unhold()
+
+
+def _text(text: str) -> str:
+    return html.escape(str(visible(text)))
+
+
+def _curve(title: str, x: str, y: str, **options: Any) -> Any:
+    drawn = figure(
+        title=title,
+        width=420,
+        height=260,
+        sizing_mode="stretch_width",
+        tools="pan,wheel_zoom,box_zoom,reset",
+        **options,
+    )
+    drawn.xaxis.axis_label, drawn.yaxis.axis_label = x, y
+    drawn.toolbar.logo, drawn.toolbar.autohide = None, True
+    drawn.name = title
+    return drawn
+
+
+def _facts(shown: Shown, transfer: str) -> str:
+    """Numbers of the pair as an HTML list."""
+    row, sites = shown.row, shown.clean.size
+    shares = {
+        name: f"{int(row[column] or 0) / sites:.3%}"
+        for name, column in {
+            "saturated in the clean frame": "saturated",
+            "clean below black": "clean_clipped_low",
+            "clean above white": "clean_clipped_high",
+            "noisy clipped at 0": "noisy_clipped_low",
+            "noisy clipped at the top": "noisy_clipped_high",
+        }.items()
+    }
+    camera = shown.plan.camera
+    facts = {
+        "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
+        **shares,
+        "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
+        "noise of the pair": transfer,
+        "effects": ", ".join(shown.plan.noise.effects),
+        "XXH3": f"clean {row['clean_xxh3']}, noisy {row['noisy_xxh3']}",
+    }
+    lines = "".join(f"<dt>{name}</dt><dd>{_text(text)}</dd>" for name, text in facts.items())
+    return f"<dl>{lines}</dl>"
+
+
+def _template() -> Any:
+    return get_env().from_string((TEMPLATES / "explorer.html").read_text(encoding="utf-8"))
+
+
+def _variables(live: bool) -> dict[str, Any]:
+    """Values of the template."""
+    return {
+        "live": live,
+        "style": (TEMPLATES / "style.css").read_text(encoding="utf-8"),
+        "sections": {section: names_of(section) for section in SECTIONS},
+        "pictures": views.PICTURES,
+        "curves": [
+            "Histogram of the source",
+            "Histogram of the raw frames",
+            "Highlight function (Figure 4)",
+            "Photon transfer",
+        ],
+        "moves": [f"move_{number}" for number in range(7)],
+    }

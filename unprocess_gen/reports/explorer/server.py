@@ -1,0 +1,70 @@
+"""Serve the page on this machine, or save it as a file."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.output_paths import check_output_file
+from unprocess_gen.reports.explorer.opening import Choices
+from unprocess_gen.reports.report_files import write_files
+
+HOST = "127.0.0.1"
+
+
+def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], None]) -> None:
+    """Serve a page to browsers of this machine until a signal arrives; ``started`` receives its address.
+
+    The server has a thread of its own, because an event loop drops exceptions that a signal raises in its callbacks.
+    ConfigError if the port is taken. Port 0 is any free one.
+    """
+    from bokeh.server.util import bind_sockets
+
+    try:
+        sockets, port = bind_sockets(HOST, port)
+    except OSError as error:
+        problem = f"cannot be used ({error.strerror}); expected a free port; choose another, or leave --port out"
+        raise ConfigError(f"--port {port}: {problem}") from None
+    for socket in sockets:
+        socket.close()
+    ready = threading.Event()
+    thread = threading.Thread(target=_run, args=(choices, port, ready), daemon=True)
+    thread.start()
+    while thread.is_alive() and not ready.wait(0.1):
+        pass
+    if thread.is_alive():
+        address = f"http://{HOST}:{port}/"
+        started(address)
+        if shows:
+            webbrowser.open(address)
+        thread.join()
+
+
+def _run(choices: Choices, port: int, ready: threading.Event) -> None:
+    from bokeh.application import Application
+    from bokeh.application.handlers.function import FunctionHandler
+    from bokeh.server.server import Server
+
+    from unprocess_gen.reports.explorer.page import Page
+
+    asyncio.set_event_loop(asyncio.new_event_loop())
+    label = next(iter(choices))
+    application = Application(FunctionHandler(lambda document: Page(choices, label).document(document)))
+    origins = [f"{name}:{port}" for name in (HOST, "localhost")]  # no other name that leads to this machine
+    server = Server({"/": application}, port=port, address=HOST, allow_websocket_origin=origins)
+    server.start()
+    ready.set()
+    server.io_loop.start()
+
+
+def save(choices: Choices, to: Path) -> None:
+    """Write a page of the first choice to a file, which may replace an HTML page."""
+    from unprocess_gen.reports.explorer.page import Page
+
+    check_output_file(to, f"--save {to}", "an HTML page", b"<!doctype html", b"<html")
+    content = Page(choices, next(iter(choices)), saved=True).html()
+    write_files(to.parent, {to.name: content.encode()})
