@@ -19,7 +19,8 @@ ALIAS_BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 )
 
 REFUSED = {
-    "200,000 brackets": ("a: " + "[" * 200_000, "line 1: nested more than 32 levels"),
+    "100 brackets": ("a: " + "[" * 100, "line 1: nested more than 32 levels"),
+    "200,000 brackets": ("a: " + "[" * 200_000, "line 1: (nested more than 32 levels|exceeded maximum nesting depth)"),
     "200,000 dashes": ("- " * 200_000, "line 1: nested more than 32 levels"),
     "deep indentation": ("".join(" " * depth + "a:\n" for depth in range(1000)), "nested more than 32 levels"),
     "alias bomb": (ALIAS_BOMB, "line 5: more than 32 aliases"),
