@@ -1,7 +1,8 @@
 """Generate clean and noisy raw pairs from sRGB photographs.
 
-``load_config`` composes a config, ``make_pair`` makes a pair from an array, ``generate`` a dataset from files, and
-``RawPairs`` reads datasets, and ``LivePairs`` makes pairs while a training runs. The command line is ``gen-dataset``.
+``load_config`` composes a config, ``make_pair`` makes a pair from an array, ``generate`` a dataset from files,
+``RawPairs`` reads datasets, ``LivePairs`` makes pairs while a training runs, and ``CameraNoise`` adds noise to sRGB
+pictures. The command line is ``gen-dataset``.
 
 Names are imported on first access. ``RawPairs`` needs only NumPy and xxhash.
 """
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from unprocess_gen.api import RawPair, develop, generate, make_pair, plan_image, replay, verify
+    from unprocess_gen.camera_noise import CameraNoise
     from unprocess_gen.config.composition import load_config
     from unprocess_gen.config.schema import Config
     from unprocess_gen.core.errors import (
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 __all__ = [
+    "CameraNoise",
     "Clip",
     "Config",
     "ConfigError",
@@ -67,6 +70,7 @@ __all__ = [
 
 _MODULES = {
     "api": ("RawPair", "develop", "generate", "make_pair", "plan_image", "replay", "verify"),
+    "camera_noise": ("CameraNoise",),
     "config.composition": ("load_config",),
     "config.schema": ("Config",),
     "core.errors": (

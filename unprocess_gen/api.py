@@ -140,7 +140,7 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     >>> darker.row["red_gain"] == plan.camera.red_gain
     True
     """
-    pixels = _pixels_of(srgb)
+    pixels = array_pixels(srgb)
     return _planned(pixels, _identity(pixels, key), config, seed).plans[0]
 
 
@@ -190,7 +190,7 @@ def make_pair(
     >>> pair.row["black_level_dn"], pair.row["white_level_dn"]
     (240, 4095)
     """
-    pixels = _pixels_of(srgb)
+    pixels = array_pixels(srgb)
     identity = _identity(pixels, key)
     if not isinstance(config, Plan):
         image = _planned(pixels, identity, config, seed)
@@ -204,7 +204,7 @@ def make_pair(
     if isinstance(config, Plan) or config.self_test == "stop":
         self_test.check(self_test.kernels(image.plans[0]))
     patch, plan, pair = next(dataclasses.replace(image, plans=image.plans[:1]).pairs())
-    return RawPair(pair, plan, _array_source(pixels, identity), patch)
+    return RawPair(pair, plan, array_source(pixels, identity), patch)
 
 
 def generate(config: Config) -> _generate.Summary:
@@ -402,7 +402,8 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
     return isp.to_codes(isp.develop(mosaic_dn(raw, recorded), plan)).astype(np.uint8)
 
 
-def _pixels_of(srgb: ArrayLike) -> Srgb:
+def array_pixels(srgb: ArrayLike) -> Srgb:
+    """Return the pixels of an array in native byte order; ValueError for another dtype or shape, or no pixel."""
     pixels = np.asarray(srgb)
     if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"srgb is {pixels.dtype} {list(pixels.shape)}, expected uint8 or uint16 [H, W, 3]")
@@ -412,7 +413,15 @@ def _pixels_of(srgb: ArrayLike) -> Srgb:
 
 
 def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> PlannedImage:
-    """Plan the pairs of an array; ConfigError if there are several."""
+    """Plan the pair of an array."""
+    settings = array_settings(config, seed)
+    recorded = _downscaled(pixels, config.source.downscale)
+    _full_frame(recorded, config.output.layout)
+    return plan_pixels(settings, Photograph(recorded, 1), array_source(pixels, identity), identity)
+
+
+def array_settings(config: Config, seed: int | None = None) -> PairSettings:
+    """Return the settings of pairs of arrays; ConfigError if an array would have several pairs."""
     settings = PairSettings.read(_config_for_arrays(config, seed))
     for key, pairs in (("levels", len(noise_levels(config.noise))), ("draws", config.noise.draws)):
         if pairs > 1:
@@ -420,19 +429,21 @@ def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> P
             raise refusal(
                 f"noise.{key}", getattr(config.noise, key), f"{pairs} pairs of an image; expected one; {advice}"
             )
-    recorded = _downscaled(pixels, config.source.downscale)
-    _full_frame(recorded, config.output.layout)
-    return plan_pixels(settings, Photograph(recorded, 1), _array_source(pixels, identity), identity)
+    return settings
 
 
-def _array_source(pixels: Srgb, identity: str) -> Source:
+def array_source(pixels: Srgb, identity: str) -> Source:
+    """Return the source of an array: its size, and the digest that identifies it."""
     return Source(0, ARRAY_NAME, ARRAY_NAME, pixels.nbytes, sha256=identity)
 
 
 def _identity(pixels: Srgb, key: str | int | None) -> str:
-    """Return the digest of the pixels, or of a key that is not a digest itself."""
-    if key is None:
-        return array_identity(pixels)
+    """Return the digest of the pixels, or of a key."""
+    return array_identity(pixels) if key is None else key_identity(key)
+
+
+def key_identity(key: str | int) -> str:
+    """Return the digest of a key that is not a digest itself."""
     text = str(key)
     is_digest = len(text) == 64 and set(text) <= set("0123456789abcdef")
     return text if is_digest else hashlib.sha256(text.encode()).hexdigest()

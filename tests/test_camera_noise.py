@@ -1,0 +1,178 @@
+"""Camera noise of sRGB pictures: the pair of a picture, developed."""
+
+from __future__ import annotations
+
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+import unprocess_gen as ug
+from unprocess_gen.simulation.pair import make_pair
+
+CAMERAS = ("sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p")
+CELL = 6
+
+
+def cells(colours: np.ndarray, dtype: type) -> np.ndarray:
+    """Return a picture with a flat square for each colour."""
+    return np.repeat(np.repeat(colours, CELL, axis=0), CELL, axis=1).astype(dtype)
+
+
+def all_codes(top: int, count: int, seed: int = 0) -> np.ndarray:
+    """Return colours [n, n, 3] with every code of 8 bits in each channel, greys and primaries among them."""
+    colours = np.random.default_rng(seed).integers(0, top + 1, (count, count, 3))
+    colours[:16, :16] = np.arange(256).reshape(16, 16, 1) * top // 255
+    for channel in range(3):
+        colours[16:32, 16 * channel : 16 * channel + 16] = 0
+        colours[16:32, 16 * channel : 16 * channel + 16, channel] = colours[:16, :16, 0]
+    return colours
+
+
+def largest_error(overrides: list[str], dtype: type, count: int, demosaic: str = "bilinear") -> int:
+    """Return the largest difference of codes in the middle of flat squares that no clip touches."""
+    picture, overrides = cells(all_codes(np.iinfo(dtype).max, count), dtype), [*overrides, "noise=none"]
+    clean, noisy = ug.CameraNoise(overrides, demosaic)(picture, index=3)
+    light = make_pair(
+        picture, ug.plan_image(picture, ug.load_config(overrides), key=3).replace(clean_dtype="float32")
+    ).clean
+    clipped = cv2.dilate(((light >= 1) | (light <= 0)).astype(np.uint8), np.ones((5, 5))) > 0
+    middle = np.zeros((CELL, CELL), bool)
+    middle[2:4, 2:4] = True
+    kept = np.tile(middle, (count, count)) & ~clipped
+    assert kept.sum() > count * count
+    return max(int(np.abs(frame.astype(int) - picture)[kept].max()) for frame in (clean, noisy))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("isp", ["smoothstep_gamma22", "srgb"])
+def test_codes_of_flat_colours_return_without_noise(isp: str, dtype: type) -> None:
+    assert largest_error([f"isp={isp}"], dtype, 48) <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize(
+    "gains", ["brooks2019", "paper_max", "paper_min", "gains.highlight=gray_mean", "gains.highlight=none"]
+)
+@pytest.mark.parametrize("isp", ["smoothstep_gamma22", "srgb", "gamma22", "linear"])
+def test_codes_return_for_every_camera(camera: str, gains: str, isp: str) -> None:
+    for dtype in (
+        (np.uint8, np.uint16) if isp != "gamma22" else (np.uint8,)
+    ):  # float32 does not resolve gamma22's 16 bits
+        for pattern in ("RGGB", "GBRG"):
+            chosen = gains if "=" in gains else f"gains={gains}"
+            assert (
+                largest_error([f"camera={camera}", chosen, f"isp={isp}", f"sensor.pattern={pattern}"], dtype, 256) <= 1
+            )
+
+
+@pytest.mark.parametrize("demosaic", ["edge_aware", "malvar", "menon"])
+@pytest.mark.filterwarnings("ignore")
+def test_every_demosaicking_restores_flat_colours(demosaic: str) -> None:
+    if demosaic != "edge_aware":
+        pytest.importorskip("colour_demosaicing")
+    for pattern in ("RGGB", "BGGR", "GRBG", "GBRG"):
+        picture = np.empty((12, 15, 3), np.uint8)
+        picture[:] = 40, 130, 90
+        clean, _ = ug.CameraNoise([f"sensor.pattern={pattern}", "noise=none"], demosaic)(picture, index=1)
+        assert np.abs(clean.astype(int) - picture).max() <= 1
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    ramp = np.linspace(20, 220, 97)[None, :, None] + np.linspace(0, 30, 65)[:, None, None]
+    return (ramp * [1, 0.8, 0.6]).astype(np.uint8)
+
+
+def test_pictures_are_pure_in_seed_and_index(picture: np.ndarray) -> None:
+    noise = ug.CameraNoise(["noise=imx385_iso12800"], seed=5)
+    first = noise(picture, index=7)
+    again = pickle.loads(pickle.dumps(noise))(picture, index=7)
+    assert all((a == b).all() for a, b in zip(first, again, strict=True))
+    others = [ug.CameraNoise(["noise=imx385_iso12800"], seed=6)(picture, index=7), noise(picture, index=8)]
+    assert all((first[1] != other[1]).any() for other in others)
+
+
+def test_calls_without_index_count(picture: np.ndarray) -> None:
+    noise = ug.CameraNoise(["noise=imx385_iso12800"])
+    calls = [noise(picture)[1] for _ in range(2)]
+    assert all((call == noise(picture, index=n)[1]).all() for n, call in enumerate(calls))
+
+
+def test_raw_pair_is_that_of_make_pair(picture: np.ndarray) -> None:
+    config = ug.load_config(["noise=imx385_iso12800"])
+    raw = ug.make_pair(picture, config, seed=2, key=9)
+    noisy = ug.CameraNoise(config, seed=2)(picture, index=9)[1]
+    difference = noisy.astype(float) - ug.develop(raw.noisy, raw.row)
+    assert abs(difference.mean()) < 1
+    assert np.corrcoef(noisy.ravel(), ug.develop(raw.noisy, raw.row).ravel())[0, 1] > 0.95  # other demosaicking
+
+
+@pytest.mark.parametrize("noise", ["imx385_iso12800", "sony_a7s2"])
+@pytest.mark.parametrize("shape", [(65, 97), (2, 3), (64, 64)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_pictures_keep_shape_and_dtype(noise: str, shape: tuple[int, int], dtype: type) -> None:
+    flat = np.full((*shape, 3), np.iinfo(dtype).max // 3, dtype)
+    overrides = [f"noise={noise}", *(["scene=low_light"] if noise == "sony_a7s2" else [])]
+    clean, noisy = ug.CameraNoise(overrides)(flat)
+    assert clean.shape == noisy.shape == flat.shape
+    assert clean.dtype == noisy.dtype == flat.dtype
+    assert (noisy != clean).any()
+
+
+def test_neighbours_correlate_after_demosaicking() -> None:
+    flat = np.full((256, 256, 3), 128, np.uint8)
+    clean, noisy = ug.CameraNoise(["noise=imx385_iso12800"])(flat, index=0)
+    noise = noisy[..., 1].astype(float) - clean[..., 1]
+    lag = [np.corrcoef(noise[:, :-n].ravel(), noise[:, n:].ravel())[0, 1] for n in (1, 8)]
+    assert lag[0] > 0.2
+    assert abs(lag[1]) < 0.02  # three standard errors are 0.012
+
+
+def test_clean_can_be_the_picture_and_noisy_a_jpeg(picture: np.ndarray) -> None:
+    clean, noisy = ug.CameraNoise(["noise=imx385_iso12800"], clean="source")(picture, index=1)
+    assert (clean == picture).all()
+    assert not np.shares_memory(clean, picture)
+    sizes = [ug.CameraNoise(["noise=imx385_iso12800"], jpeg=quality)(picture, index=1)[1] for quality in (5, 100)]
+    errors = [np.abs(size.astype(int) - noisy).mean() for size in sizes]
+    assert errors[0] > 1.5 * errors[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        ({"demosaic": "ahd"}, "demosaic='ahd': unknown; expected one of bilinear, edge_aware, malvar, menon"),
+        ({"clean": "none"}, "clean='none': unknown; expected one of developed, source"),
+        ({"jpeg": 0}, "jpeg=0: no quality; expected an integer from 1 to 100, or None"),
+        ({"jpeg": True}, "jpeg=True: no quality"),
+        ({"config": "noise=none"}, "expected a list: ['noise=none']"),
+        ({"config": ["noise=loud"]}, "noise=loud"),
+        ({"config": ["seed=3"]}, "pass seed=3 to CameraNoise"),
+        ({"config": ["source.downscale=2"]}, "source.downscale=2: CameraNoise keeps the geometry"),
+        ({"config": ["output.layout=packed"]}, "output.layout=packed: CameraNoise"),
+        ({"config": ["noise.draws=2"]}, "noise.draws=2: 2 pairs of an image"),
+        ({"seed": -1}, "seed=-1"),
+    ],
+)
+def test_wrong_arguments_are_refused(arguments: dict, problem: str) -> None:
+    with pytest.raises(ug.ConfigError) as error:
+        ug.CameraNoise(**arguments)
+    assert problem in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "kind", "problem"),
+    [
+        (np.zeros((8, 8), np.uint8), ValueError, "expected uint8 or uint16 [H, W, 3]"),
+        (np.zeros((8, 8, 3), np.float32), ValueError, "expected uint8 or uint16 [H, W, 3]"),
+        (np.zeros((1, 8, 3), np.uint8), ValueError, "at least 2 x 2"),
+        (np.zeros((8, 8, 3), np.uint16), ValueError, "expected uint8 with jpeg=90"),
+    ],
+)
+def test_wrong_pictures_are_refused(wrong: np.ndarray, kind: type[Exception], problem: str) -> None:
+    with pytest.raises(kind) as error:
+        ug.CameraNoise(jpeg=90)(wrong)
+    assert problem in str(error.value)
