@@ -1,0 +1,124 @@
+"""Experiment 2: let a small network tell real from simulated tiles of a sensor.
+
+    python docs/experiments/classifier.py CAPTURES [--to RESULTS.json]
+
+Needs PyTorch. CAPTURES is a folder that ``gen-dataset calibrate`` reads. Protocol: protocol.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from common import Level, Sensor, arguments, halves, interval, smooth, write
+from torch import nn
+
+SIDE, STEPS, BATCH, SEEDS = 64, 600, 32, (0, 1, 2)
+MODELS = {"dark": ("awgn", "two_numbers", "physical", "dark_frames"), "flat": ("awgn", "two_numbers", "physical")}
+
+
+class Classifier(nn.Module):
+    """Energies of filters that see grain, rows and columns; then two linear layers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.filters = nn.ModuleList(nn.Conv2d(1, 8, size, bias=False) for size in ((5, 5), (1, 31), (31, 1)))
+        self.decide = nn.Sequential(nn.LayerNorm(24), nn.Linear(24, 16), nn.ReLU(), nn.Linear(16, 1))
+
+    def forward(self, tiles: Any) -> Any:
+        """Return the log odds that each tile is real."""
+        energies = [filtered(tiles).square().mean((2, 3)) for filtered in self.filters]
+        return self.decide(torch.log(torch.cat(energies, 1) + 1e-4))[:, 0]
+
+
+def tiles_of(frame: Any) -> Any:
+    """Cut a frame into tiles without their means, float32 [N, 1, SIDE, SIDE]."""
+    height, width = (side // SIDE for side in frame.shape)
+    cut = frame[: height * SIDE, : width * SIDE].astype(np.float32).reshape(height, SIDE, width, SIDE)
+    tiles = cut.swapaxes(1, 2).reshape(-1, 1, SIDE, SIDE)
+    return torch.from_numpy(tiles - tiles.mean(axis=(2, 3), keepdims=True))
+
+
+def real_and_simulated(
+    sensor: Sensor, levels: list[Level], model: str, first: int, folder: str
+) -> list[tuple[Any, Any]]:
+    """Return tiles of each real frame, and of a frame that was simulated for it."""
+    pairs = []
+    for level in levels:
+        clean = smooth(level)
+        for frame in level.frames:
+            extra = (f"noise.dark_frames={folder}", "effects.all=auto") if model == "dark_frames" else ()
+            name = "physical" if model == "dark_frames" else model
+            pairs.append((tiles_of(frame), tiles_of(sensor.simulate(name, clean, first + len(pairs), *extra))))
+    return pairs
+
+
+def trained(pairs: list[tuple[Any, Any]], scale: float, seed: int) -> Classifier:
+    """Train a classifier on pairs of real and simulated tiles."""
+    torch.manual_seed(seed)
+    real, simulated = (torch.cat([pair[side] for pair in pairs]) / scale for side in (0, 1))
+    classifier, labels = Classifier(), torch.cat((torch.ones(BATCH), torch.zeros(BATCH)))
+    optimiser = torch.optim.Adam(classifier.parameters(), 0.003)
+    for _ in range(STEPS):
+        chosen = [tiles[torch.randint(len(tiles), (BATCH,))] for tiles in (real, simulated)]
+        loss = nn.functional.binary_cross_entropy_with_logits(classifier(torch.cat(chosen)), labels)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return classifier
+
+
+def accuracies(classifier: Classifier, pairs: list[tuple[Any, Any]], scale: float) -> list[float]:
+    """Return the share of right answers for each judged frame and its simulation."""
+    with torch.no_grad():
+        return [
+            float(((classifier(real / scale) > 0).float().mean() + (classifier(made / scale) <= 0).float().mean()) / 2)
+            for real, made in pairs
+        ]
+
+
+def dark_folder(sensor: Sensor, levels: list[Level]) -> str:
+    """Write the calibrating darks as NPY, and return their folder."""
+    folder = sensor.folder / "darks"
+    folder.mkdir()
+    for number, frame in enumerate(frame for level in levels for frame in level.frames):
+        np.save(folder / f"{number:03d}.npy", frame)
+    return str(folder)
+
+
+def main() -> None:
+    """Run the experiment."""
+    options = arguments(__doc__, "classifier", "captures of a sensor: EMVA data, captures.csv, or raw darks and flats")
+    torch.set_num_threads(2)
+    torch.use_deterministic_algorithms(True)
+    calibrating, judged = halves(options.data)
+    sensor = Sensor(calibrating)
+    results: dict[str, Any] = {"tile": SIDE, "parameters": sum(p.numel() for p in Classifier().parameters())}
+    for kind, models in MODELS.items():
+        train, test = ([level for level in half if level.kind == kind] for half in (calibrating, judged))
+        folder = dark_folder(sensor, train) if kind == "dark" else ""
+        scale = float(np.sqrt(np.mean([np.subtract(*map(float_of, level.frames[:2])).var() / 2 for level in train])))
+        results[kind] = {}
+        for model in models:
+            training = real_and_simulated(sensor, train, model, 10_000, folder)
+            testing = real_and_simulated(sensor, test, model, 20_000, folder)
+            scores = [accuracies(trained(training, scale, seed), testing, scale) for seed in SEEDS]
+            by_frame = np.mean(scores, axis=0)
+            results[kind][model] = {
+                "accuracy": interval(by_frame, np.mean),
+                "by_seed": [float(np.mean(score)) for score in scores],
+                "judged_frames": len(by_frame),
+                "judged_tiles": 2 * sum(len(real) for real, _ in testing),
+            }
+            print(kind, model, results[kind][model], flush=True)
+    write(results, options.to)
+
+
+def float_of(frame: Any) -> Any:
+    """Convert a frame to float64."""
+    return frame.astype(np.float64)
+
+
+if __name__ == "__main__":
+    main()
