@@ -1,0 +1,243 @@
+"""Make the pages and figures of the experiments from their results.
+
+    python docs/experiments/page.py
+
+Reads the JSON files next to this script, and writes a page for each of them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+HERE = Path(__file__).parent
+NAMES = {
+    "real": "real",
+    "noisy": "noisy, not denoised",
+    "awgn": "AWGN",
+    "signal_dependent": "signal-dependent white",
+    "two_numbers": "two numbers",
+    "physical": "physical",
+    "dark_frames": "dark frames",
+    "ours": "`CameraNoise`",
+    "noise_flow": "Noise Flow",
+    "GAN": "GAN",
+    "white_oracle": "white, oracle",
+}
+
+
+def number(value: float) -> str:
+    """Format a number with three digits."""
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def with_interval(values: Sequence[float]) -> str:
+    """Format a value with its interval."""
+    return f"{number(values[0])} ({number(values[1])} to {number(values[2])})"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def met(condition: bool) -> str:
+    """State whether a goal was met."""
+    return "met" if condition else "not met"
+
+
+def ladder(results: dict[str, Any]) -> str:
+    """Return the page of experiment 1, and draw its figure."""
+    models = ("awgn", "two_numbers", "physical")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
+    flats = [level for level in results["levels"] if level["kind"] == "flat"]
+    for model in models:
+        left.plot(
+            [level["mean_dn"] for level in flats],
+            [level[model]["divergence"] for level in flats],
+            "o",
+            label=NAMES[model],
+        )
+    left.set(yscale="log", xlabel="mean signal, DN", ylabel="divergence from real")
+    for model in ("real", *models):
+        right.plot(np.arange(1, 9) / 16, results["row_power_dn2"][model], ".-", label=NAMES[model])
+    right.set(yscale="log", xlabel="frequency, cycles per row", ylabel="power of row means, DN²")
+    left.legend(), right.legend()
+    figure.savefig(HERE / "ladder.png", dpi=80)
+    ratios, divergences = results["simulated_to_real"], results["divergence"]
+    ratio, rows = results["two_numbers_to_awgn"], ratios["row_mean_std_dn"]
+    physical, two = rows["physical"][0], rows["two_numbers"][0]
+    cells = [
+        [
+            NAMES[model],
+            with_interval(divergences[model]),
+            *(with_interval(ratios[name][model]) for name in ("std_dn", "row_mean_std_dn", "column_mean_std_dn")),
+            number(results["next_in_row"][model]),
+            number(results["next_in_column"][model]),
+        ]
+        for model in models
+    ]
+    return f"""# The ladder on raw frames
+
+{results["judged_levels"]} levels of a sensor were judged, which was calibrated on
+{results["calibrating_levels"]} others. Ratios are simulated to real deviations; medians over levels with 95 %
+intervals. Real neighbours in a row correlate by {number(results["next_in_row"]["real"])}, in a column by
+{number(results["next_in_column"]["real"])}.
+
+{table(["model", "divergence", "pixels", "row means", "column means", "next in row", "next in column"], cells)}
+
+- Divergence of two numbers to that of AWGN: {with_interval(ratio)}. Goal, at most 0.05: {met(ratio[0] <= 0.05)}.
+- Row means of physical, 0.95 to 1.05 of the real ones: {met(0.95 <= physical <= 1.05)} ({number(physical)}).
+- Row means of two numbers, less than a third of the real ones: {met(two < 1 / 3)} ({number(two)}).
+
+![divergence by level, and power of row means by frequency, real and simulated](ladder.png)
+"""
+
+
+def classifier(results: dict[str, Any]) -> str:
+    """Return the page of experiment 2."""
+    cells, goals = [], []
+    for kind in ("dark", "flat"):
+        found = results[kind]
+        cells += [
+            [
+                f"{kind}s",
+                NAMES[model],
+                with_interval([100 * share for share in one["accuracy"]]),
+                str(one["judged_frames"]),
+            ]
+            for model, one in found.items()
+        ]
+        best = min((one["accuracy"][0], model) for model, one in found.items())
+        two = found["two_numbers"]["accuracy"][0]
+        goals.append(
+            f"- On {kind}s, {NAMES[best[1]]} is recognised least: {number(100 * best[0])} %."
+            f" Goal, at most 55 %: {met(best[0] <= 0.55)}."
+            f" Two numbers exceed 55 %: {met(two > 0.55)}."
+        )
+    return f"""# A classifier as judge
+
+A network of {results["parameters"]} parameters was trained to distinguish real from simulated tiles of
+{results["tile"]} x {results["tile"]} sites, and judged on frames that neither calibrated the sensor nor trained it. At
+50 % it cannot distinguish them. Accuracy in %, mean of three seeds, with 95 % intervals over frames:
+
+{table(["frames", "model", "accuracy, %", "judged frames"], cells)}
+
+{chr(10).join(goals)}
+"""
+
+
+def learned_noise(results: dict[str, Any]) -> str:
+    """Return the page of experiment 3."""
+    models = results["models"]
+    cells = [
+        [
+            NAMES[model],
+            str(one["patches"]),
+            with_interval(one["divergence"]),
+            with_interval(one["std_to_real"]),
+            number(one["lag_1"]),
+            with_interval(one["lag_1_difference"]),
+            with_interval(one["lag_2_difference"]),
+        ]
+        for model, one in models.items()
+    ]
+    distance, lag = (models["ours"][name][0] for name in ("divergence", "lag_1_difference"))
+    levels = float(np.median([patch["ours"]["variance_by_level_error"] for patch in results["by_patch"]]))
+    head = [
+        "noise",
+        "patches",
+        "divergence",
+        "deviation to real",
+        "lag 1",
+        "difference at lag 1",
+        "difference at lag 2",
+    ]
+    return f"""# Against learned noise
+
+{results["judged"]} of {results["patches"]} patches of SIDD were judged, {results["groups"]} combinations of phone and
+ISO. `CameraNoise` was fitted on other patches of the same phone and ISO; the white noise has the deviation of the
+judged patch at each level. Medians over patches with 95 % intervals; the real correlation at lag 1 is
+{number(results["real_lag_1"])}.
+
+{table(head, cells)}
+
+- Divergence of `CameraNoise`, goal at most 0.02: {met(distance <= 0.02)} ({number(distance)}).
+- Correlation at lag 1, goal within 0.05: {met(lag <= 0.05)} ({number(lag)}).
+- Its variance differs from the real one by {number(100 * levels)} % at the median level.
+"""
+
+
+def training(results: dict[str, Any]) -> str:
+    """Return the page of experiment 4."""
+    srgb = results["srgb"]
+    cells = [
+        [NAMES[model], with_interval(srgb["psnr_db"][model]), with_interval(srgb["ssim"][model])]
+        for model in srgb["psnr_db"]
+    ]
+    differences = [
+        [
+            " − ".join(NAMES[name] for name in pair.split(" - ")),
+            with_interval(values),
+            with_interval(srgb["ssim_difference"][pair]),
+        ]
+        for pair, values in srgb["psnr_difference_db"].items()
+    ]
+    page = f"""# Does it train better
+
+One network of {srgb["parameters"]} parameters was trained on {results["photographs"]} photographs with each kind of
+noise, in {results["steps"]} steps, with {results["seeds"]} seeds. It was judged on {srgb["pairs"]} real sRGB pairs of {srgb["scenes"]} scenes; 95 % intervals over scenes.
+
+{table(["training noise", "PSNR, dB", "SSIM"], cells)}
+
+Paired differences; an interval that contains 0 shows no difference:
+
+{table(["difference", "PSNR, dB", "SSIM"], differences)}
+"""
+    if "raw" not in results:
+        return page
+    raw = results["raw"]
+    cells = [[NAMES[model], with_interval(values)] for model, values in raw["error_to_noise"].items()]
+    ratios = [
+        [" / ".join(NAMES[name] for name in pair.split(" / ")), with_interval(values)]
+        for pair, values in raw["error_ratio"].items()
+    ]
+    return f"""{page}
+## On raw frames
+
+Squared error that is left, as a share of the noise variance, on {raw["judged_levels"]} judged levels of the sensor; it
+is measured on pairs of exposures, without clean frames. Medians over levels:
+
+{table(["training noise", "error / noise"], cells)}
+
+{table(["ratio of errors", "median over levels"], ratios)}
+"""
+
+
+PAGES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "ladder": ladder,
+    "classifier": classifier,
+    "learned_noise": learned_noise,
+    "training": training,
+}
+
+
+def main() -> None:
+    """Make the pages of all results that exist."""
+    for name, page in PAGES.items():
+        results = HERE / f"{name}.json"
+        if results.exists():
+            (HERE / f"{name}.md").write_text(page(json.loads(results.read_text(encoding="utf-8"))), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
