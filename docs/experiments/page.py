@@ -195,7 +195,8 @@ def training(results: dict[str, Any]) -> str:
     page = f"""# Does it train better
 
 One network of {srgb["parameters"]} parameters was trained on {results["photographs"]} photographs with each kind of
-noise, in {results["steps"]} steps, with {results["seeds"]} seeds. It was judged on {srgb["pairs"]} real sRGB pairs of {srgb["scenes"]} scenes; 95 % intervals over scenes.
+noise, in {results["steps"]} steps, with {results["seeds"]} seeds. It was judged on {srgb["pairs"]}
+real sRGB pairs of {srgb["scenes"]} scenes; 95 % intervals over scenes.
 
 {table(["training noise", "PSNR, dB", "SSIM"], cells)}
 
