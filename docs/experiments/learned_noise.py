@@ -141,7 +141,7 @@ def judge(patch: Patch, others: Sequence[Patch], number: int) -> dict[str, Any]:
     curve, demosaic, a, b = chosen(others)
     clean = patch.kinds["samples_gts"]
     real = patch.noise("samples_noisy", "samples_gts")
-    noises = {"ours": (simulate(camera_noise(curve, demosaic, a, b), patch, 1000 + number), real)}
+    noises = {"camera_noise": (simulate(camera_noise(curve, demosaic, a, b), patch, 1000 + number), real)}
     noises["white_oracle"] = (white(real, clean, number), real)
     for name, (noisy, truth) in KINDS.items():
         if noisy in patch.kinds and truth in patch.kinds:
@@ -152,10 +152,10 @@ def judge(patch: Patch, others: Sequence[Patch], number: int) -> dict[str, Any]:
         lags = {f"lag_{lag}": [correlation(noise, lag), correlation(reference, lag)] for lag in (1, 2)}
         ratio = float(noise.std() / reference.std())
         found[name] = {"divergence": divergence(reference, noise, WIDTH), "std_to_real": ratio, **lags}
-    model, counts = by_level(noises["ours"][0], clean)
+    model, counts = by_level(noises["camera_noise"][0], clean)
     truth = by_level(real, clean)[0]
     filled = (counts > 500) & (truth > 0)
-    found["ours"]["variance_by_level_error"] = float(np.median(np.abs(model[filled] / truth[filled] - 1)))
+    found["camera_noise"]["variance_by_level_error"] = float(np.median(np.abs(model[filled] / truth[filled] - 1)))
     return found
 
 
@@ -167,11 +167,11 @@ def main() -> None:
         others = [other for other in patches if other.group == patch.group and other.name != patch.name]
         if others:
             judged.append(judge(patch, others, number))
-            print(patch.group, judged[-1]["ours"], flush=True)
+            print(patch.group, judged[-1]["camera_noise"], flush=True)
     if not judged:
         raise SystemExit(f"{options.data}: no two patches of one phone and ISO; expected LIGHT/ISO/PHONE/samples_noisy")
     summary = {}
-    for name in ("ours", "noise_flow", "GAN", "white_oracle"):
+    for name in ("camera_noise", "noise_flow", "GAN", "white_oracle"):
         results = [patch[name] for patch in judged if name in patch]
         if results:
             lags = {
@@ -185,7 +185,7 @@ def main() -> None:
                 "lag_1": float(np.median([result["lag_1"][0] for result in results])),
                 **lags,
             }
-    real = float(np.median([patch["ours"]["lag_1"][1] for patch in judged]))
+    real = float(np.median([patch["camera_noise"]["lag_1"][1] for patch in judged]))
     write(
         {
             "patches": len(patches),

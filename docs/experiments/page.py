@@ -27,7 +27,7 @@ NAMES = {
     "two_numbers": "two numbers",
     "physical": "physical",
     "dark_frames": "dark frames",
-    "ours": "`CameraNoise`",
+    "camera_noise": "`CameraNoise`",
     "noise_flow": "Noise Flow",
     "GAN": "GAN",
     "white_oracle": "white, oracle",
@@ -151,8 +151,8 @@ def learned_noise(results: dict[str, Any]) -> str:
         ]
         for model, one in models.items()
     ]
-    distance, lag = (models["ours"][name][0] for name in ("divergence", "lag_1_difference"))
-    levels = float(np.median([patch["ours"]["variance_by_level_error"] for patch in results["by_patch"]]))
+    distance, lag = (models["camera_noise"][name][0] for name in ("divergence", "lag_1_difference"))
+    levels = float(np.median([patch["camera_noise"]["variance_by_level_error"] for patch in results["by_patch"]]))
     head = [
         "noise",
         "patches",
