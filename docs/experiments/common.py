@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import shutil
 import tempfile
@@ -146,6 +147,7 @@ class Sensor:
         codes = np.rint(np.clip(light, 0, 1) * 65535).astype(np.uint16)
         return ug.make_pair(np.repeat(codes[..., None], 3, axis=2), self.config(model, *extra), key=number).noisy
 
+    @functools.cache
     def config(self, model: str, *extra: str) -> Any:
         """Return the config whose light is the picture itself, on this sensor."""
         overrides = [f"noise={model}", "camera=identity", "gains=unity", "isp=linear", f"sensor.bits={self.bits}"]
