@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import json
 import shutil
 import tempfile
@@ -136,6 +135,7 @@ class Sensor:
         self.white, self.bits = round(sensor.white_dn), sensor.bits
         self.pattern = sensor.pattern if sensor.pattern in ("RGGB", "BGGR", "GRBG", "GBRG") else "RGGB"
         pairs = [np.subtract(*map(np.float64, level.frames[:2])).var() / 2 for level in levels]
+        self._configs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self.white_std = float(np.sqrt(np.mean(pairs)))
 
     def simulate(self, model: str, clean_dn: Any, number: int, *extra: str) -> Any:
@@ -145,9 +145,13 @@ class Sensor:
             return np.clip(np.rint(clean_dn + noise), 0, 2**self.bits - 1)
         light = (clean_dn - self.black) / (self.white - self.black)
         codes = np.rint(np.clip(light, 0, 1) * 65535).astype(np.uint16)
-        return ug.make_pair(np.repeat(codes[..., None], 3, axis=2), self.config(model, *extra), key=number).noisy
+        return ug.make_pair(np.repeat(codes[..., None], 3, axis=2), self._composed(model, extra), key=number).noisy
 
-    @functools.cache
+    def _composed(self, model: str, extra: tuple[str, ...]) -> Any:
+        if (model, extra) not in self._configs:
+            self._configs[model, extra] = self.config(model, *extra)
+        return self._configs[model, extra]
+
     def config(self, model: str, *extra: str) -> Any:
         """Return the config whose light is the picture itself, on this sensor."""
         overrides = [f"noise={model}", "camera=identity", "gains=unity", "isp=linear", f"sensor.bits={self.bits}"]
