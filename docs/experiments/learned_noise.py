@@ -8,6 +8,7 @@ samples_noisy, samples_gts, GAN, samples_noisyNF, samples_gtsNF or samples_noise
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,6 +74,7 @@ def correlation(noise: Any, lag: int) -> float:
     return float(np.mean([np.corrcoef(noise[:, :-lag, c].ravel(), noise[:, lag:, c].ravel())[0, 1] for c in range(3)]))
 
 
+@functools.cache
 def camera_noise(curve: str, demosaic: str, a: float, b: float) -> ug.CameraNoise:
     """Return the camera noise of a curve, a demosaicking and two numbers."""
     numbers = [f"noise.a={a}", f"noise.b={b}", "noise.units=dn", "noise.black=subtracted"]
