@@ -23,7 +23,7 @@ import unprocess_gen as ug
 
 WIDTH, SIDE, BATCH, STEPS, RATE, SEEDS = 24, 48, 8, 400, 0.002, (0, 1, 2)
 CENTRE = 256
-SCENE = ["noise=canon_5d4", "scene=low_light", "scene.iso={law: log_uniform, low: 800, high: 12800}"]
+SCENE = ["noise=canon_5d4", "scene=low_light", "scene.iso=[log_uniform, 800, 6400]"]
 SRGB = ("awgn", "signal_dependent", "two_numbers", "physical")
 RAW = ("awgn", "two_numbers", "physical")
 TWO = ["effects.all=off", "effects.shot=on", "effects.read=on"]
