@@ -36,7 +36,7 @@ NAMES = {
 
 def number(value: float) -> str:
     """Format a number with three digits."""
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return f"{value:.3g}" if 0.0001 <= abs(value) < 1000 or not value else f"{value:.4f}"
 
 
 def with_interval(values: Sequence[float]) -> str:
@@ -71,11 +71,16 @@ def ladder(results: dict[str, Any]) -> str:
     for model in ("real", *models):
         right.plot(np.arange(1, 9) / 16, results["row_power_dn2"][model], ".-", label=NAMES[model])
     right.set(yscale="log", xlabel="frequency, cycles per row", ylabel="power of row means, DN²")
-    left.legend(), right.legend()
+    left.legend(fontsize="small"), right.legend(fontsize="small", loc="lower left")
     figure.savefig(HERE / "ladder.png", dpi=80)
     ratios, divergences = results["simulated_to_real"], results["divergence"]
     ratio, rows = results["two_numbers_to_awgn"], ratios["row_mean_std_dn"]
     physical, two = rows["physical"][0], rows["two_numbers"][0]
+    darks = [level for level in results["levels"] if level["kind"] == "dark"]
+    name = "row_mean_std_dn"
+    dark = {
+        model: number(float(np.median([one[model][name] / one["real"][name] for one in darks]))) for model in models
+    }
     cells = [
         [
             NAMES[model],
@@ -98,6 +103,9 @@ intervals. Real neighbours in a row correlate by {number(results["next_in_row"][
 - Divergence of two numbers to that of AWGN: {with_interval(ratio)}. Goal, at most 0.05: {met(ratio[0] <= 0.05)}.
 - Row means of physical, 0.95 to 1.05 of the real ones: {met(0.95 <= physical <= 1.05)} ({number(physical)}).
 - Row means of two numbers, less than a third of the real ones: {met(two < 1 / 3)} ({number(two)}).
+
+On darks alone, which the protocol does not separate, row means of two numbers are {dark["two_numbers"]} of the real
+ones, those of physical {dark["physical"]}: there the light hides nothing.
 
 ![divergence by level, and power of row means by frequency, real and simulated](ladder.png)
 """
