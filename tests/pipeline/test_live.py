@@ -14,7 +14,7 @@ from helpers.datasets import Make
 from helpers.photographs import fill
 
 import unprocess_gen as ug
-from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceError
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.random_streams import CLIP_FRAMES, EPOCHS, frame_word
 from unprocess_gen.simulation.pair import make_pair, reference_pair
@@ -176,14 +176,12 @@ def test_pixels_are_decoded_once_up_to_the_bound(tmp_path: Path, make: Make) -> 
     files = sorted((tmp_path / "cache").iterdir())
     assert 1 <= len(files) <= 2
     assert sum(file.stat().st_size for file in files) <= 2 * size
+    files[0].write_bytes(files[0].read_bytes()[:-99])
     unbounded = ug.LivePairs(tmp_path / "ds", cache=tmp_path / "cache")
     assert_same(unbounded, stored)
     for photograph in (tmp_path / "photos").iterdir():
         photograph.unlink()
     assert_same(unbounded, stored)
-    files[0].write_bytes(b"damaged")
-    with pytest.raises(DamageError, match="not an NPY file"):
-        assert_same(ug.LivePairs(tmp_path / "ds", cache=tmp_path / "cache"), stored)
 
 
 def test_datasets_are_joined_and_split(make: Make, tmp_path: Path) -> None:

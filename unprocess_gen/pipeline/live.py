@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import itertools
+import math
 import operator
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +21,8 @@ from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
 from unprocess_gen.core.targets import TARGETS
-from unprocess_gen.core.types import Frame, Patch, Plan, Srgb, Value
+from unprocess_gen.core.types import Frame, Pair, Patch, Plan, Srgb, Value
+from unprocess_gen.dataset.columns import COLUMNS, number_or_text
 from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_folders, name_apart
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPairs, RecordedPairs
@@ -64,7 +66,8 @@ class LivePairs:
         ``"noise"``: new noise in each epoch, clean frames as in epoch 0. ``"all"``: new cameras, gains, noise levels
         and random patches too. ``"none"``: the pairs of epoch 0 in every epoch.
     cache : str or Path, optional
-        Folder for decoded pixels, 3 bytes a pixel, which worker processes share; ``"memory"`` for a temporary one.
+        Folder for decoded pixels, 3 bytes a pixel, which worker processes share; ``"memory"`` for a temporary one. On a
+        full disk, other pixels are decoded each time.
     split : str, optional
         Only pairs of this split, by default all; needs a dataset.
     cache_bytes : int
@@ -165,15 +168,32 @@ class LivePairs:
             patch = _crop(plan, epoch, patch, self._patch, crop)
         for kernels in kernels_for(self._targets, plan):
             self_test.check(kernels)
-        pair = make_crop(crop_patch(srgb, patch), plan, patch.origin, epoch, source.settings.dark_folder)
-        targets = {}
+        pixels, dark_pixels = crop_patch(srgb, patch), source.settings.dark_folder
+        clean, noisy, counts = make_crop(pixels, plan, patch.origin, epoch, dark_pixels)
+        targets, frames = {}, (clean, noisy)
         if self._targets:
-            targets = targets_of(self._targets, srgb, plan, patch, pair, noise_law(plan), as_float=self._as_float)
-        clean, noisy = (self._frame(frame, plan) for frame in (pair.clean, pair.noisy))
+            pair, law = Pair(clean, noisy, counts()), noise_law(plan)
+            targets = targets_of(self._targets, srgb, plan, patch, pair, law, as_float=self._as_float)
+        if self._as_float:
+            frames = self._frame(clean, plan), self._frame(noisy, plan)
         if self._arrays_only:
-            return (clean, noisy, *targets.values())
-        row: Any = LiveRow(lambda: source.row(image, plan.replace(epoch=epoch), patch, pair))
-        return LiveSample(clean, noisy, row, source.name, targets)
+            return (*frames, *targets.values())
+        row: Any = LiveRow(lambda: source.row(image, plan.replace(epoch=epoch), patch, Pair(clean, noisy, counts())))
+        return LiveSample(*frames, row, source.name, targets)
+
+    def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
+        """Return a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
+
+        Items are tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets if
+        there are any; with ``arrays_only`` of arrays.
+        """
+        samples = [self[item] for item in items]
+        if self._arrays_only:
+            return samples
+        return [
+            (sample.clean, sample.noisy, _without_none(sample.row), *filter(None, [sample.targets]))
+            for sample in samples
+        ]
 
     def _redrawn(self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int) -> tuple[Plan, Patch]:
         """Return the plan of an epoch, without its number, and the patch."""
@@ -189,21 +209,19 @@ class LivePairs:
         return plan, patch
 
     def _frame(self, frame: Frame, plan: Plan) -> Frame:
-        """Return a frame in DN, or as light."""
-        if not self._as_float or frame.dtype != np.uint16:
-            return frame
-        return to_light(frame, levels_of(plan))
+        """Return a frame as light."""
+        return frame if frame.dtype != np.uint16 else to_light(frame, levels_of(plan))
 
 
 class LiveRow(Mapping[str, Value]):
     """Row of a live pair, built on first access: its digests take longer than a small pair. Pickled as a dict."""
 
-    def __init__(self, build: Callable[[], dict[str, Value]]) -> None:
-        self._build = build
+    def __init__(self, row: Callable[[], dict[str, Value]] | dict[str, Value]) -> None:
+        self._given = row
 
     @cached_property
     def _row(self) -> dict[str, Value]:
-        return self._build()
+        return self._given if isinstance(self._given, dict) else self._given()
 
     def __getitem__(self, name: str) -> Value:
         return self._row[name]
@@ -219,6 +237,13 @@ class LiveRow(Mapping[str, Value]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (self._row,)
+
+
+def _without_none(row: Mapping[str, Value]) -> dict[str, Value]:
+    """Return a row whose columns have one type in every pair: NaN instead of None, text where some pairs have text."""
+    texts = {column.name for column in COLUMNS if column.type is number_or_text}
+    cells = {"epoch": 0} | {name: math.nan if value is None else value for name, value in row.items()}
+    return {name: str(value) if name in texts else value for name, value in cells.items()}
 
 
 def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, split: str | None) -> list[LiveSource]:

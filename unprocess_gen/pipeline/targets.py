@@ -59,11 +59,12 @@ def noise_law(plan: Plan) -> dict[str, Value]:
 
 def kernels_for(names: Sequence[str], plan: Plan) -> list[str]:
     """Return the sets of kernels that simulate a plan and its targets (`self_test.kernels`)."""
-    plans = [plan]
-    if "linear_rgb" in names:
-        rounded = plan.replace(methods=())
-        plans += [rounded, rounded.replace(clean_dtype=FLOAT32)]
-    return list(dict.fromkeys(map(self_test.kernels, plans)))
+    own = self_test.kernels(plan)
+    if "linear_rgb" not in names:
+        return [own]
+    rounded = plan.replace(methods=())
+    plans = rounded, rounded.replace(clean_dtype=FLOAT32)
+    return list(dict.fromkeys([own, *map(self_test.kernels, plans)]))
 
 
 def _noise(name: str, frame: Frame, row: Row, as_float: bool) -> NDArray[np.float32]:

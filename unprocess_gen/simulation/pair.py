@@ -11,7 +11,7 @@ clip and round both frames (`_reference_pair`).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +32,7 @@ from unprocess_gen.core.types import (
 )
 from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
-from unprocess_gen.simulation.kernels.render import pass_key, render_clean, render_pairs
+from unprocess_gen.simulation.kernels.render import pass_key, render_clean, render_crop, render_pairs
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
 from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
@@ -126,7 +126,7 @@ def _pairs(
 
 def make_crop(
     srgb: Srgb, plan: Plan, origin: tuple[int, int], epoch: int, dark_pixels: DarkPixels | None = None
-) -> Pair:
+) -> tuple[Frame, Frame, Callable[[], Counts]]:
     """Simulate the pair of a crop in an epoch, with little fixed cost if the plan is that of earlier crops.
 
     Parameters
@@ -144,8 +144,10 @@ def make_crop(
 
     Returns
     -------
-    Pair
+    clean, noisy : ndarray
         As `make_pair` with ``plan.replace(epoch=epoch)``.
+    counts : callable
+        Returns the counts of the pair.
 
     Raises
     ------
@@ -153,9 +155,10 @@ def make_crop(
         As `make_pair`.
     """
     if plan.noise.dark.sha256 or plan.accuracy.uses_reference:
-        return make_pair(srgb, plan.replace(epoch=epoch), origin, dark_pixels)
+        pair = make_pair(srgb, plan.replace(epoch=epoch), origin, dark_pixels)
+        return pair.clean, pair.noisy, lambda: pair.counts
     _check_image(srgb, plan, origin)
-    return render_pairs(_dequantise(srgb, plan, origin), [plan], origin, epoch=epoch)[0]
+    return render_crop(_dequantise(srgb, plan, origin), plan, origin, epoch)
 
 
 def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:

@@ -14,7 +14,7 @@ NORMAL_STREAM = "heteroscedastic"
 """Stream of noise that is one normal deviate per site, with a variance linear in the signal."""
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=1024)
 def slots_of(plan: Plan) -> Slots:
     """Return the slots of a plan whose noise counts electrons."""
     black_dn, physics = float(plan.sensor.black_level_dn), plan.noise.physics

@@ -1,10 +1,15 @@
-"""Keep decoded pixels in files that processes map into memory, 3 bytes a pixel: reading a patch takes microseconds."""
+"""Keep decoded pixels in files that processes map into memory, 3 bytes a pixel: reading a patch takes microseconds.
+
+A file is an NPY array, then the XXH3-128 of its pixels as 32 hex digits. Each process compares them when it first maps
+the file. A damaged file is decoded and written again.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
+import warnings
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,13 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.files import machine_errors
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import NO_SPACE, array_xxh3, machine_errors
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.types import Srgb
 
 MAPS = 256
 """Files that a process keeps mapped, each with a file descriptor; mapping takes longer than reading a patch."""
+
+DIGEST_BYTES, HEADER_BYTES = 32, 128
+"""Sizes of the digest at the end of a file, and of the header of NPY before the pixels."""
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -32,7 +40,7 @@ class PixelCache:
         Folder, created if necessary; ``"memory"`` for a temporary one in shared memory, which is deleted with the cache
         of the process that created it.
     most_bytes : int
-        Size up to which pixels are added; none are removed.
+        Size up to which pixels are added; none are removed. Processes that add at once can exceed it by one image each.
     """
 
     def __init__(self, folder: str | os.PathLike[str], most_bytes: int) -> None:
@@ -42,6 +50,7 @@ class PixelCache:
             folder = tempfile.mkdtemp(prefix="unprocess_gen_", dir=root)
             weakref.finalize(self, _delete, folder, os.getpid())
         self._maps: Recent[str, Srgb] = Recent(MAPS)
+        self._compared: set[str] = set()
         self._folder = Path(folder).absolute()
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -55,24 +64,29 @@ class PixelCache:
         pixels = self._maps.get(name)
         if pixels is None:
             path = self._folder / f"{name}.npy"
-            pixels = self._mapped(path)
+            with machine_errors(path):
+                pixels = self._mapped(path)
             if pixels is None:
                 decoded = decode()
-                if self._bytes() + decoded.nbytes <= self._most_bytes:
+                if self._bytes() + HEADER_BYTES + decoded.nbytes + DIGEST_BYTES <= self._most_bytes:
                     self._add(path, decoded)
                 return decoded
             self._maps.keep(name, pixels)
         return pixels
 
-    @staticmethod
-    def _mapped(path: Path) -> Srgb | None:
-        """Map a file; None if there is none."""
+    def _mapped(self, path: Path) -> Srgb | None:
+        """Map a file; None if there is none or if it is damaged."""
         try:
-            return np.asarray(np.load(path, mmap_mode="r"))
-        except FileNotFoundError:
+            pixels = np.asarray(np.load(path, mmap_mode="r"))
+            if path.name not in self._compared:
+                with path.open("rb") as stream:
+                    stream.seek(-DIGEST_BYTES, os.SEEK_END)
+                    if stream.read() != array_xxh3(pixels).encode():
+                        return None
+                self._compared.add(path.name)
+            return pixels
+        except (FileNotFoundError, ValueError, EOFError):
             return None
-        except ValueError as error:
-            raise DamageError(f"{path}: not an NPY file ({error}); expected decoded pixels; delete it") from error
 
     def _bytes(self) -> int:
         """Size of the files in the folder; files that are deleted meanwhile count as empty."""
@@ -83,16 +97,23 @@ class PixelCache:
         return total
 
     def _add(self, path: Path, pixels: Srgb) -> None:
-        """Write a file and rename it, so that other processes see all of it or nothing."""
-        with machine_errors(self._folder):
+        """Write a file and rename it, so that other processes see all of it or nothing; stop at a full disk."""
+        try:
             number, unfinished = tempfile.mkstemp(suffix=".part", dir=self._folder)
             try:
                 with os.fdopen(number, "wb") as stream:
                     np.save(stream, pixels)
+                    stream.write(array_xxh3(pixels).encode())
                 Path(unfinished).replace(path)
             except BaseException:
                 Path(unfinished).unlink()
                 raise
+        except OSError as error:
+            with machine_errors(self._folder):
+                if error.errno not in NO_SPACE:
+                    raise
+            self._most_bytes = 0
+            warnings.warn(f"cache={self._folder}: the disk is full; other pixels are decoded each time", stacklevel=2)
 
 
 def _delete(folder: str, pid: int) -> None:

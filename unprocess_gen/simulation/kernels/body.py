@@ -30,8 +30,9 @@ from unprocess_gen.simulation.kernels.strips import (
 )
 from unprocess_gen.simulation.slots import BrightPixels, DeadPixels, NormalPattern, Patterns, RadialFactor
 
-SMALL_SITES, SMALL_PATTERNS, LARGE_PATTERNS = 2**16, 384, 5
-"""So many patterns of crops of up to this many sites (0.3 MB each) are kept, and so many of larger crops."""
+SMALL_SITES, SMALL_PATTERNS, LARGE_PATTERNS, LIVE_PATTERNS = 2**16, 384, 5, 8
+"""So many patterns of crops of up to this many sites (0.3 MB each) are kept, so many of larger crops, and so many of
+live crops, whose places are new in each epoch: keeping more would only use memory that no cache holds."""
 
 DEAD, FIRST_STEP = 1, 2
 """Numbers in the map of defects: a dead pixel, and the first step of the means of bright defects."""
@@ -52,13 +53,14 @@ EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS = equal_sites(1.0), equal_sites(0.0), equ
 WITHOUT_PATTERNS = Body(EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS, np.zeros(1))
 
 
-def body_of(patterns: Patterns, shape: Shape, origin: Shape) -> Body:
+def body_of(patterns: Patterns, shape: Shape, origin: Shape, is_live: bool = False) -> Body:
     """Return the fixed patterns of a body for a crop of ``shape`` at ``origin``, without the factor on the light."""
     electrons, sites, bright, dead = patterns.electrons, patterns.sites_dn, patterns.bright, patterns.dead
+    kept = _live_patterns if is_live else _kept
     return Body(
-        _kept(_normal_pattern, electrons, shape, origin) if electrons else EQUAL_RESPONSE,
-        _kept(_normal_pattern, sites, shape, origin) if sites else NO_OFFSETS,
-        _kept(_defect_map, (bright, dead), shape, origin) if bright or dead else NO_DEFECTS,
+        kept(_normal_pattern, electrons, shape, origin) if electrons else EQUAL_RESPONSE,
+        kept(_normal_pattern, sites, shape, origin) if sites else NO_OFFSETS,
+        kept(_defect_map, (bright, dead), shape, origin) if bright or dead else NO_DEFECTS,
         _means_e(bright.mean_e if bright else 0.0),
     )
 
@@ -93,7 +95,8 @@ def _compute(compute: Any, slot: Any, shape: Shape, origin: Shape) -> Any:
     return compute(slot, shape, origin)
 
 
-_caches = [functools.lru_cache(maxsize=count)(_compute) for count in (SMALL_PATTERNS, LARGE_PATTERNS)]
+_caches = [functools.lru_cache(maxsize=count)(_compute) for count in (SMALL_PATTERNS, LARGE_PATTERNS, LIVE_PATTERNS)]
+_live_patterns = _caches[2]
 
 
 def forget_bodies() -> None:
@@ -171,7 +174,7 @@ def _defect_map(slots: tuple[BrightPixels | None, DeadPixels | None], shape: Sha
         scratch_of_thread(),
         values,
     )
-    return SiteMap(values.reshape(-1), (width, 1))
+    return SiteMap(values.reshape(-1), (width, 1)) if values.any() else NO_DEFECTS
 
 
 @kernel

@@ -119,7 +119,7 @@ def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -
     )
 
 
-_scenes = [functools.lru_cache(maxsize=count)(_scene) for count in (256, 4)]
+_scenes = [functools.lru_cache(maxsize=count)(_scene) for count in (1024, 4)]
 """Scenes of 256 codes (18 kB each) and of 65,536 codes (5 MB each), of which the last ones are kept."""
 
 

@@ -41,11 +41,20 @@ def electron_noise(
     origin: tuple[int, int],
 ) -> Electrons:
     """Return the noise of frames of one body."""
-    has_columns = any(slots.columns or slots.fixed_columns for slots in frames)
-    left = origin[1] // BLOCK * BLOCK if has_columns else 0
-    noise = _electron_noise(frames, padded_width(origin[1], shape[1]), (origin[0] % 2, left))._replace(body=body)
+    columns, top, left = padded_width(origin[1], shape[1]), origin[0] % 2, origin[1] // BLOCK * BLOCK
+    members: dict[str, Any] = {"body": body}
+    if any(slots.columns for slots in frames):  # new in every frame
+        noise = _electron_noise(frames, columns, (top, left))
+    elif any(slots.fixed_columns for slots in frames):
+        noise = _electron_noise(frames, -(-(left + columns) // _COLUMNS) * _COLUMNS, (top, 0))
+        for name in ("columns_dn", "fixed_columns_dn", "base_dn"):
+            members[name] = np.ascontiguousarray(getattr(noise, name)[..., left : left + columns])
+        members["padded_width"] = columns
+    else:
+        noise = _electron_noise(frames, columns, (top, 0))
     if any(slots.rows and slots.rows.correlation for slots in frames):
-        noise = noise._replace(rows_dn=_correlated_rows(frames, origin[0], shape[0]), rows_step=shape[0])
+        members |= {"rows_dn": _correlated_rows(frames, origin[0], shape[0]), "rows_step": shape[0]}
+    noise = noise._replace(**members)
     offsets, step = body.sites_dn, 0
     if any(slots.has_site_offsets for slots in frames):
         pitch, first, step = noise.padded_width, origin[1] % BLOCK, noise.padded_width * shape[0]
@@ -64,9 +73,13 @@ def electron_noise(
     return noise._replace(numbers=numbers, sites_dn=offsets, sites_step=step)
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=256)
 def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, int]) -> Electrons:
-    """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
+    """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it.
+
+    Crops of a body whose columns are fixed cut theirs from 1024 or more: each of their own takes a tenth of a crop of
+    128 x 128.
+    """
     first, members = frames[0], _members_of_sites(frames, origin[0])
     columns_dn = np.stack([_columns_dn(slots, columns, origin[1]) for slots in frames])
     base_dn = columns_dn.reshape(len(frames), 1, -1, VECTOR_WIDTH) + members["planes_dn"][:, :, None]

@@ -58,7 +58,7 @@ def variance_lines(plans: tuple[Plan, ...], dtype: Any = np.float64) -> NDArray[
         return np.array([plan.noise.variance_line for plan in plans]).astype(dtype)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=1024)
 def gaussian_noise(plans: tuple[Plan, ...]) -> Gaussian:
     """Return the noise of the plans' frames."""
     lines, error, _, quadratics = normal.normal_quantiles()

@@ -37,13 +37,11 @@ def philox_keys(plans: Sequence[Plan], epoch: int | None = None) -> NDArray[np.u
 
     ``epoch`` replaces that of the plans.
     """
-    keys = [plan.stream_key for plan in plans]
-    noises = [plan.noise for plan in plans]
-    words = [noise.frame_word if epoch is None else frame_word(noise.frame, epoch) for noise in noises]
-    rows = [
-        (key & 0xFFFFFFFF, key >> 32, noise.level << 12 | noise.draw, word)
-        for key, noise, word in zip(keys, noises, words, strict=True)
-    ]
+    rows = []
+    for plan in plans:
+        key, noise = plan.stream_key, plan.noise
+        word = frame_word(noise.frame, noise.epoch if epoch is None else epoch)
+        rows.append((key & 0xFFFFFFFF, key >> 32, noise.level << 12 | noise.draw, word))
     return np.array(rows, dtype=np.uint64)
 
 

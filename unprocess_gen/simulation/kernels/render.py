@@ -8,7 +8,7 @@ contains only what a pair needs. Every form gives the same DN as `pair.reference
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,6 @@ def render_pairs(
     plans: Sequence[Plan],
     origin: tuple[int, int] = (0, 0),
     dark_pixels: DarkPixels | None = None,
-    epoch: int | None = None,
 ) -> list[Pair]:
     """Simulate pairs that share the clean frame, in one pass.
 
@@ -57,21 +56,36 @@ def render_pairs(
         Row and column of ``srgb[0, 0]`` in the full frame.
     dark_pixels : DarkPixels, optional
         Access to the dark frames that the plans name.
-    epoch : int, optional
-        Epoch in place of that of the plans, which then name no dark frame. The records of a plan serve all its epochs:
-        preparing them for each would take longer than a patch of 128 x 128.
 
     Returns
     -------
     list of Pair
         One pair per plan; all share the clean array.
     """
-    clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin, dark_pixels, epoch)
-    clean_low, clean_high, _, _, saturated, _, light_high = counts[0]
-    light = None if plans[0].scene.exposure == 1 else light_high
+    clean, noisy, numbers = _fill_frames(srgb, plans, len(plans), origin, dark_pixels)
+    counts = _counts_of(numbers, plans[0])
+    return [Pair(clean, frame, counted) for frame, counted in zip(noisy, counts, strict=True)]
+
+
+def render_crop(
+    srgb: Srgb, plan: Plan, origin: tuple[int, int], epoch: int
+) -> tuple[Frame, Frame, Callable[[], Counts]]:
+    """Simulate the pair of a crop in an epoch in place of the plan's, without a dark frame: frames, and their counts.
+
+    The records of a plan serve all its epochs: preparing them for each would take longer than a patch of 128 x 128. The
+    counts are built when they are asked for, because a record of Python takes 5 µs.
+    """
+    clean, noisy, numbers = _fill_frames(srgb, [plan], 1, origin, None, epoch)
+    return clean, noisy[0], lambda: _counts_of(numbers, plan)[0]
+
+
+def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
+    """Return the counts of frames that share the clean frame."""
+    clean_low, clean_high, _, _, saturated, _, light_high = numbers[0].tolist()
+    light = None if plan.scene.exposure == 1 else light_high
     return [
-        Pair(clean, frame, Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, light))
-        for frame, (_, _, noisy_low, noisy_high, _, zero_variance, _) in zip(noisy, counts, strict=True)
+        Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, light)
+        for _, _, noisy_low, noisy_high, _, zero_variance, _ in numbers.tolist()
     ]
 
 
@@ -87,7 +101,7 @@ def _fill_frames(
     origin: tuple[int, int],
     dark_pixels: DarkPixels | None,
     epoch: int | None = None,
-) -> tuple[Frame, Frame, list[list[int]]]:
+) -> tuple[Frame, Frame, NDArray[np.int64]]:
     """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`.
 
     Only the first numbers include those of the clean frame.
@@ -104,7 +118,7 @@ def _fill_frames(
     codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
     keys, frames = philox_keys(plans, epoch)[:count], (clean.reshape(-1), noisy.reshape(count, clean.size))
     _render(codes, scene, noise, keys, origin, readout, scratch, *frames, counts)
-    return clean, noisy, counts.tolist()
+    return clean, noisy, counts
 
 
 def _records(
@@ -127,7 +141,7 @@ def _records(
     if not first.noise.counts_electrons:
         return scene, gaussian_noise(plans), readout
     frames = tuple(slots_in_epoch(plan, epoch) for plan in plans)
-    body = body_of(frames[0].patterns, shape, origin)
+    body = body_of(frames[0].patterns, shape, origin, is_live=epoch is not None)
     factor = light_factor(frames[0].patterns, body, shape, origin, first.noise.averaged)
     if factor is not None:
         scene = with_response(scene, factor)
