@@ -9,6 +9,7 @@ standard output. Without photographs, the sources are JPEG files of built-in sce
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import platform
@@ -27,7 +28,7 @@ from unprocess_gen.reports.benchmark.timing import measure_in_turns, median_rati
 from unprocess_gen.simulation.reference.colour import CAMERAS, RGB2XYZ
 from unprocess_gen.sources.scenes import synthetic
 
-SIDE, PATCHES, BATCH = 128, 16, 16
+SIDE, PATCHES, BATCH, REPEATS = 128, 16, 16, 6
 TWO, FAST = ("noise=imx385_iso3200",), ("noise=imx385_iso3200", "accuracy=fast")
 NIGHT, DAYLIGHT = ("noise=sony_a7s2", "scene=night"), ("noise=sony_a7s2", "scene=daylight")
 GOALS = {
@@ -41,13 +42,13 @@ GOALS = {
 DECODE_GOAL = 1.2
 
 
-def write_scenes(folder: Path, count: int = 40) -> None:
-    """Write JPEG files of 1024 x 1536 pixels, each of four built-in scenes."""
+def write_scenes(folder: Path, count: int = 16) -> None:
+    """Write JPEG files of 2048 x 2304 pixels, each of twelve built-in scenes."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [name for name in synthetic.NAMES if synthetic.scene(name).shape == (512, 768, 3)]
     for number in range(count):
-        parts = [synthetic.scene(names[(4 * number + 7 * n) % len(names)]) for n in range(4)]
-        picture = np.vstack([np.hstack(parts[:2]), np.hstack(parts[2:])])
+        parts = [synthetic.scene(names[(number + n) % len(names)]) for n in range(12)]
+        picture = np.vstack([np.hstack(parts[n : n + 3]) for n in range(0, 12, 3)])
         cv2.imwrite(str(folder / f"{number:03}.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
 
 
@@ -71,12 +72,12 @@ def numpy_pairs(folder: Path, cache: Path, redraw: str) -> NumpyPairs:
     return NumpyPairs(rows, pixels.__getitem__, SIDE, draw)
 
 
-def us_per_item(pairs: Any, epoch: int) -> float:
-    """Processor time of an item in this thread, µs, over one epoch."""
+def us_per_item(pairs: Any, epoch: int, repeats: int = 1) -> float:
+    """Processor time of an item in this thread, µs, over epochs from ``repeats * epoch`` on."""
     start = time.thread_time()
-    for number in range(len(pairs)):
-        _ = pairs[epoch, number]
-    return (time.thread_time() - start) / len(pairs) * 1e6
+    for item in itertools.product(range(repeats * epoch, repeats * (epoch + 1)), range(len(pairs))):
+        _ = pairs[item]
+    return (time.thread_time() - start) / len(pairs) / repeats * 1e6
 
 
 def summary(times: dict[str, list[float]], side: str, against: str, goal: float) -> dict[str, Any]:
@@ -96,7 +97,7 @@ def measure_goals(out: Path, photos: Path, cache: Path, rounds: int) -> dict[str
         sides = {"live": live, "numpy": numpy_pairs(folder, cache, redraw)}
         for pairs in sides.values():
             us_per_item(pairs, 0)  # compiles kernels and maps files
-        calls = {side: lambda n, pairs=pairs: us_per_item(pairs, n + 1) for side, pairs in sides.items()}
+        calls = {side: lambda n, pairs=pairs: us_per_item(pairs, n + 1, REPEATS) for side, pairs in sides.items()}
         results[name] = summary(measure_in_turns(calls, rounds), "live", "numpy", goal)
     return results
 
