@@ -88,7 +88,7 @@ def items_of(pairs: Any) -> Items:
 def test_epoch_0_is_the_stored_dataset(made: dict[str, Path], tmp_path: Path) -> None:
     for name, folder in made.items():
         stored = ug.RawPairs(folder)
-        names = stored[0].row["targets"].split(";") if stored[0].row.get("targets") else []
+        names = list(stored[0].targets)
         for redraw in ("noise", "all", "none"):
             live = ug.LivePairs(folder, redraw=redraw, cache=tmp_path / "cache", targets=names)
             assert items_of(live) == items_of(stored), (name, redraw)
