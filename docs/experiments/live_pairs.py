@@ -45,9 +45,10 @@ DECODE_GOAL = 1.2
 def write_scenes(folder: Path, count: int = 16) -> None:
     """Write JPEG files of 2048 x 2304 pixels, each of twelve built-in scenes."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = [name for name in synthetic.NAMES if synthetic.scene(name).shape == (512, 768, 3)]
+    names = [name for name in synthetic.NAMES if name not in synthetic.SIZES][:count]
+    scenes = [synthetic.scene(name) for name in names]
     for number in range(count):
-        parts = [synthetic.scene(names[(number + n) % len(names)]) for n in range(12)]
+        parts = [scenes[(number + n) % len(scenes)] for n in range(12)]
         picture = np.vstack([np.hstack(parts[n : n + 3]) for n in range(0, 12, 3)])
         cv2.imwrite(str(folder / f"{number:03}.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
 
