@@ -28,7 +28,7 @@ def fill(folder: Path, numbers: list[int]) -> list[Pixels]:
 
 
 def refuse() -> Pixels:
-    raise AssertionError("decoded again")
+    raise AssertionError("decoded twice")
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def refuse() -> Pixels:
     ],
     ids=["last byte", "half", "empty", "text", "one bit", "digest", "zeros after a loss of power"],
 )
-def test_a_damaged_file_is_decoded_and_written_again(damage: Any, tmp_path: Path) -> None:
+def test_a_damaged_file_is_replaced(damage: Any, tmp_path: Path) -> None:
     fill(tmp_path, [3])
     file = tmp_path / "3.npy"
     file.write_bytes(damage(intact := file.read_bytes()))

@@ -1,7 +1,7 @@
 """Keep decoded pixels in files that processes map into memory, 3 bytes a pixel: reading a patch takes microseconds.
 
 A file is an NPY array, then the XXH3-128 of its pixels as 32 hex digits. Each process compares them when it first maps
-the file. A damaged file is decoded and written again.
+the file. A damaged file is replaced.
 """
 
 from __future__ import annotations
