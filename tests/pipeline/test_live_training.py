@@ -98,6 +98,7 @@ def test_epoch_0_is_the_stored_dataset(made: dict[str, Path], tmp_path: Path) ->
             assert items_of(ug.LivePairs(folder, split=split)) == items_of(ug.RawPairs(folder, split=split))
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes:UserWarning")
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.parametrize("workers", [0, 1, 2, 4])
 def test_loaders_give_the_same_items(workers: int, method: str, made: dict[str, Path], tmp_path: Path) -> None:
