@@ -1,4 +1,4 @@
-"""Draw page.png, figure6.png and dng.png for the documentation: python .readme/draw_pages.py.
+"""Draw page.png, sweep.jpg, figure6.png and dng.png for the documentation: python .readme/draw_pages.py.
 
 They show the report of a dataset, a figure of the article and DNG files, made from built-in scenes in a temporary
 folder. Requires the extras figures and dng, rawpy, and Chromium.
@@ -36,6 +36,23 @@ def developed(path: Path) -> np.ndarray:
         return raw.postprocess(use_camera_wb=True, no_auto_bright=True, bright=2.0, adjust_maximum_thr=0)
 
 
+def screenshot(page: Path, height: int) -> np.ndarray:
+    """Return the top of a page, RGB, at half size."""
+    to = page.with_suffix(".png")
+    shot = (f"--window-size=1220,{height}", f"--screenshot={to}", f"--user-data-dir={page.parent}/profile")
+    subprocess.run([*BROWSER, *shot, page.as_uri()], check=True, capture_output=True)
+    return cv2.resize(cv2.imread(str(to), cv2.IMREAD_COLOR_RGB), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+
+
+def draw_sweep() -> None:
+    """Generate a sweep of built-in scenes, and write the picture of its page."""
+    with tempfile.TemporaryDirectory() as name:
+        gen_dataset("+sweep=camera_by_iso", f"out={name}/sweep", "source.limit=2", "n_jobs=1")
+        gen_dataset("report", f"{name}/sweep")
+        picture = screenshot(Path(name) / "sweep" / "report.html", 1130)
+    cv2.imwrite(str(HERE / "sweep.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+
+
 def main() -> None:
     """Generate a dataset, its report, DNG files and figures; write the three pictures."""
     with tempfile.TemporaryDirectory() as name:
@@ -56,3 +73,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+    draw_sweep()

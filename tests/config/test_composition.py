@@ -12,7 +12,6 @@ from pathlib import Path
 
 import hydra
 import pytest
-from helpers.cases import slow_except
 from helpers.processes import WAIT_S, processes_per_core
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
@@ -249,9 +248,7 @@ sys.exit(main.main())
 
 
 @pytest.mark.linux_only("Windows ends a process instead of sending it a signal")
-@pytest.mark.parametrize(
-    ("name", "code"), slow_except([("SIGINT", 130)], [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-)
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_signals_end_composing_within_two_seconds(name: str, code: int, own: Path) -> None:
     number = signal.Signals[name]
     process = subprocess.Popen([sys.executable, "-c", SLOW], cwd=own.parent, stderr=subprocess.PIPE, text=True)

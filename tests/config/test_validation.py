@@ -103,6 +103,7 @@ accuracy: reference exact fast
 output: webdataset
 executor: local dask
 experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training
+experiment: many_highlights no_highlights
 sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
 """
 """Options that commands of users name."""

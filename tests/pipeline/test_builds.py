@@ -70,7 +70,7 @@ def test_list_names_every_build(run_main: RunMain) -> None:
 def test_build_has_the_recorded_bytes_also_when_it_is_repeated(run_main: RunMain, tmp_path: Path) -> None:
     first, second = (run_main("build", SMALL, "--to", "here", "n_jobs=1") for _ in range(2))
     assert (first.code, second.code) == (0, 0)
-    assert first.out.splitlines()[-1].startswith(f"here is the build {SMALL}, bit for bit")
+    assert first.out.splitlines()[-1] == f"here is the build {SMALL}, bit for bit"
     assert "nothing to do" in second.out
     assert len(ug.RawPairs(tmp_path / "here")) == len(read_build(SMALL).rows())
 

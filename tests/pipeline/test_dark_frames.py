@@ -342,10 +342,8 @@ def test_noise_of_dark_frames_is_checked_with_their_folder(make: Make, run_main:
 @pytest.mark.parametrize(
     "overrides",
     [
-        *(NOISE, (*NOISE, "effects.all=on"), pytest.param((*NOISE, "accuracy=fast"), marks=pytest.mark.slow)),
-        pytest.param(
-            ("noise=canon_5d4", "scene=night", "output.dtype=float32", "sensor.clip=none"), marks=pytest.mark.slow
-        ),
+        *(NOISE, (*NOISE, "accuracy=fast"), (*NOISE, "effects.all=on")),
+        ("noise=canon_5d4", "scene=night", "output.dtype=float32", "sensor.clip=none"),
     ],
 )
 def test_sums_of_dark_frames_raise_no_alarm(overrides: tuple[str, ...], shading: str, darks: Path) -> None:

@@ -286,9 +286,10 @@ def with_large_undisturbed(with_large: Path, made_hash: MadeHash) -> str:
     return made_hash(with_large, ONE, LEVELS)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n_jobs", [1, 2])
-@pytest.mark.parametrize("megabytes", [20, 100])
+@pytest.mark.parametrize(
+    ("n_jobs", "megabytes"),
+    [(1, 100), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 20), (1, 20), (2, 100)))],
+)
 def test_out_of_memory_is_reported_and_rerun_completes_dataset(
     n_jobs: int,
     megabytes: int,

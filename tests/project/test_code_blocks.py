@@ -154,8 +154,6 @@ def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:rdflib")  # below mlcroissant
-@pytest.mark.filterwarnings("ignore:DataFrame is highly fragmented", "ignore:unclosed file:ResourceWarning")
 @pytest.mark.parametrize(
     "path",
     [

@@ -34,7 +34,7 @@ ONLY_IN = {
     "cv2": {
         *("sources.image.decode", "sources.mosaics", "simulation.reference.isp", "pipeline.worker"),
         *("reports.dataset_page.page", "reports.sheets.contact_sheet", "reports.sheets.panels"),
-        *("reports.benchmark.complete_runs", "reports.explorer.views", "camera_noise"),
+        *("reports.benchmark.complete_runs", "reports.explorer.views", "reports.sweep_page", "camera_noise"),
     },
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},

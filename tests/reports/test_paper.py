@@ -26,7 +26,7 @@ from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.simulation.reference.cfa import PATTERNS
 from unprocess_gen.sources.scenes import synthetic
 
-FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
+FILES = [*(f"fig{number}.png" for number in range(1, 8)), "figures.html"]
 
 
 @pytest.fixture(scope="module")

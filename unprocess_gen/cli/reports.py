@@ -16,7 +16,7 @@ from unprocess_gen.cli.hydra_app import compose
 from unprocess_gen.cli.messages import print_result
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
-from unprocess_gen.cli.sweep import plan_totals
+from unprocess_gen.cli.sweep import plan_totals, read_table, swept_keys
 from unprocess_gen.config.option_files import group_options
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.paths import any_path, local_path
@@ -126,10 +126,12 @@ def _report_folder(config: Config, verb: str) -> Path:
 
 
 def report(call: Call) -> int:
-    """Write the HTML page of a dataset, or its card."""
+    """Write the HTML page of a dataset or a sweep, or the card of a dataset."""
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
 
-    folder = dataset_folder(call)
+    folder = dataset_folder(call, sweeps=True)
+    if isinstance(folder, Path) and (folder / "sweep.csv").is_file() and not (folder / "dataset.json").exists():
+        return _report_sweep(folder, call)
     _check_card_arguments(call)
     if "card" in call.values:
         return _card(call, folder)
@@ -144,6 +146,16 @@ def report(call: Call) -> int:
         if to is None and isinstance(folder, Path) and not os.access(folder, os.W_OK):
             raise MachineError(f"{folder}: the page cannot be written to the dataset; give --to FILE") from error
         raise
+    return 0
+
+
+def _report_sweep(folder: Path, call: Call) -> int:
+    from unprocess_gen.reports.sweep_page import write_sweep_page
+
+    if others := sorted(call.values.keys() & {"card", *FOR_PAGE, *FOR_CARD}):
+        raise ConfigError(f"report: {folder}: is a sweep; --{others[0]} is for one of its datasets; leave it out")
+    to, jobs = call.values.get("to"), read_table(folder / "sweep.csv")
+    print_result(write_sweep_page(folder, jobs, swept_keys(jobs), None if to is None else Path(to)))
     return 0
 
 

@@ -147,7 +147,7 @@ def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:
         if not job.generated and seconds:
             row["seconds"] = seconds
         rows[job.folder] = row
-    keys = dict.fromkeys(key for row in rows.values() for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS})
+    keys = swept_keys(rows.values())
     temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
     try:
         with temporary.open("w", encoding="utf-8", newline="") as stream:
@@ -171,6 +171,11 @@ def read_table(path: Path) -> list[dict[str, str]]:
             f"{path}: no table of a sweep ({error}); expected CSV in UTF-8; move the file away and rerun"
         ) from error
     return [{column: text for column, text in row.items() if column} for row in rows if row.get("folder")]
+
+
+def swept_keys(rows: Iterable[Mapping[str, str]]) -> list[str]:
+    """Return the keys that a sweep varies: the columns of its table between those of every sweep."""
+    return list(dict.fromkeys(key for row in rows for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS}))
 
 
 def plan_totals(estimates: Sequence[RunEstimate]) -> str:

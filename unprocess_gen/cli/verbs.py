@@ -148,7 +148,7 @@ _VERBS = (
     ),
     Verb(
         "report",
-        "write an HTML page about a dataset, or its card: README.md and croissant.json",
+        "write an HTML page about a dataset or a sweep, or the card of a dataset",
         "reports.report",
         (
             _to("write FILE instead of DIR/report.html; with --card, a folder", "FILE"),
@@ -157,7 +157,7 @@ _VERBS = (
             Argument(("--published",), "with --card: date of publication", "DATE", _date, "a date, such as 2026-01-31"),
             *INPUTS,
         ),
-        DATASET,
+        Place("DIR", "the folder of a dataset or of a sweep"),
     ),
     Verb(
         "explore",

@@ -216,7 +216,7 @@ def real_quantile(rate: float, w: float) -> float:
 RATES = (LOW_RATE, 5.6, 6.3, 7.1, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9)
 
 
-@pytest.mark.parametrize("rate", slow_except((LOW_RATE, 8.3, 25.0, 1e9), RATES))
+@pytest.mark.parametrize("rate", slow_except((LOW_RATE, 8.3, 25.0, *RATES[12:]), RATES))
 def test_the_first_terms_are_within_their_error(rate: float) -> None:
     """What remains of the bound is for the words between those that are tested."""
     reach = min(math.sqrt(NORMAL_REACH2[0] + NORMAL_REACH2[1] * math.sqrt(rate)), 6.3)
@@ -284,11 +284,7 @@ def test_counts_of_low_rates_are_within_their_bounds(inside: tuple[float, ...], 
 
 @pytest.mark.parametrize("rate_error", [-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE])
 @pytest.mark.parametrize(
-    "rate",
-    slow_except(
-        (5.0, 8.1, 25.0, 100.3, 2.0**21),
-        (5.0, 5.1, 6.3, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21),
-    ),
+    "rate", [5.0, 5.1, 6.3, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21]
 )
 def test_counts_by_expansion_are_within_their_bounds(rate: float, rate_error: float) -> None:
     assert wrong(rate, 20_000, rate_error) == 0

@@ -1,4 +1,4 @@
-"""Draw Figures 2 to 7 of the article from a photograph: ``fig2.png`` … ``fig7.png`` and a page with captions.
+"""Draw Figures 1 to 7 of the article from a photograph: ``fig1.png`` … ``fig7.png`` and a page with captions.
 
 The figures are computed with the code that makes datasets. The template of the page has the captions, with differences
 from the article's text; the functions give it the numbers of the photograph. Raw frames are grey, from the lowest DN
@@ -30,6 +30,7 @@ from unprocess_gen.reports.html_pages import PageTable, render_page
 from unprocess_gen.reports.paper import pictures
 from unprocess_gen.reports.paper.pictures import BLUE, GREEN, GREY, INK, ORANGE, PaperFigure, percent, show_picture
 from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.reports.sheets.contact_sheet import processing_steps
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import isp, unprocess
 from unprocess_gen.simulation.reference.cfa import mosaic, tile
@@ -158,7 +159,7 @@ def saturated_sites(srgb: Srgb, pattern: str) -> NDArray[np.bool_]:
 
 
 def draw_figures(config: Config, options: PaperOptions) -> list[PaperFigure]:
-    """Draw Figures 2 to 7 for the first readable photograph of the source of a validated config.
+    """Draw Figures 1 to 7 for the first readable photograph of the source of a validated config.
 
     ConfigError if no photograph can be read, or ``source.patch`` is set.
     """
@@ -170,7 +171,10 @@ def draw_figures(config: Config, options: PaperOptions) -> list[PaperFigure]:
             "leave it out"
         )
     source = load_figure_source(config, options)
-    draw = (draw_tone, draw_gamma, draw_highlight_function, draw_default_raw, draw_saturation, draw_highlights)
+    draw = (
+        *(draw_steps, draw_tone, draw_gamma, draw_highlight_function, draw_default_raw, draw_saturation),
+        draw_highlights,
+    )
     with rc_context(pictures.STYLE):
         return [function(source) for function in draw]
 
@@ -194,6 +198,22 @@ def _draw_inverse(axes: Axes, inputs: Float, forward: tuple[Float, str], inverse
         axes.plot(inputs, values, color=colour, label=label)
     limits = {"xlabel": "input", "ylabel": "output", "xlim": (0, most), "ylim": (0, most), "aspect": "equal"}
     pictures.finish_curves(axes, "curves", **limits)
+
+
+def draw_steps(source: FigureSource) -> PaperFigure:
+    """Figure 1: the photograph after each step of unprocessing, and the mosaic."""
+    plan, small = source.plans[DEFAULT_GAINS], pictures.small_photograph(source.srgb)
+    figure, axes = pictures.panel_grid(2, 3, 9.4, pictures.panel_aspect(source.srgb))
+    panels = iter(axes)
+    show_picture(next(panels), small, "photograph")
+    numbers = []
+    for number, (title, note, image) in enumerate(processing_steps(small, plan), start=1):
+        show_picture(next(panels), np.clip(image, 0, 1), f"{number}. {title}")
+        numbers.append(f"{title} ({note})")
+    clean = make_pair(source.srgb, plan).clean
+    light = (pictures.block_means(clean, is_mosaic=True) - plan.sensor.black_level_dn) / plan.sensor.span_dn
+    show_picture(next(panels), light, "5. mosaic")
+    return PaperFigure("fig1.png", pictures.png(figure), {"name": source.name, "steps": "; ".join(numbers)})
 
 
 def draw_tone(source: FigureSource) -> PaperFigure:
@@ -261,7 +281,9 @@ def draw_highlight_function(source: FigureSource) -> PaperFigure:
         axes.axhline(1, color=GREY, linewidth=0.8)
         axes.set(xlabel="intensity i", ylabel="f(i)", xlim=limits, ylim=(0, 1.25))
         axes.set_title(title, loc="left")
-    panels[0].legend(title="inverse gain 1/g", frameon=False, fontsize=8)
+    lines, labels = panels[0].get_legend_handles_labels()
+    options = {"title": "inverse gain 1/g", "ncols": len(lines), "frameon": False, "fontsize": 8}
+    figure.legend(lines, labels, loc="outside lower center", **options)
     weakest = min(inverse_gains)
     slope = weakest + (1 - weakest) * (1 + 2 / (1 - HIGHLIGHT_THRESHOLD))
     return PaperFigure("fig4.png", pictures.png(figure), {"weakest": f"{weakest:.3g}", "slope": f"{slope:.0f}"})
@@ -273,9 +295,10 @@ def draw_default_raw(source: FigureSource) -> PaperFigure:
     pair, authors_pair = make_pair(source.srgb, plan), make_pair(source.srgb, authors)
     figure, axes = pictures.panel_grid(2, 3, 9.4, max(pictures.panel_aspect(source.srgb), 0.8))
     show_picture(axes[0], pictures.small_photograph(source.srgb), "(a) photograph")
-    pictures.show_stretched(axes[1], pair.clean, "(b) clean raw frame")
-    pictures.show_stretched(axes[2], pair.noisy, "(c) noisy raw frame")
-    crop = _typical_crop(pair.clean)
+    for panel, frame, title in ((axes[1], pair.clean, "(b) clean raw"), (axes[2], pair.noisy, "(c) noisy raw")):
+        limits = float(frame.min()), float(frame.max())
+        show_picture(panel, pictures.green_sites(frame, plan.sensor.pattern), f"{title}, green sites", *limits)
+    crop = _detailed_crop(source.srgb)
     limits = float(pair.clean[crop].min()), float(pair.clean[crop].max())
     show_picture(axes[3], pair.clean[crop].astype(np.float64), "(d) crop of the clean frame", *limits)
     show_picture(axes[4], pair.noisy[crop].astype(np.float64), "(d) same crop, noisy", *limits)
@@ -295,12 +318,17 @@ def draw_default_raw(source: FigureSource) -> PaperFigure:
     return PaperFigure("fig5.png", pictures.png(figure), numbers)
 
 
-def _typical_crop(clean: Frame) -> tuple[slice, slice]:
-    """The square of `CROP_PX` sites with the median standard deviation; its corner has even coordinates."""
-    side = min(CROP_PX, *(max(length - length % 2, 1) for length in clean.shape))
-    rows, columns = (range(0, length - side + 1, side) for length in clean.shape)
+DETAILED = 0.9
+"""Share of the crops with less contrast than the one shown: of the median, many photographs show nothing but sky."""
+
+
+def _detailed_crop(srgb: Srgb) -> tuple[slice, slice]:
+    """The square of `CROP_PX` sites at the quantile `DETAILED` of the contrast, from even coordinates."""
+    side = min(CROP_PX, *(max(length - length % 2, 1) for length in srgb.shape[:2]))
+    rows, columns = (range(0, length - side + 1, side) for length in srgb.shape[:2])
     squares = [(slice(y, y + side), slice(x, x + side)) for y in rows for x in columns]
-    return sorted(squares, key=lambda square: float(clean[square].std()))[len(squares) // 2]
+    squares.sort(key=lambda square: float(srgb[square].mean(axis=-1).std()))
+    return squares[int(DETAILED * (len(squares) - 1))]
 
 
 def draw_saturation(source: FigureSource) -> PaperFigure:

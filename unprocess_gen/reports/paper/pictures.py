@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Frame, Srgb
 from unprocess_gen.reports.html_pages import PageTable
-from unprocess_gen.simulation.reference.cfa import CHANNELS, mosaic
+from unprocess_gen.simulation.reference.cfa import CHANNELS, mosaic, tile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,6 +54,12 @@ def block_means(image: NDArray[Any], most: int = MOST_PX, is_mosaic: bool = Fals
 def small_photograph(srgb: Srgb) -> FloatImage:
     """A photograph at reduced size, ``[h, w, 3]`` in [0, 1]."""
     return block_means(srgb) / float(np.iinfo(srgb.dtype).max)
+
+
+def green_sites(raw: Frame, pattern: str, most: int = MOST_PX) -> FloatImage:
+    """A green site of every tile, or of every few tiles of a large mosaic: not averaged, so that its noise shows."""
+    step = 2 * max(1, -(-max(raw.shape) // (2 * most)))
+    return np.asarray(raw[::step, tile(pattern)[0].index(1) :: step], dtype=np.float64)
 
 
 def channel_fractions(mask: NDArray[np.bool_], pattern: str, most: int = MOST_PX) -> FloatImage:

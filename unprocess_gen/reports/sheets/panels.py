@@ -50,10 +50,10 @@ Window = tuple[slice, slice]
 """The rows and columns of a detail."""
 
 
-def detail_window(shape: tuple[int, ...]) -> Window:
-    """Find the centre of a frame, which begins at an even row and column like the Bayer tile."""
-    starts = [max(0, length - most) // 4 * 2 for length, most in zip(shape, PANEL_PX, strict=True)]
-    ends = [start + min(length, most) for start, length, most in zip(starts, shape, PANEL_PX, strict=True)]
+def detail_window(shape: tuple[int, ...], panel_px: tuple[int, int] = PANEL_PX) -> Window:
+    """Find the centre of a frame that fits into a panel, which begins at an even row and column like the Bayer tile."""
+    starts = [max(0, length - most) // 4 * 2 for length, most in zip(shape, panel_px, strict=True)]
+    ends = [start + min(length, most) for start, length, most in zip(starts, shape, panel_px, strict=True)]
     return slice(starts[0], ends[0]), slice(starts[1], ends[1])
 
 
