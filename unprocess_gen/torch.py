@@ -41,7 +41,7 @@ class DevelopmentParameters(NamedTuple):
     Attributes
     ----------
     pattern, highlight, tone : ndarray of int64, []
-        Positions in `FILTERS`, ``isp.HIGHLIGHTS`` and ``isp.TONES``.
+        Positions in ``FILTERS``, ``isp.HIGHLIGHTS`` and ``isp.TONES``.
     gamma : ndarray of float64, []
         Exponent; 0 for the curve of sRGB.
     levels_dn : ndarray of float64, [2]

@@ -475,7 +475,7 @@ def test_folder_of_a_sweep_is_refused_instead_of_a_dataset(moved: Path, run_main
     (tmp_path / "sweep").mkdir()
     (tmp_path / "ds").rename(tmp_path / "sweep/seed=1")
     (tmp_path / "sweep/sweep.csv").touch()
-    for verb in ("replay", "report", *REQUIRED):
+    for verb in ("replay", *REQUIRED):
         done = run_main(verb, "sweep", *REQUIRED.get(verb, ()))
         expected = (
             f"gen-dataset: {verb}: sweep: is the folder of a sweep; expected one of its datasets, such as sweep/seed=1"
@@ -568,7 +568,7 @@ NOISE_FILES = [
     (("--noise", "--to", "noise.txt"), "--to noise.txt: is not a PNG file"),
     (("--noise", "--to", "no/noise.png"), "--to no/noise.png: expected the name of a file in a folder that exists"),
     (("--noise", "--to", "moved/002.png"), "--to moved/002.png: exists and is not an earlier figure"),
-    (("--to", "noise.png"), "verify: --to noise.png: draws the fits of --noise; add --noise"),
+    (("--to", "noise.png"), "verify: --to noise.png: is for --noise or --against; add one of them"),
 ]
 
 

@@ -24,6 +24,7 @@ ONLY_IN = {
             "config.body_composition",
             "config.composition",
             "config.composition_errors",
+            "config.raw_composition",
             "config.serialization",
         ),
         *("cli.sweep_plugins", "config.recomposition", "config.sweep_expansion"),
