@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from unprocess_gen.config.interpretation import noise_levels
+from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.values import refusal
@@ -452,6 +453,7 @@ def key_identity(key: str | int) -> str:
 def _config_for_arrays(config: Config, seed: int | None) -> Config:
     """Return a validated copy of a config without the keys that choose files; ConfigError for patches."""
     _check_complete(config)
+    require_photographs(config.source, "make_pair, as plan_image and CameraNoise,")
     if config.source.patch is not None:
         problem = (
             "make_pair returns complete frames; expected null; cut the arrays of the pair at even rows and columns"

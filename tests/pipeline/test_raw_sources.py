@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +149,7 @@ def dataset(tmp_path: Path) -> Path:
 
 def test_datasets_of_raw_sources_are_complete(dataset: Path, tmp_path: Path) -> None:
     assert not ug.verify(dataset) and not any(result.complaint for result in ug.replay(dataset))
+    assert json.loads((dataset / "dataset.json").read_text())["versions"]["libraw"]
     pairs, live = ug.RawPairs(dataset), ug.LivePairs(dataset)
     assert len(pairs) == 4
     assert (live[0].noisy == pairs[0].noisy).all() and (live[1, 0].clean == pairs[0].clean).all()
@@ -197,6 +199,18 @@ REFUSED = {
 def test_settings_of_photographs_are_refused(tmp_path: Path, override: str) -> None:
     with pytest.raises(ConfigError, match=REFUSED[override]):
         raw_config(tmp_path, override)
+
+
+def test_functions_of_photographs_refuse_raw_sources(tmp_path: Path) -> None:
+    picture, config = np.zeros((8, 8, 3), np.uint8), raw_config(tmp_path)
+    calls = (
+        lambda: ug.make_pair(picture, config),
+        lambda: ug.plan_image(picture, config),
+        lambda: ug.CameraNoise(config),
+    )
+    for call in calls:
+        with pytest.raises(ConfigError, match=r"source\.kind=raw: .* pixels of photographs; expected srgb"):
+            call()
 
 
 @pytest.mark.parametrize("override", ["source.shrink=2", "source.own_noise=subtract", "sensor=source",

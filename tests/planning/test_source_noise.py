@@ -99,12 +99,12 @@ def test_ratio_compares_with_simulated_noise_at_the_same_signal(plan: Plan, line
 
 
 def test_sentence_counts_noisy_sources_and_names_the_remedy() -> None:
-    sentence = source_noise_sentence([0.1, 0.21, 0.4], downscale=2)
+    sentence = source_noise_sentence([0.1, 0.21, 0.4], "source.downscale=4")
     assert sentence is not None
     assert sentence.startswith("the noise of 2 of 3 sources exceeds a fifth of the simulated noise (0.1 to 0.4 of it)")
     assert sentence.endswith("source.downscale=4 averages it")
-    assert "downscale" not in (source_noise_sentence([0.1], downscale=1) or "")
-    assert source_noise_sentence([], downscale=1) is None
+    assert "downscale" not in (source_noise_sentence([0.1], "source.downscale=2") or "")
+    assert source_noise_sentence([], "source.downscale=2") is None
 
 
 # ------------------------------------------------------------------------------------------------------------ datasets

@@ -75,7 +75,7 @@ def test_unmatched_files_are_counted_by_suffix_with_advice(tmp_path: Path) -> No
 def test_folder_of_other_files_is_refused_with_their_suffixes(tmp_path: Path) -> None:
     for name in ("a.cr2", "b.dng", "c.dng"):
         (tmp_path / name).touch()
-    with pytest.raises(ConfigError, match=r"\(2 \.dng, 1 \.cr2\); convert \.cr2, \.dng to JPEG, PNG or TIFF; choose"):
+    with pytest.raises(ConfigError, match=r"\(2 \.dng, 1 \.cr2\); source\.kind=raw reads \.cr2, \.dng; choose"):
         list_folder(str(tmp_path), ["*.jpg"], True, None)
 
 

@@ -18,6 +18,7 @@ from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals, read_table, swept_keys
 from unprocess_gen.config.option_files import group_options
+from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.reports.formatting import counted
@@ -62,6 +63,7 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
             f"accuracy: noise.dark_frames={config.noise.dark_frames}: tiers are measured with the noise of a profile; "
             "expected null; leave it out"
         )
+    require_photographs(config.source, "accuracy")
     out = _report_folder(config, "accuracy")
     profiles = measure.BenchmarkProfiles(
         _tiers(),
@@ -99,6 +101,7 @@ def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, Non
     from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports.paper import figures as paper_figures
 
+    require_photographs(config.source, "figures")
     out = _report_folder(config, "figures")
     gains = {name: read_option("gains", name) for name in paper_figures.GAINS}
     authors = read_option("noise", paper_figures.AUTHORS_NOISE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from unprocess_gen.config.interpretation import is_physical, uses_dark_frames
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.config.values import refusal
 from unprocess_gen.simulation.reference.cfa import MONO
 
@@ -32,6 +32,13 @@ def check_raw_source(config: Config) -> None:
             raise refusal(f"source.raw.{name}", found, "describes raw files; expected null, or set source.kind=raw")
     if config.sensor.levels == "source":
         raise refusal("sensor.levels", "source", "photographs state no levels; choose a sensor, or set source.kind=raw")
+
+
+def require_photographs(source: SourceConfig, caller: str) -> None:
+    """Raise ConfigError if sources are raw frames and ``caller`` works on pixels of photographs only."""
+    if source.kind == "raw":
+        problem = f"{caller} works on pixels of photographs; expected srgb; generate a dataset of raw frames instead"
+        raise refusal("source.kind", "raw", problem)
 
 
 def _check_levels(config: Config) -> None:

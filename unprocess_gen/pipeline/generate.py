@@ -283,8 +283,17 @@ def dataset_json_facts(
         "source": source_facts(config),
         **_dark_facts(settings),
         "run": run | machine(),
-        "versions": {package: version(package) for package in PACKAGES},
+        "versions": {package: version(package) for package in PACKAGES} | _decoder_versions(config),
     }
+
+
+def _decoder_versions(config: Config) -> dict[str, str]:
+    """Return the versions that decide how raw frames are decoded."""
+    if config.source.kind != "raw":
+        return {}
+    import rawpy
+
+    return {"rawpy": version("rawpy"), "libraw": ".".join(map(str, rawpy.libraw_version))}
 
 
 def source_facts(config: Config) -> dict[str, Any]:

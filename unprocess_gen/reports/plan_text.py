@@ -10,7 +10,7 @@ import numpy as np
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.bodies import body_sentence
-from unprocess_gen.config.schema import BRANCH_FIELDS, TOGETHER, AccuracyConfig, Config, NoiseConfig
+from unprocess_gen.config.schema import BRANCH_FIELDS, TOGETHER, AccuracyConfig, Config, NoiseConfig, SourceConfig
 from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Patch, Plan
 from unprocess_gen.pipeline.sizes import shards_warning
@@ -154,7 +154,7 @@ def noise_lines(config: Config, estimates: Sequence[SourceEstimate], dark_frames
         *(_physical_lines if interpretation.is_physical(config.noise) else _two_number_lines)(config, plans),
         *_labelled("dark", [_dark_frames_sentence(config, dark_frames)] if dark_frames else []),
         *_labelled("highlight", [highlight_sentence([source.bands for source in estimates])]),
-        *_labelled("source", [source_noise_sentence(ratios, config.source.downscale)]),
+        *_labelled("source", [source_noise_sentence(ratios, averaging(config.source))]),
         *_labelled("warning", warnings),
         *effect_table(config, [level for source in estimates for level in source.predictions]),
     ]
@@ -300,15 +300,22 @@ NOISY_SOURCE = 0.2
 """Noise of a source, relative to the simulated noise, above which ``plan`` counts it: it adds 2 % to the total."""
 
 
-def source_noise_sentence(ratios: Sequence[float], downscale: int) -> str | None:
+def averaging(source: SourceConfig) -> str:
+    """Return the setting that averages the noise of sources further; empty if none is left."""
+    if source.kind == "raw":
+        return f"source.shrink={2 * source.shrink}" if source.shrink < 4 else ""
+    return f"source.downscale={2 * source.downscale}"
+
+
+def source_noise_sentence(ratios: Sequence[float], remedy: str) -> str | None:
     """Count the sources that bring visible noise into the clean frame, and name the remedy."""
     if not ratios:
         return None
     noisy = sum(ratio > NOISY_SOURCE for ratio in ratios)
-    remedy = f"; it stays in the clean frame: source.downscale={2 * downscale} averages it" if noisy else ""
+    advice = "; it stays in the clean frame" + (f": {remedy} averages it" if remedy else "") if noisy else ""
     return (
         f"the noise of {noisy} of {len(ratios)} sources exceeds a fifth of the simulated noise "
-        f"({value_range(ratios, 2)} of it){remedy}"
+        f"({value_range(ratios, 2)} of it){advice}"
     )
 
 

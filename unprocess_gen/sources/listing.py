@@ -40,12 +40,7 @@ NAMED_SUFFIXES = 5
 READABLE_SUFFIXES = frozenset((".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
 """Suffixes of photographs that can be decoded; `unmatched_sentence` advises to extend ``source.include``."""
 
-CONVERTIBLE_SUFFIXES = frozenset(
-    (
-        *(".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"),
-        *RAW_FILES,
-    )
-)
+CONVERTIBLE_SUFFIXES = frozenset((".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"))
 """Suffixes of pictures that photographs are not read from; `unmatched_sentence` advises to convert them."""
 
 
@@ -225,14 +220,15 @@ def unmatched_sentence(unmatched: dict[str, int]) -> str:
     others = sum(list(unmatched.values())[NAMED_SUFFIXES:])
     kinds = ", ".join([*named, *([f"{others} others"] if others else [])])
     files = "1 file is" if total == 1 else f"{total} files are"
-    readable, convertible = (
-        ", ".join(sorted(unmatched.keys() & suffixes)) for suffixes in (READABLE_SUFFIXES, CONVERTIBLE_SUFFIXES)
+    readable, convertible, raw = (
+        ", ".join(sorted(unmatched.keys() & suffixes))
+        for suffixes in (READABLE_SUFFIXES, CONVERTIBLE_SUFFIXES, set(RAW_FILES))
     )
     return (
         f"{files} not matched by source.include ({kinds})"
         + (f"; extend source.include to read {readable}" if readable else "")
         + (f"; convert {convertible} to JPEG, PNG or TIFF" if convertible else "")
-        + ("; source.kind=raw reads raw files" if unmatched.keys() & set(RAW_FILES) else "")
+        + (f"; source.kind=raw reads {raw}" if raw else "")
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from unprocess_gen.config.composition import OptionFolders
 from unprocess_gen.config.interpretation import entry_config
+from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.recomposition import Recomposition, override_text, overrides_of
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
@@ -57,6 +58,7 @@ def _path_text(path: str) -> str:
 
 def _open_sources(start: Exploration) -> Choices:
     config = start.composition.config(start.overrides).source
+    require_photographs(config, "explore")
     root = config.root
     is_folder = root is not None and config.list is None and not config.clips and root_path(root).is_dir()
 
@@ -92,6 +94,7 @@ def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
     """Return the settings of a dataset as overrides, whose pair is that of the row."""
     manifest, source, given = folder / "manifest.csv", source_of(row), dict(start.settings)
     config, kind = read_dataset_yaml(folder / "config.yaml")
+    require_photographs(config.source, "explore")
     if config.mixture is not None:
         config = replaced(entry_config(config, int(row["mixture"] or 0)), {"mixture": None})
     settings = overrides_of(config)
