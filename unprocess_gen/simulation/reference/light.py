@@ -40,16 +40,17 @@ class Light:
 
 
 LIGHTS: Mapping[str, Light] = {
-    # Colour temperatures: those that camera makers state for their presets (Canon EOS 5D Mark IV and Nikon D850
-    # manuals): daylight 5200 K, cloudy 6000 K, shade 7000 K and 8000 K, tungsten 3000 K and 3200 K. The ranges extend
-    # to what the presets are meant for: sun with sky 5000 to 5800 K, overcast to 6800 K, blue sky to 9000 K, household
-    # lamps from 2700 K. Scatter across the locus: 0.006 for fluorescent lamps, the tolerance of ANSI C78.377, and half
-    # of it for the others (chosen).
+    # Colour temperatures: those that camera makers state for their presets. Nikon (D800 manual, section White Balance):
+    # daylight 5200 K, cloudy 6000 K, shade 8000 K, incandescent 3000 K; others, not checked in a manual: shade 7000 K,
+    # tungsten 3200 K. The ranges extend to what the presets are meant for: sun with sky 5000 to 5800 K, overcast to
+    # 6800 K, blue sky to 9000 K, household lamps from 2700 K. Scatter across the locus: 0.006 for fluorescent lamps,
+    # the tolerance of ANSI C78.377, and half of it for the others (chosen).
     "daylight": Light(5000.0, 5800.0, True, 0.0, 0.003),
     "cloudy": Light(5800.0, 6800.0, True, 0.0, 0.003),
     "shade": Light(6800.0, 9000.0, True, 0.0, 0.003),
     "tungsten": Light(2700.0, 3200.0, False, 0.0, 0.003),
-    # EXIF 2.32, LightSource: white and cool white fluorescent lamps, 3200 to 4600 K.
+    # Exif, LightSource: white (3250 to 3800 K) and cool white (3800 to 4500 K) fluorescent lamps, widened by 50 K and
+    # 100 K.
     "fluorescent": Light(3200.0, 4600.0, False, 0.003, 0.006),
     # CIE 15: D50 and D65 are 5003 K and 6504 K on the daylight locus, A is 2856 K on Planck's.
     "d65": Light(6504.0, 6504.0, True),
@@ -60,7 +61,7 @@ LIGHTS: Mapping[str, Light] = {
 
 
 def daylight_xy(kelvin: float) -> XY:
-    """Return the chromaticity of a phase of daylight (CIE 15).
+    """Return the chromaticity of a phase of daylight (CIE 15:2004, section 3.1).
 
     Parameters
     ----------
