@@ -90,11 +90,11 @@ class SourceConfig(Group):
 
     Attributes
     ----------
+    root
+        folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://
     kind
         srgb: photographs; raw: clean frames of a camera, DNG and other raw files or 16-bit mosaics (extra raw), of
         which the light is used: camera, gains and isp are not applied
-    root
-        folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://
     roots
         several folders or URLs, instead of root; names of images begin with the number of their folder, 0/, 1/, …
     list
@@ -138,11 +138,10 @@ class SourceConfig(Group):
         the source, down to 0; the column zero_variance counts the sites where the source has as much or more
     """
 
-    kind: str = key("srgb", Choice("srgb", "raw"), since="0.3")
-
     root: Optional[str] = key(
         None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
     )
+    kind: str = key("srgb", Choice("srgb", "raw"), since="0.3")
     roots: tuple[str, ...] = key((), Limit("a list of folders and URLs, each once"), decides_data=False, since="0.3")
     list: Optional[str] = key(
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False, since="0.3"
