@@ -17,14 +17,15 @@ from unprocess_gen import load_config
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.pipeline import sizes
-from unprocess_gen.pipeline.run import shard_tasks
+from unprocess_gen.pipeline.run import shard_starts, shard_tasks
 from unprocess_gen.sources.loader import list_photographs
 
 
 def estimate(settings: Settings, root: Path | None, *overrides: str) -> sizes.SizeEstimate:
     config = settings(*overrides)
     config = replaced(config, {"source.root": None if root is None else str(root)})
-    tasks = shard_tasks(list_photographs(config.source).sources, config.output.pairs_per_shard)
+    sources = list_photographs(config.source).sources
+    tasks = shard_tasks(sources, shard_starts(sources, config.output))
     return sizes.estimate_shards(config, tasks)
 
 
@@ -115,7 +116,7 @@ def test_resumed_run_needs_space_only_for_missing_shards(
 def test_true_free_space_is_compared(tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings(ONE)
     config = replaced(config, {"source.root": str(fill(tmp_path / "p", 2))})
-    tasks = shard_tasks(list_photographs(config.source).sources, 1)
+    tasks = shard_tasks(list_photographs(config.source).sources, (0, 1))
     config = replaced(config, {"out": str(tmp_path / "does/not/exist")})
     sizes.check_free_space(config, tasks, 1)
     monkeypatch.setattr(sizes, "estimate_shards", lambda *_: sizes.SizeEstimate(10**18, 10**18))

@@ -39,6 +39,7 @@ from unprocess_gen.pipeline.sizes import check_free_space
 from unprocess_gen.pipeline.tasks import SHOWN, RunContext, ShardReport, ShardTask, StageTimes, Tally
 from unprocess_gen.pipeline.workspace import Workspace
 from unprocess_gen.sources.clips import ClipSizes
+from unprocess_gen.sources.raw.decode import decoder_versions
 from unprocess_gen.sources.video.decode import is_installed
 
 PACKAGES = (
@@ -276,6 +277,7 @@ def dataset_json_facts(
 ) -> dict[str, Any]:
     """Collect what ``dataset.json`` holds apart from digests and shards: counts, source, run and versions."""
     config = settings.config
+    decoders = decoder_versions() if config.source.kind == "raw" else {}
     return {
         **tally.facts(),
         "not_matched": not_matched,
@@ -283,17 +285,8 @@ def dataset_json_facts(
         "source": source_facts(config),
         **_dark_facts(settings),
         "run": run | machine(),
-        "versions": {package: version(package) for package in PACKAGES} | _decoder_versions(config),
+        "versions": {package: version(package) for package in PACKAGES} | decoders,
     }
-
-
-def _decoder_versions(config: Config) -> dict[str, str]:
-    """Return the versions that decide how raw frames are decoded."""
-    if config.source.kind != "raw":
-        return {}
-    import rawpy
-
-    return {"rawpy": version("rawpy"), "libraw": ".".join(map(str, rawpy.libraw_version))}
 
 
 def source_facts(config: Config) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,13 @@ class RawFrame:
     pixels: NDArray[np.uint16]
     colours: NDArray[np.uint8]
     metadata: RawMetadata
+
+
+def decoder_versions() -> dict[str, str]:
+    """Return the versions that decide how raw files are decoded."""
+    import rawpy
+
+    return {"rawpy": version("rawpy"), "libraw": ".".join(map(str, rawpy.libraw_version))}
 
 
 def decode_raw(content: bytes, max_pixels: int = 2**40) -> RawFrame:
