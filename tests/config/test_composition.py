@@ -93,7 +93,7 @@ def test_threads_compose_at_the_same_time() -> None:
 
 REFUSED = [
     ("camera=sony_a7", r"camera=sony_a7: no such option; expected one of canon_5d4, .*; did you mean sony_a7r\?"),
-    ("source.rot=p", r"source.rot=p: no such key; source has kind, root, .*; did you mean root\?"),
+    ("source.rot=p", r"source.rot=p: no such key; source has root, kind, .*; did you mean root\?"),
     ("sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
     ("+sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
     ("seed=abc", r"seed=abc: expected 0 to 9223372036854775807$"),
