@@ -6,11 +6,13 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import joblib
 import pytest
 
+import unprocess_gen as ug
 from unprocess_gen.pipeline.executors import local
 
 LOKY = "joblib.externals.loky.process_executor"
@@ -33,6 +35,16 @@ def test_warnings_of_the_pool_are_hidden(message: str, monkeypatch: pytest.Monke
         warnings.simplefilter("error")
         context: Any = None
         assert [*local._run_pool(context, [], 2)] == ["report"]
+
+
+def test_workers_of_an_earlier_run_follow_to_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        ug.generate(ug.load_config(["source.limit=2", "output.pairs_per_shard=1", "n_jobs=2", "out=ds"]))
+    first, second = (sorted((tmp_path / name / "ds" / "shards").iterdir()) for name in ("first", "second"))
+    assert [path.name for path in first] == [path.name for path in second]
+    assert len(second) == 2
 
 
 TRACKER = """

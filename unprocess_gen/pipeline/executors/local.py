@@ -89,9 +89,15 @@ def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> I
         warnings.filterwarnings("ignore", message="A worker stopped", module="joblib")
         with interrupts_ignored():
             start_tracker()
-            results = parallel(delayed(make_and_commit)(context, task) for task in tasks)
+            results = parallel(delayed(_make_in)(Path.cwd(), context, task) for task in tasks)
         with closing(results):
             yield from results
+
+
+def _make_in(folder: Path, context: RunContext, task: ShardTask) -> ShardReport:
+    """Make and commit a shard in a folder, because loky keeps workers that an earlier run started in another one."""
+    os.chdir(folder)
+    return make_and_commit(context, task)
 
 
 @contextmanager
