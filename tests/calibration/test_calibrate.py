@@ -89,10 +89,11 @@ def test_profile_is_used_as_it_was_written(calibrated: Any, run_main: RunMain, t
         assert text in done.err
 
 
-def test_numbers_of_the_body_are_measured(calibrated: Any, tmp_path: Path) -> None:
-    """Gains by colour, full well, dark current and its doubling: intervals contain the true values."""
+@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.7, 1.0, 0.4)], ids=["neutral", "coloured"])
+def test_numbers_of_the_body_are_measured(light: tuple[float, float, float], calibrated: Any, tmp_path: Path) -> None:
+    """Gains by colour, full well, dark current and its doubling agree with the true values in their errors."""
     gains, full_e = (1.1, 1.0, 0.9), 2000.0
-    numbers = Numbers(4.0, 5.0, 0.0, gains=gains, full_well_e=full_e, dark_e_per_s=20.0, prnu_std=0.01)
+    numbers = Numbers(4.0, 5.0, 0.0, gains=gains, full_well_e=full_e, dark_e_per_s=20.0, prnu_std=0.01, light=light)
     darks = [Shot(0.0, seconds, celsius) for celsius in (20.0, 32.0) for seconds in (0.01, 1.0, 4.0) for _ in range(3)]
     lights = (0.03, 0.08, 0.13, 0.18, 0.23, 0.28, 0.4, 0.7)
     shots = [*darks, *(Shot(light) for light in lights for _ in range(2))]
@@ -103,7 +104,8 @@ def test_numbers_of_the_body_are_measured(calibrated: Any, tmp_path: Path) -> No
         *(("prnu_std", 0.01), ("hot_pixel_share", 0.0), ("dead_pixel_share", 0.0)),
     ):
         row = found[name, None, None]
-        assert row["low"] <= true <= row["high"], row
+        low, high = (row["value"] + 2 * (row[end] - row["value"]) for end in ("low", "high"))  # 4 standard errors
+        assert low <= true <= high, row
     mean = sum((gains[0], 2 * gains[1], gains[2])) / 4
     assert written["gain_by_colour"] == pytest.approx([gain / mean for gain in gains], rel=0.03)
     assert written["dark_reference_c"] == 32

@@ -31,6 +31,7 @@ class Numbers:
     dark_e_per_s: float = 0.0
     full_well_e: float = math.inf
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    light: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 BLACK, WHITE = 512, 16383
@@ -58,10 +59,11 @@ def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequ
     folder.mkdir(parents=True)
     rng, lines = np.random.default_rng(seed), [COLUMNS]
     pattern = 1 + rng.normal(0, numbers.prnu_std, (side, side))
-    gains = np.tile([numbers.gains[:2], numbers.gains[1:]], (side // 2, side // 2)) * numbers.dn_per_e
+    gains, colours = (np.tile([rgb[:2], rgb[1:]], (side // 2, side // 2)) for rgb in (numbers.gains, numbers.light))
+    gains = gains * numbers.dn_per_e
     for place, shot in enumerate(shots):
         dark = numbers.dark_e_per_s * shot.seconds * 2 ** ((shot.celsius - 20) / 6)
-        light = shot.light * (WHITE - BLACK) / numbers.dn_per_e * pattern
+        light = shot.light * (WHITE - BLACK) / numbers.dn_per_e * pattern * colours
         electrons = np.minimum(rng.poisson(light + dark), numbers.full_well_e) - dark
         rows = rng.normal(0, numbers.row_std_dn, (side, 1))
         noise = rng.normal(BLACK + numbers.black_error_dn, numbers.read_std_dn, (side, side)) + rows

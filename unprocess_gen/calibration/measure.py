@@ -22,7 +22,17 @@ from unprocess_gen.calibration.frame_sums import (
     high_passed,
     summed,
 )
-from unprocess_gen.calibration.gain import Estimate, Gain, Transfer, emva_gain, estimate, fit_gain, root_estimate
+from unprocess_gen.calibration.gain import (
+    NORMAL_95,
+    Estimate,
+    Gain,
+    Transfer,
+    combined,
+    emva_gain,
+    estimate,
+    fit_gain,
+    root_estimate,
+)
 from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms, joined
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
@@ -67,14 +77,22 @@ class Dark:
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """Flats of one level: frames, noise, number of the darks of the nearest exposure, and values of dead pixels, DN."""
+    """Flats of one level: frames, noise, number of the darks of the nearest exposure, and values of dead pixels, DN.
+
+    ``signals_dn`` are the means of the planes above those of the darks; light is rarely neutral in raw values.
+    """
 
     frames: list[Capture]
     measured: Measured
     dark: int
     dead_dn: Float
     is_bright: bool
-    signal_dn: float
+    signals_dn: Float
+
+    @property
+    def signal_dn(self) -> float:
+        """Mean signal of the planes."""
+        return float(self.signals_dn.mean())
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,9 +144,10 @@ def measure_iso(
     shapes, histogram = _shapes(darks[reference], watch)
     checks.check_dark_noise(darks[reference].frames, sensor, _rounded_std(darks[reference].measured, shapes[0]))
     curves = [_curve(plane, darks, usable(flats), shapes[0]) for plane in range(4)] if flats else []
+    gain = Gain(known, [], 0.0, 0.0, False, False) if known else fit_gain(curves, sensor.span_dn)
     return IsoResult(
         iso=iso,
-        gain=Gain(known, [], 0.0, 0.0, False, False) if known else fit_gain(curves, sensor.span_dn),
+        gain=gain,
         emva_gain=float(np.mean([emva_gain(curve) for curve in curves])) if curves else math.nan,
         curves=curves,
         darks=darks,
@@ -138,7 +157,7 @@ def measure_iso(
         shapes=shapes[1:],
         histogram=histogram,
         prnu_squares=_prnu_squares(usable(flats), darks, watch) if flats else [],
-        full_well_dn=_full_well(flats, sensor) if flats else None,
+        full_well_dn=_full_well(flats, sensor, gain) if flats else None,
         notes=notes,
         **_of_darks(darks[reference], sensor, shapes),
     )
@@ -221,18 +240,19 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
         seconds = frames[0].exposure_s or 0.0
         nearest = min(range(len(darks)), key=lambda number: abs(darks[number].exposure_s - seconds))
         dark = darks[nearest].measured
-        signal = float(measured.mean_dn.mean() - dark.mean_dn.mean())
+        signals = measured.mean_dn - dark.mean_dn
         if measured.full_share > FULL_SHARE:
             notes.append(
                 f"{checks.place(frames)}: {measured.full_share:.2%} of the values are at white; left out of fits"
             )
         else:
             checks.check_flat(frames, sensor, measured, dark, notes)
-        dead, is_bright = np.zeros(0), DEAD_SIGNAL * sensor.span_dn < signal
+        dead, is_bright = np.zeros(0), DEAD_SIGNAL * sensor.span_dn < signals.min()
         if is_bright:
-            above = sums.mean_frame() - dark.mean_dn.mean()
-            dead = above[above < DEAD_RESPONSE * signal] + dark.mean_dn.mean()
-        flats.append(Flat(frames, measured, nearest, dead, is_bright, signal))
+            mean, limits = sums.mean_frame(), dark.mean_dn + DEAD_RESPONSE * signals
+            planes = [mean[y::2, x::2] for y, x in TILE]
+            dead = np.concatenate([plane[plane < limit] for plane, limit in zip(planes, limits, strict=True)])
+        flats.append(Flat(frames, measured, nearest, dead, is_bright, signals))
     return sorted(flats, key=lambda flat: flat.signal_dn)
 
 
@@ -345,15 +365,12 @@ def _of_darks(dark: Dark, sensor: Sensor, shapes: Sequence[Shape]) -> dict[str, 
 
 
 def usable(flats: Sequence[Flat]) -> list[Flat]:
-    """Return the levels below saturation: not at white, and not beyond the largest variance."""
+    """Return the levels below saturation: not at white, and no plane beyond its largest variance."""
     below = [flat for flat in flats if flat.measured.full_share <= FULL_SHARE]
-    variances = [float(flat.measured.variance.mean()) for flat in below]
-    peak = int(np.argmax(variances)) if variances else 0
-    return [
-        flat
-        for number, (flat, variance) in enumerate(zip(below, variances, strict=True))
-        if number <= peak or variance > variances[peak] * STILL_RISING
-    ]
+    variances = np.array([flat.measured.variance for flat in below]).reshape(-1, 4)
+    is_rising = variances > variances.max(axis=0, initial=0) * STILL_RISING
+    is_rising |= np.arange(len(below))[:, None] <= np.argmax(np.vstack([variances, np.zeros(4)]), axis=0)
+    return [flat for flat, is_below in zip(below, is_rising.all(axis=1), strict=True) if is_below]
 
 
 def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) -> list[tuple[float, float]]:
@@ -363,20 +380,19 @@ def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) ->
     fixed pattern contains that of darks, c² times, and the temporal noise.
     """
     total, squares = np.zeros(1), list[tuple[float, float]]()
-    signals = [flat.measured.mean_dn.mean() - darks[flat.dark].measured.mean_dn.mean() for flat in flats]
-    weights = [signal / flat.measured.variance.mean() for signal, flat in zip(signals, flats, strict=True)]
+    weights = [flat.signal_dn / flat.measured.variance.mean() for flat in flats]
     counts = np.array([flat.measured.count for flat in flats])
     for flat, weight in zip(flats, weights, strict=True):
         for frame in watch(flat.frames):
             total = total + np.float32(weight) * frame.pixels()
-    scale = float(counts * weights @ signals)
-    share = counts * np.square(weights) / scale**2
-    rows = sum(one * max(flat.measured.row[0], 0.0) for one, flat in zip(share, flats, strict=True)) * (1 - 1 / WINDOW)
-    for plane, (y, x) in enumerate(TILE):
+    scales = counts * weights @ [flat.signals_dn for flat in flats]
+    for plane, ((y, x), scale) in enumerate(zip(TILE, scales, strict=True)):
+        share = counts * np.square(weights) / scale**2
+        rows = share @ [max(flat.measured.row[0], 0.0) for flat in flats] * (1 - 1 / WINDOW)
         pattern = high_passed(total[y::2, x::2] / scale)
         deviation = np.abs(pattern - np.median(pattern))
         pattern = pattern[deviation <= FAR * ROBUST * np.median(deviation)]
-        noise = sum(one * flat.measured.variance[plane] for one, flat in zip(share, flats, strict=True))
+        noise = share @ [flat.measured.variance[plane] for flat in flats]
         of_dark = float(counts @ weights / scale) ** 2
         dark = darks[flats[-1].dark].measured
         square = (float(pattern.var()) - rows) / SMOOTH - noise - of_dark * dark.fixed[plane]
@@ -385,15 +401,26 @@ def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) ->
     return squares
 
 
-def _full_well(flats: Sequence[Flat], sensor: Sensor) -> Estimate | None:
-    """Return the signal of full pixels, DN: the largest mean where the variance has fallen.
+def _full_well(flats: Sequence[Flat], sensor: Sensor, gain: Gain) -> Estimate | None:
+    """Return the signal of full pixels, DN: the largest mean of the planes whose variance has fallen.
 
-    None if the converter ends first, or no level is that bright.
+    None if the converter ends first, or no level is that bright. If only some planes are full, the signal is scaled
+    from their gain to that of the sensor.
     """
     chosen = usable(flats)
-    full = [flat for flat in flats if flat not in chosen and flat.measured.full_share <= FULL_SHARE]
-    if not full or full[-1].signal_dn > LARGEST_WELL * sensor.span_dn:
+    beyond = [flat for flat in flats if flat not in chosen and flat.measured.full_share <= FULL_SHARE]
+    if not beyond:
         return None
-    level, falling = full[-1].signal_dn, float(full[-1].measured.variance.mean())
-    is_flat = falling < chosen[-1].measured.variance.mean() / 4  # all pixels are full
-    return Estimate(level, level * 0.995 if is_flat else chosen[-1].signal_dn, level * (1.005 if is_flat else 1.1))
+    variances = np.array([flat.measured.variance for flat in (*chosen, *beyond)])
+    is_full = variances[-1] < STILL_RISING * variances.max(axis=0)
+    planes = is_full if is_full.any() else np.ones(4, bool)
+    level, below = (float(flat.signals_dn[planes].mean()) for flat in (beyond[-1], chosen[-1]))
+    if level > LARGEST_WELL * sensor.span_dn:
+        return None
+    is_flat = bool((variances[-1] < variances[len(chosen) - 1] / 4)[planes].all())  # all their pixels are full
+    low, high = (0.995, 1.005) if is_flat else (below / level, 1.1)
+    if not gain.has_colours or planes.all():
+        return Estimate(level, level * low, level * high)
+    own = combined([plane for plane, is_in in zip(gain.planes, planes, strict=True) if is_in])
+    level, error = level * gain.sensor.value / own.value, NORMAL_95 * own.error / own.value
+    return Estimate(level, level * (1 - math.hypot(1 - low, error)), level * (1 + math.hypot(high - 1, error)))
