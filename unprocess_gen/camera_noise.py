@@ -283,15 +283,15 @@ def _balance(
 ) -> None:
     """Fill ``balanced`` with (frame - black) * factor of the site, and restore highlights above ``threshold``."""
     for y in range(frame.shape[0]):
-        even, odd, row, highest = factors[y % 2, 0], factors[y % 2, 1], balanced[y], np.float32(0)
+        row, (even, odd), (even_gain, odd_gain), bright = balanced[y], factors[y % 2], gains[y % 2], np.int32(0)
         for x in range(frame.shape[1]):
             row[x] = (np.float32(frame[y, x]) - black) * (odd if x % 2 else even)
-            highest = max(highest, row[x])
-        if highest > threshold:
+            bright |= np.int32(row[x] > threshold)  # a maximum would not be vectorised
+        if bright:
             for x in range(frame.shape[1]):
-                gain = gains[y % 2, 1] if x % 2 else gains[y % 2, 0]
+                gain = odd_gain if x % 2 else even_gain
                 restored = _restored(row[x] * gain, gain, threshold)
-                row[x] = restored if row[x] > threshold and gain < 1 else row[x]
+                row[x] = restored if row[x] > threshold and gain < np.float32(1) else row[x]
 
 
 @inner
