@@ -3,7 +3,8 @@
     python docs/experiments/learned_noise.py PATCHES [--to RESULTS.json]
 
 PATCHES has folders LIGHT/ISO/PHONE/KIND, as `sample_imgs_per_ISO_lighting_camera` of synt_noise_GANs has; KIND is
-samples_noisy, samples_gts, GAN, samples_noisyNF, samples_gtsNF or samples_noiseflowNF. Protocol: protocol.md.
+samples_noisy, samples_gts, GAN, samples_noisyNF, samples_gtsNF or samples_noiseflowNF. Or it is a folder of SIDD, which
+has no learned noise. Protocol: protocol.md.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 from common import arguments, divergence, interval, write
+from real_pairs import real_pairs
 from scipy.optimize import nnls
 
 import unprocess_gen as ug
@@ -44,7 +46,7 @@ class Patch:
 
 
 def patches_of(folder: Path) -> list[Patch]:
-    """Read all patches below a folder that have the real pair."""
+    """Read all patches below a folder that have the real pair; of larger pictures, the centre."""
     found = []
     for noisy in sorted(folder.rglob("samples_noisy/*.png")):
         place = noisy.parents[1]
@@ -53,6 +55,8 @@ def patches_of(folder: Path) -> list[Patch]:
         kinds = {kind: read(file) for kind, file in files.items() if file.exists()}
         if "samples_gts" in kinds:
             found.append(Patch(noisy.stem, f"{place.name}_{place.parent.name}", kinds))
+    for pair in real_pairs(folder):
+        found.append(Patch(pair.name, pair.group, {"samples_noisy": pair.noisy, "samples_gts": pair.clean}))
     return found
 
 

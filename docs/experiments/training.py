@@ -1,9 +1,9 @@
 """Experiment 4: train one network on four kinds of noise, and judge it on real pairs.
 
-    python docs/experiments/training.py POLYU [--raw CAPTURES] [--photos FOLDER] [--to RESULTS.json]
+    python docs/experiments/training.py PAIRS [--raw CAPTURES] [--photos FOLDER] [--to RESULTS.json]
 
-Needs PyTorch. POLYU has pairs NAME_real.JPG and NAME_mean.JPG (also PNG); CAPTURES is a folder that ``gen-dataset
-calibrate`` reads. Protocol: protocol.md.
+Needs PyTorch. PAIRS is a folder of PolyU, SIDD, SID or ELD; CAPTURES is one that ``gen-dataset calibrate`` reads.
+Protocol: protocol.md.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 import torch
 from common import Sensor, arguments, halves, interval, write
+from real_pairs import real_pairs
 from torch import nn
 
 import unprocess_gen as ug
 
 WIDTH, SIDE, BATCH, STEPS, RATE, SEEDS = 24, 48, 8, 400, 0.002, (0, 1, 2)
-CENTRE = 256
 SCENE = ["noise=canon_5d4", "scene=low_light", "scene.iso=[log_uniform, 800, 6400]"]
 SRGB = ("awgn", "signal_dependent", "two_numbers", "physical")
 RAW = ("awgn", "two_numbers", "physical")
@@ -132,24 +132,6 @@ def denoised(model: nn.Sequential, image: Any) -> Any:
         return (noisy - model(noisy))[0].permute(1, 2, 0).numpy().astype(np.float64)
 
 
-def real_pairs(folder: Path) -> list[tuple[str, Any, Any]]:
-    """Return scene, noisy and clean centre of each pair; the scene is the name without the number of the crop."""
-    pairs = []
-    for noisy in sorted(file for file in folder.rglob("*_real.*") if file.suffix.lower() in (".jpg", ".jpeg", ".png")):
-        clean = noisy.with_name(noisy.name.replace("_real.", "_mean."))
-        if clean.exists():
-            images = (cv2.imread(str(file), cv2.IMREAD_COLOR)[..., ::-1] for file in (noisy, clean))
-            scene = noisy.stem.rpartition("_")[0].rpartition("_")[0]
-            pairs.append((scene, *(centre(image) / 255 for image in images)))
-    return pairs
-
-
-def centre(image: Any) -> Any:
-    """Cut the middle of an image."""
-    y, x = (max(side - CENTRE, 0) // 2 for side in image.shape[:2])
-    return image[y : y + CENTRE, x : x + CENTRE]
-
-
 def quality(image: Any, clean: Any) -> tuple[float, float]:
     """Return PSNR in dB and SSIM of an image in [0, 1]."""
     from skimage.metrics import structural_similarity
@@ -166,9 +148,9 @@ def by_scene(scenes: Sequence[str], values: Any) -> Any:
 
 def judge_srgb(folder: Path, pictures: Sequence[Any]) -> dict[str, Any]:
     """Train on all models, and compare them on real sRGB pairs."""
-    pairs = real_pairs(folder)
+    pairs = [(pair.scene, pair.noisy / 255, pair.clean / 255) for pair in real_pairs(folder)]
     if not pairs:
-        raise SystemExit(f"{folder}: no pairs; expected NAME_real.JPG and NAME_mean.JPG")
+        raise SystemExit(f"{folder}: no pairs; expected files named as in PolyU, SIDD, SID or ELD")
     scenes = [scene for scene, _, _ in pairs]
     scores = {"noisy": np.array([quality(noisy, clean) for _, noisy, clean in pairs])}
     for model in SRGB:
@@ -240,7 +222,7 @@ def shares(denoise: Callable[[Any], Any], level: Any, sensor: Sensor) -> float:
 
 def main() -> None:
     """Run the experiment."""
-    options = arguments(__doc__, "training", "folder of PolyU pairs")
+    options = arguments(__doc__, "training", "folder of PolyU, SIDD, SID or ELD")
     torch.set_num_threads(2)
     torch.use_deterministic_algorithms(True)
     pictures = photographs(options.photos)
