@@ -15,65 +15,78 @@ from common import Level, Sensor, arguments, halves, interval, smooth, write
 from torch import nn
 
 SIDE, STEPS, BATCH, SEEDS = 64, 600, 32, (0, 1, 2)
+SIZES = ((5, 5), (1, 31), (31, 1))
 MODELS = {"dark": ("awgn", "two_numbers", "physical", "dark_frames"), "flat": ("awgn", "two_numbers", "physical")}
 
 
 class Classifier(nn.Module):
-    """Energies of filters that see grain, rows and columns; then two linear layers."""
+    """Energies of filters that see grain, rows and columns; then two linear layers.
+
+    The mean square of a filter w over a tile is w·C·w, where C is the mean product of pairs of sites below the filter.
+    C is computed once for each tile and size, which takes a hundredth of the time of filtering in each step.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.filters = nn.ModuleList(nn.Conv2d(1, 8, size, bias=False) for size in ((5, 5), (1, 31), (31, 1)))
+        self.filters = nn.ModuleList(nn.Conv2d(1, 8, size, bias=False) for size in SIZES)
         self.decide = nn.Sequential(nn.LayerNorm(24), nn.Linear(24, 16), nn.ReLU(), nn.Linear(16, 1))
 
-    def forward(self, tiles: Any) -> Any:
-        """Return the log odds that each tile is real."""
-        energies = [filtered(tiles).square().mean((2, 3)) for filtered in self.filters]
+    def forward(self, products: Any) -> Any:
+        """Return the log odds that each tile is real, from its products of `products_of`."""
+        weights = [filtered.weight.flatten(1) for filtered in self.filters]
+        energies = [((c @ w.T) * w.T).sum(1) for c, w in zip(products, weights, strict=True)]
         return self.decide(torch.log(torch.cat(energies, 1) + 1e-4))[:, 0]
 
 
-def tiles_of(frame: Any) -> Any:
-    """Cut a frame into tiles without their means, float32 [N, 1, SIDE, SIDE]."""
+def products_of(frame: Any, scale: float) -> list[Any]:
+    """Cut a frame into tiles without their means, divided by ``scale``; return their C of each size, [N, k, k]."""
     height, width = (side // SIDE for side in frame.shape)
     cut = frame[: height * SIDE, : width * SIDE].astype(np.float32).reshape(height, SIDE, width, SIDE)
-    tiles = cut.swapaxes(1, 2).reshape(-1, 1, SIDE, SIDE)
-    return torch.from_numpy(tiles - tiles.mean(axis=(2, 3), keepdims=True))
+    tiles = torch.from_numpy(cut.swapaxes(1, 2).reshape(-1, SIDE, SIDE))
+    tiles = (tiles - tiles.mean((1, 2), keepdim=True)) / scale
+    products = []
+    for height, width in SIZES:
+        below = tiles.unfold(1, height, 1).unfold(2, width, 1).flatten(3).flatten(1, 2)
+        products.append(below.transpose(1, 2) @ below / below.shape[1])
+    return products
 
 
 def real_and_simulated(
-    sensor: Sensor, levels: list[Level], model: str, first: int, folder: str
+    sensor: Sensor, levels: list[Level], model: str, first: int, folder: str, scale: float
 ) -> list[tuple[Any, Any]]:
-    """Return tiles of each real frame, and of a frame that was simulated for it."""
+    """Return products of the tiles of each real frame, and of a frame that was simulated for it."""
     pairs = []
     for level in levels:
         clean = smooth(level)
         for frame in level.frames:
             extra = (f"noise.dark_frames={folder}", "effects.all=auto") if model == "dark_frames" else ()
             name = "physical" if model == "dark_frames" else model
-            pairs.append((tiles_of(frame), tiles_of(sensor.simulate(name, clean, first + len(pairs), *extra))))
+            made = sensor.simulate(name, clean, first + len(pairs), *extra)
+            pairs.append((products_of(frame, scale), products_of(made, scale)))
     return pairs
 
 
-def trained(pairs: list[tuple[Any, Any]], scale: float, seed: int) -> Classifier:
+def trained(pairs: list[tuple[Any, Any]], seed: int) -> Classifier:
     """Train a classifier on pairs of real and simulated tiles."""
     torch.manual_seed(seed)
-    real, simulated = (torch.cat([pair[side] for pair in pairs]) / scale for side in (0, 1))
+    real, simulated = ([torch.cat(sizes) for sizes in zip(*side, strict=True)] for side in zip(*pairs, strict=True))
     classifier, labels = Classifier(), torch.cat((torch.ones(BATCH), torch.zeros(BATCH)))
     optimiser = torch.optim.Adam(classifier.parameters(), 0.003)
     for _ in range(STEPS):
-        chosen = [tiles[torch.randint(len(tiles), (BATCH,))] for tiles in (real, simulated)]
-        loss = nn.functional.binary_cross_entropy_with_logits(classifier(torch.cat(chosen)), labels)
+        places = [torch.randint(len(side[0]), (BATCH,)) for side in (real, simulated)]
+        chosen = [torch.cat((a[places[0]], b[places[1]])) for a, b in zip(real, simulated, strict=True)]
+        loss = nn.functional.binary_cross_entropy_with_logits(classifier(chosen), labels)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     return classifier
 
 
-def accuracies(classifier: Classifier, pairs: list[tuple[Any, Any]], scale: float) -> list[float]:
+def accuracies(classifier: Classifier, pairs: list[tuple[Any, Any]]) -> list[float]:
     """Return the share of right answers for each judged frame and its simulation."""
     with torch.no_grad():
         return [
-            float(((classifier(real / scale) > 0).float().mean() + (classifier(made / scale) <= 0).float().mean()) / 2)
+            float(((classifier(real) > 0).float().mean() + (classifier(made) <= 0).float().mean()) / 2)
             for real, made in pairs
         ]
 
@@ -101,15 +114,15 @@ def main() -> None:
         scale = float(np.sqrt(np.mean([np.subtract(*map(float_of, level.frames[:2])).var() / 2 for level in train])))
         results[kind] = {}
         for model in models:
-            training = real_and_simulated(sensor, train, model, 10_000, folder)
-            testing = real_and_simulated(sensor, test, model, 20_000, folder)
-            scores = [accuracies(trained(training, scale, seed), testing, scale) for seed in SEEDS]
+            training = real_and_simulated(sensor, train, model, 10_000, folder, scale)
+            testing = real_and_simulated(sensor, test, model, 20_000, folder, scale)
+            scores = [accuracies(trained(training, seed), testing) for seed in SEEDS]
             by_frame = np.mean(scores, axis=0)
             results[kind][model] = {
                 "accuracy": interval(by_frame, np.mean),
                 "by_seed": [float(np.mean(score)) for score in scores],
                 "judged_frames": len(by_frame),
-                "judged_tiles": 2 * sum(len(real) for real, _ in testing),
+                "judged_tiles": 2 * sum(len(real[0]) for real, _ in testing),
             }
             print(kind, model, results[kind][model], flush=True)
     write(results, options.to)
