@@ -104,7 +104,7 @@ class Camera:
             *(f"scene.exposure_s={seconds}", "effects.all=on", "sensor.units=1", *self._levels(), *self.overrides),
         )
         codes = np.full((self.side, self.side, 3), round(light * 65535), np.uint16)
-        return ug.make_pair(codes, config, seed=self.seed, key=f"{self.iso} {light} {seconds} {number}")
+        return ug.make_pair(codes, config, seed=self.seed, key=f"{self.profile} {self.iso} {light} {seconds} {number}")
 
     def _levels(self) -> list[str]:
         noise = load(f"noise={self.profile}", f"scene.iso={self.iso}").noise
