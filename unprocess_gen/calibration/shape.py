@@ -138,7 +138,7 @@ def fit_shape(histogram: Histogram, start: Shape | None = None) -> Shape:
     error = _error_of_shape(around, np.array(heights))
     pull = float(best.x[1] - NORMAL_SHAPE) / histogram.sites
     systematic = abs(pull) * (1 if pull < 0 else 4) + _of_rounded_means(math.exp(best.x[0]), best.x[1])
-    shape, half = float(best.x[1]) + OF_ROWS * pull, NORMAL_95 * error + systematic
+    shape, half = float(best.x[1]) + OF_ROWS * pull, math.hypot(NORMAL_95 * error, systematic)
     normal_std, tukey_std_dn = np.exp([normal.x, best.x[0]]) * math.sqrt(histogram.sites / (histogram.sites - 1))
     interval = Estimate(shape, shape - half, shape + half)
     return Shape(float(normal_std), float(tukey_std_dn), interval, bool(best.fun < normal.fun - EVIDENCE))
