@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from effect_page import effects_page
 from noise_profile_page import profiles_page
 from scene_page import scenes_page
 
@@ -270,5 +271,6 @@ PAGES = {
     "docs/reference/command_line.md": command_line_page,
     "docs/reference/noise_profiles.md": lambda: profiles_page(table, page),
     "docs/reference/scenes.md": lambda: scenes_page(table, page),
+    "docs/reference/effects.md": lambda: effects_page(table, page),
 }
 """The pages, and the functions that return their text."""

@@ -30,18 +30,13 @@ INTRODUCTION = """\
 
 This page lists the effects that `effects.all=auto` simulates, for each scene and physical noise profile. The
 predictions are for a photograph of 24 megapixels with codes from 0 to 255. The sensor has the bits of the profile.
-Light is divided by the mean of the scene's range. [Physical scenes](../guides/physical_scenes.md#what-you-get) explains
+Light is divided by the mean of the scene's range. The [atlas of effects](effects.md) has the meaning and a picture of
 each effect.
 
 The number after an effect is its ratio to the noise that hides it; for the full well it is an upper limit. For hot and
 dead pixels it is the number of pixels above the noise. All omitted effects together stay below a tenth of the noise. An
 effect with an asterisk uses an assumed number: a typical value, because [no source](noise_profiles.md) gives one for
-this camera.
-
-![each effect by itself, amplified](effects.png)
-
-Each picture shows one effect of `noise=nikon_d850`, amplified (`python docs/draw_effects.py`). In the pictures, hot and
-dead pixels are more frequent than in the profile, and the full well is smaller."""
+this camera."""
 
 REASONS = {
     "daylight": "There is much light. PRNU grows faster with the signal than shot noise does, so it is visible. "
@@ -77,6 +72,7 @@ def _scene(name: str) -> SceneConfig:
     return replace(scene, exposure_ratio=(ratio[1] + ratio[2]) / 2) if isinstance(ratio, tuple) else scene
 
 
+@cache
 def predictions_of(scene: str, profile: str) -> tuple[Prediction, ...] | None:
     """Return the predictions of all effects; None if the profile was not calibrated at the ISO of the scene."""
     noise = _profile(profile)
