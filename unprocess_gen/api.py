@@ -282,9 +282,9 @@ def verify(folder: PathLike) -> list[_verify.Damage]:
     if not _verify.is_sweep(path):
         return _verify.verify(path)
     return [
-        dataclasses.replace(damage, file=f"{one.folder}/{damage.file}")
-        for one in _verify.verify_sweep(path)
-        for damage in one.damages
+        dataclasses.replace(damage, file=f"{result.folder}/{damage.file}")
+        for result in _verify.verify_sweep(path)
+        for damage in result.damages
     ]
 
 

@@ -93,7 +93,7 @@ def test_part_of_a_file_is_read(folder: Folder) -> None:
 
 
 def test_functions_are_applied_in_order(folder: Folder) -> None:
-    assert list(folder.each(lambda number: number * 2, range(99))) == list(range(0, 198, 2))
+    assert list(folder.map(lambda number: number * 2, range(99))) == list(range(0, 198, 2))
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["pipe", "folder"])

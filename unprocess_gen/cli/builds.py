@@ -33,8 +33,8 @@ def build(call: Call) -> int:
     if "list" in call.values:
         if name or "to" in call.values:
             raise ConfigError("build: --list: lists all builds; expected neither NAME nor --to; leave them out")
-        for one in map(read_build, build_names()):
-            print_result(f"{one.name:<28} {len(one.rows()):>3} pairs  {one.recipe.title}")
+        for entry in map(read_build, build_names()):
+            print_result(f"{entry.name:<28} {len(entry.rows()):>3} pairs  {entry.recipe.title}")
         return 0
     if name is None or "to" not in call.values:
         missing = "NAME" if name is None else "--to"

@@ -51,9 +51,9 @@ def _stated(folder: Path, to: Path) -> int:
     stated = read_stated_noise(folder)
     _report_notes(stated.notes)
     write_stated_profile(stated, to)
-    for one in stated.isos:
-        print_result(f"ISO {one.iso:g}: a {short_number(one.a[1], 4)} DN, b {short_number(one.b[1], 4)} DN² (stated)")
-    _report_profile(to, [one.iso for one in stated.isos])
+    for iso, a, b, *_ in stated.isos:
+        print_result(f"ISO {iso:g}: a {short_number(a[1], 4)} DN, b {short_number(b[1], 4)} DN² (stated)")
+    _report_profile(to, [result.iso for result in stated.isos])
     return 0
 
 
@@ -69,26 +69,26 @@ def _measured(folder: Path, to: Path, call: Call) -> int:
         check_page(page)
     watch = partial(with_bar, unit="frame")
     if call.values.get("from") == DARKS:
-        found = measure.calibrate_darks(folder, call.values.get("gain"), call.values.get("dn_per_e"), watch)
+        calibration = measure.calibrate_darks(folder, call.values.get("gain"), call.values.get("dn_per_e"), watch)
     else:
-        found = measure.calibrate(folder, "quick" in call.values, watch)
-    _report_notes(found.notes)
-    measure.write_profile(found, to, "two_parameter" in call.values)
-    for result in found.isos:
+        calibration = measure.calibrate(folder, "quick" in call.values, watch)
+    _report_notes(calibration.notes)
+    measure.write_profile(calibration, to, "two_parameter" in call.values)
+    for result in calibration.isos:
         gain, read = result.gain.sensor, result.read
         interval = f"{short_number(gain.low, 4)} to {short_number(gain.high, 4)}"
         print_result(
             f"ISO {result.iso:g}: {short_number(gain.value, 4)} DN per electron "
-            f"({found.known.source if found.known else interval}), read noise {short_number(read.value, 4)} DN, row "
-            f"noise {short_number(result.row.value, 3)} DN"
+            f"({calibration.known.source if calibration.known else interval}), "
+            f"read noise {short_number(read.value, 4)} DN, row noise {short_number(result.row.value, 3)} DN"
         )
     if page is not None:
-        write_page(found, to.stem, f"gen-dataset calibrate {folder} --to {to}", page)
+        write_page(calibration, to.stem, f"gen-dataset calibrate {folder} --to {to}", page)
         print_result(f"drawn in {page}")
     if "keep_darks" in call.values:
-        kept = ", ".join(map(str, measure.keep_darks(found, Path(call.values["keep_darks"]))))
+        kept = ", ".join(map(str, measure.keep_darks(calibration, Path(call.values["keep_darks"]))))
         print_result(f"darks kept for noise.dark_frames: {kept}")
-    _report_profile(to, [result.iso for result in found.isos])
+    _report_profile(to, [result.iso for result in calibration.isos])
     return 0
 
 

@@ -124,18 +124,18 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     except ConfigError:  # without the recorded files, the pairs are counted as not checked
         if {"dark_frames", "dark_shading"} & call.values.keys():
             raise
-    found = photon_transfer.examine_dataset(folder, access)
-    checks = found.checks
+    summary = photon_transfer.examine_dataset(folder, access)
+    checks = summary.checks
     if not checks.count:
         print_result(
             f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
             "noise.dark_frames=FOLDER names their folder, noise.dark_shading=PATH their map"
         )
         return []
-    if found.worst is not None:
+    if summary.worst is not None:
         print_result(
-            f"noise of {counted(found.count, 'pair')} fitted (a, b with 95 % intervals); "
-            f"the farthest from its row: {found.worst}"
+            f"noise of {counted(summary.count, 'pair')} fitted (a, b with 95 % intervals); "
+            f"the farthest from its row: {summary.worst}"
         )
     unchecked = f"; {checks.unchecked} not checked: too few usable sites, or a dark frame that is not available"
     print_result(
@@ -143,7 +143,7 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
         + (unchecked if checks.unchecked else "")
     )
     if to is not None:
-        photon_transfer.draw_fits(found.first, Path(to))
+        photon_transfer.draw_fits(summary.first, Path(to))
         print_result(f"drawn in {to}")
     unlisted = checks.wrong_pairs - sum(bool(alarm.key) for alarm in checks.alarms)
     more = [f"noise of {counted(unlisted, 'other pair')}: wrong too"] if unlisted else []
@@ -155,18 +155,18 @@ def _compare_frames(folder: AnyPath, frames: Path, to: str | None) -> list[str]:
     from unprocess_gen.reports import against
 
     config, _ = read_dataset_yaml(folder / "config.yaml")
-    found = against.compare_frames(config, frames, partial(with_bar, unit="frame"))
-    for note in found.notes:
+    comparisons = against.compare_frames(config, frames, partial(with_bar, unit="frame"))
+    for note in comparisons.notes:
         report(note)
-    compared = [one for one in found.numbers if one.verdict != against.UNKNOWN]
+    compared = [comparison for comparison in comparisons.numbers if comparison.verdict != against.UNKNOWN]
     print_result(
         f"{frames}: {counted(len(compared), 'number')} compared with the profile {config.noise.name}, "
-        f"{len(found.differences)} wrong"
+        f"{len(comparisons.differences)} wrong"
     )
     if to is not None:
-        against.write_list(found, Path(to))
+        against.write_list(comparisons, Path(to))
         print_result(f"listed in {to}")
-    return _reported(folder, map(str, found.differences))
+    return _reported(folder, map(str, comparisons.differences))
 
 
 def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:

@@ -102,7 +102,7 @@ def group_help(group: str, conf: Path) -> str:
 
         settings = group_settings(group)
         nested = {name.rpartition(".")[0] for name in settings if "." in name}
-        inside = {f"{one}.{name}": value for one in nested for name, value in default_values(f"{group}.{one}").items()}
+        inside = {f"{key}.{name}": value for key in nested for name, value in default_values(f"{group}.{key}").items()}
         values, option = default_values(group) | inside, default_options().get(group) or "default"
         chosen = f" with {group}={option}" if option != "default" else ""
         title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"

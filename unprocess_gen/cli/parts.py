@@ -79,15 +79,15 @@ def status(call: Call) -> int:
     from unprocess_gen.pipeline.parts import left_text, parts_status
 
     out = str(call.path)
-    found = parts_status(out)
+    state = parts_status(out)
     if "left" in call.values:
-        print_result(left_text(found.left))
-    elif found.complete:
+        print_result(left_text(state.left))
+    elif state.complete:
         print_result(f"{out} is complete")
     else:
-        done = f"{found.parts - len(found.left)} of {counted(found.parts, 'part')}"
-        shards = f"{found.committed} of {counted(found.shards, 'shard')} committed"
-        next_step = f"left: {left_text(found.left)}" if found.left else f"run gen-dataset merge {shlex.quote(out)}"
+        done = f"{state.parts - len(state.left)} of {counted(state.parts, 'part')}"
+        shards = f"{state.committed} of {counted(state.shards, 'shard')} committed"
+        next_step = f"left: {left_text(state.left)}" if state.left else f"run gen-dataset merge {shlex.quote(out)}"
         print_result(f"{out}: {done} done, {shards}; {next_step}")
     return DONE
 

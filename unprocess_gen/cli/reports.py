@@ -217,14 +217,14 @@ def preview(call: Call) -> int:
 
 def _check_not_among_photographs(to: Path, root: Root | None) -> None:
     """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
-    for one in root if isinstance(root, tuple) else [root] if root is not None else []:
-        place = any_path(one).resolve()
+    for source_root in root if isinstance(root, tuple) else [root] if root is not None else []:
+        place = any_path(source_root).resolve()
         if not isinstance(place, Path) or not place.is_dir():
             continue
         if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
             raise ConfigError(
-                f"--to {to}: is inside the folder of the photographs, {one}; expected a folder outside of it, because "
-                "runs would read the pictures; choose another folder"
+                f"--to {to}: is inside the folder of the photographs, {source_root}; expected a folder outside of it, "
+                "because runs would read the pictures; choose another folder"
             )
 
 

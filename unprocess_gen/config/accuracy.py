@@ -125,7 +125,7 @@ def is_steep(camera: CameraPlan, exposure: float) -> bool:
     The light of a channel is i · (gain + headroom · m²) with m = (i - threshold) / (1 - threshold). Here i is the sum
     of table entries times one row of the matrix. The limits are `MAX_ERROR_GAIN` and `MAX_HIGHLIGHT_ERROR_GAIN`.
     """
-    rows = [sum(abs(entry) for entry in camera.rgb2cam[at : at + 3]) * exposure for at in (0, 3, 6)]
+    rows = [sum(abs(entry) for entry in camera.rgb2cam[start : start + 3]) * exposure for start in (0, 3, 6)]
     highlights = 0.0 if camera.highlight == "none" else 1 + 2 / (1 - camera.highlight_threshold)
     return any(
         row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN

@@ -169,9 +169,9 @@ def _with_entries(config: Config, node: DictConfig, settings: Any, overrides: Se
     """
     places = {source.provider: Path(source.path) for source in settings.runtime.config_sources if source.path}
     folders = OptionFolders(places["main"], settings.job.config_name, places.get("command-line"))
-    given = [one for one in settings.overrides.task if one.lstrip("+").partition("=")[0] != "mixture"]
+    given = [override for override in settings.overrides.task if override.lstrip("+").partition("=")[0] != "mixture"]
     if config.source.kind == "raw":  # each entry is composed with what follows from the kind
-        given = [one for one in given if one != OF_FILE and not one.startswith("source.include=")]
+        given = [override for override in given if override != OF_FILE and not override.startswith("source.include=")]
     outside = _settings_outside(node, settings.runtime.choices, given, overrides, folders)
     entries = []
     for number, (weight, options, values) in enumerate(read_entries(config.mixture)):
@@ -212,14 +212,14 @@ def _settings_outside(
     outside = {
         f"{group}": f"{group}={choices[group]}" for group in ENTRY_GROUPS if choices[group] != default_options()[group]
     }
-    if any(one.startswith("+") for one in given) or (folders.main, folders.name) != (conf_dir().absolute(), "config"):
+    if any(text.startswith("+") for text in given) or (folders.main, folders.name) != (conf_dir().absolute(), "config"):
         own = folders.own or (None if folders.main == conf_dir().absolute() else folders.main)
         plain = compose_node([f"{group}={choices[group]}" for group in ENTRY_GROUPS], OptionFolders(own=own))
         for group in ENTRY_GROUPS:
             for name in node[group]:
                 if node[group][name] != plain[group][name]:
                     outside[f"{group}.{name}"] = f"{group}.{name}={value_text(node[group][name])}"
-    keys = [one.lstrip("+").partition("=")[0] for one in given]
+    keys = [override.lstrip("+").partition("=")[0] for override in given]
     return outside | {key: assignment(key, overrides) for key in keys}
 
 

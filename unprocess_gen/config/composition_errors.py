@@ -102,10 +102,10 @@ def unknown_option(group: str, name: str, options: Sequence[str]) -> str:
 
 def assignment(key: str, overrides: Sequence[str]) -> str:
     """Return ``key=value`` as the user wrote it, or the key alone if no override names it or a key below it."""
-    written = [one.lstrip("+~") for one in overrides]
-    exact = (one for one in written if one.split("=")[0] == key)
-    below = (one for one in written if one.split("=")[0].startswith(f"{key}."))
-    return next((one for ones in (exact, below) for one in ones), key)
+    written = [override.lstrip("+~") for override in overrides]
+    exact = (override for override in written if override.split("=")[0] == key)
+    below = (override for override in written if override.split("=")[0].startswith(f"{key}."))
+    return next((override for matches in (exact, below) for override in matches), key)
 
 
 def _wrong_value(error: OmegaConfBaseException, key: str, overrides: Sequence[str]) -> str:

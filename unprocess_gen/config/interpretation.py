@@ -146,13 +146,13 @@ def table_words(value: Any) -> tuple[list[str], list[Any]]:
     """Split a number of a branch into its leading words and the rest."""
     if not isinstance(value, list | tuple):
         return [], [value]
-    count = next((place for place, one in enumerate(value) if not isinstance(one, str)), len(value))
+    count = next((place for place, entry in enumerate(value) if not isinstance(entry, str)), len(value))
     return list(value[:count]), list(value[count:])
 
 
 def provenance_at(noise: NoiseConfig, isos: Sequence[float]) -> list[ProvenanceConfig]:
     """Return the statements about the source of a physical profile's numbers at some ISOs."""
-    return [one for one in noise.provenance if not one.iso or any(one.iso[0] <= iso <= one.iso[1] for iso in isos)]
+    return [fact for fact in noise.provenance if not fact.iso or any(fact.iso[0] <= iso <= fact.iso[1] for iso in isos)]
 
 
 @functools.cache

@@ -19,17 +19,17 @@ def check_raw_source(config: Config) -> None:
     """Raise ConfigError if settings of raw sources and of photographs are mixed, or contradict each other."""
     source, is_raw = config.source, config.source.kind == "raw"
     for name, value in (OF_PHOTOGRAPHS if is_raw else OF_RAW).items():
-        if (found := getattr(source, name)) != value:
+        if (setting := getattr(source, name)) != value:
             kind, advice = ("photographs", "use source.shrink") if is_raw else ("raw sources", "set source.kind=raw")
-            raise refusal(f"source.{name}", found, f"is for {kind}; expected {value}, or {advice}")
+            raise refusal(f"source.{name}", setting, f"is for {kind}; expected {value}, or {advice}")
     if is_raw:
         _check_levels(config)
         _check_own_noise(config)
         _check_targets(config)
         return
-    for name, found in asdict(source.raw).items():
-        if found is not None:
-            raise refusal(f"source.raw.{name}", found, "describes raw files; expected null, or set source.kind=raw")
+    for name, setting in asdict(source.raw).items():
+        if setting is not None:
+            raise refusal(f"source.raw.{name}", setting, "describes raw files; expected null, or set source.kind=raw")
     if config.sensor.levels == "source":
         raise refusal("sensor.levels", "source", "photographs state no levels; choose a sensor, or set source.kind=raw")
 

@@ -109,21 +109,21 @@ def overrides_of(config: Config) -> dict[str, str]:
     base = typed_config(node, options)
     given |= {key: override_text(wanted) for key, wanted in _differences(config, base)}
     given = {key: text for key, text in given.items() if default_options().get(key) != text}
-    found = load_config([f"{key}={text}" for key, text in given.items()])
-    if left := [key for key, _ in _differences(config, found)]:
+    composition = load_config([f"{key}={text}" for key, text in given.items()])
+    if left := [key for key, _ in _differences(config, composition)]:
         raise ConfigError(f"{', '.join(left)}: recorded settings that overrides cannot express; run gen-dataset again")
     return given
 
 
 def _differences(config: Config, other: Config) -> list[tuple[str, Any]]:
     """Return the keys that decide data and differ, with their values in a config."""
-    found = []
+    differences = []
     for group, name, setting in all_settings():
-        owner, others = (operator.attrgetter(group)(one) if group else one for one in (config, other))
+        owner, others = (operator.attrgetter(group)(side) if group else side for side in (config, other))
         value = getattr(owner, name)
         if setting.decides_data and group not in ("body", "executor") and value != getattr(others, name):
-            found.append((f"{group}.{name}".lstrip("."), recorded(value)))
-    return found
+            differences.append((f"{group}.{name}".lstrip("."), recorded(value)))
+    return differences
 
 
 def override_text(value: Any) -> str:

@@ -835,7 +835,7 @@ class Config(Group):
         """Write the names of splits as text and their shares as floats, because users may write 1 or 1.0."""
         super().__post_init__()
         if isinstance(self.split, dict):
-            shares = {str(name): float(one) if is_number(one) else one for name, one in self.split.items()}
+            shares = {str(name): float(share) if is_number(share) else share for name, share in self.split.items()}
             object.__setattr__(self, "split", FrozenMapping(shares))
 
 
@@ -854,7 +854,7 @@ NESTED: dict[str, type[Any]] = {"source.raw": RawConfig}
 def group_settings(group: str) -> dict[str, Setting]:
     """Return the settings of a group by key, and those of the groups inside of it: ``raw.pattern``."""
     inside = {place.removeprefix(f"{group}."): kind for place, kind in NESTED.items() if place.startswith(f"{group}.")}
-    nested = {f"{place}.{name}": one for place, kind in inside.items() for name, one in settings_of(kind).items()}
+    nested = {f"{place}.{key}": setting for place, kind in inside.items() for key, setting in settings_of(kind).items()}
     return {**settings_of(GROUPS[group]), **nested}
 
 

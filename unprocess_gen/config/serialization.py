@@ -53,7 +53,7 @@ NOT_DATA = _keys(lambda setting: not setting.decides_data)
 NOT_RECORDED = tuple(
     group
     for group, kind in GROUPS.items()
-    if {one.name for one in dataclasses.fields(kind)} == set(NOT_DATA.get(group, ()))
+    if {field.name for field in dataclasses.fields(kind)} == set(NOT_DATA.get(group, ()))
 )
 """Groups of which no key decides data; ``config.yaml`` omits them."""
 
@@ -110,7 +110,7 @@ def _canonical_settings(config: Config) -> dict[str, Any]:
     if not has_float_clean(config):
         settings["output"].pop("clean_dtype", None)
     for group, keys in NUMBER_KEYS.items():
-        place = functools.reduce(lambda found, name: found.get(name, {}), group.split("."), settings)
+        place = functools.reduce(lambda mapping, name: mapping.get(name, {}), group.split("."), settings)
         place |= {key: _canonical(value) for key, value in place.items() if key in keys}
     return settings
 
@@ -125,14 +125,14 @@ def recorded(group: Any) -> Any:
         return group
     settings = settings_of(group)
     mapping: dict[str, Any] = {}
-    for one in dataclasses.fields(group):
-        setting, value = settings.get(one.name), getattr(group, one.name)
+    for field in dataclasses.fields(group):
+        setting, value = settings.get(field.name), getattr(group, field.name)
         if setting is None:
-            omitted = one.name in NOT_RECORDED
+            omitted = field.name in NOT_RECORDED
         else:
-            omitted = not setting.decides_data or bool(setting.since and value == one.default)
-        if not omitted and not (one.name in _NESTED_KEYS and value == type(value)()):
-            mapping[one.name] = recorded(value)
+            omitted = not setting.decides_data or bool(setting.since and value == field.default)
+        if not omitted and not (field.name in _NESTED_KEYS and value == type(value)()):
+            mapping[field.name] = recorded(value)
     return mapping
 
 
@@ -193,7 +193,7 @@ def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
     if not isinstance(loaded, dict):
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
     omitted = _OMITTED.get(group, ())
-    fields = {one.name: one for one in dataclasses.fields(group) if one.name not in omitted}
+    fields = {field.name: field for field in dataclasses.fields(group) if field.name not in omitted}
     later = {name for name, setting in settings_of(group).items() if setting.since} | _NESTED_KEYS
     missing, unknown = fields.keys() - loaded.keys() - later, loaded.keys() - fields.keys()
     for problem, keys in (("missing", missing), ("unknown", unknown)):

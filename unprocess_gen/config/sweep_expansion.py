@@ -177,7 +177,7 @@ def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
     parser = OverridesParser.create(config_loader=_GroupOptions(folders))  # type: ignore[arg-type]
     choices: dict[str, _Choice] = {}
     try:
-        parsed = parser.parse_overrides([quoted_path(one) for one in overrides])
+        parsed = parser.parse_overrides([quoted_path(override) for override in overrides])
         for text, override in zip(overrides, parsed, strict=True):
             key, values = override.get_key_element(), tuple[str, ...]()
             if not override.is_sweep_override():
@@ -244,16 +244,16 @@ def _described_by(
     if not params:
         return ()
     keys = {choice.key for choice in choices if choice.adds_group}
-    found = []
+    sweep_overrides = []
     for override in overrides:
         if override.partition("=")[0] in keys:
             try:
-                rest = _raw_params(compose_node([one for one in overrides if one != override], folders))
+                rest = _raw_params(compose_node([other for other in overrides if other != override], folders))
             except ConfigError:
                 rest = {}
             if params.keys() - rest.keys():
-                found.append(override)
-    return tuple(found)
+                sweep_overrides.append(override)
+    return tuple(sweep_overrides)
 
 
 def _plugins(node: DictConfig) -> tuple[str, ...]:

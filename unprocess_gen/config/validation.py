@@ -322,12 +322,12 @@ def _check_lights(config: Config) -> None:
         return
     matrix = colour.matrix(config.camera.xyz2cam or ())
     for name, _ in lights(config):
-        one = LIGHTS[name]
+        light = LIGHTS[name]
         for step in range(9):
-            mired = 1e6 / one.high_k + step / 8 * (1e6 / one.low_k - 1e6 / one.high_k)
+            mired = 1e6 / light.high_k + step / 8 * (1e6 / light.low_k - 1e6 / light.high_k)
             for side in (-1, 1):
                 try:
-                    gains = camera_gains(matrix, chromaticity(one, 1e6 / mired, one.offset + side * one.scatter))
+                    gains = camera_gains(matrix, chromaticity(light, 1e6 / mired, light.offset + side * light.scatter))
                 except ValueError as error:
                     raise refusal("gains.light", name, f"{error}; expected another light or matrix") from None
                 if not all(MIN_GAIN <= gain <= MAX_GAIN for gain in gains):

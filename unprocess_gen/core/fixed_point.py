@@ -173,8 +173,8 @@ def logarithm(x: float) -> tuple[int, int]:
     fraction, doublings = math.frexp(x)
     mantissa = int(fraction * 2.0**53)
     step = mantissa >> (53 - STEP_BITS)
-    of_step = step << (53 - STEP_BITS)
-    r = (mantissa - of_step) * ONE // (mantissa + of_step)
+    step_mantissa = step << (53 - STEP_BITS)
+    r = (mantissa - step_mantissa) * ONE // (mantissa + step_mantissa)
     square, series = r * r >> BITS, 0
     for coefficient in _LN_SERIES:
         series = (series * square >> BITS) + coefficient

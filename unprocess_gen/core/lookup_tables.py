@@ -57,9 +57,9 @@ def sha256(table: Float) -> str:
 
 def freeze(table: Float, expected_sha256: str | None = None) -> Float:
     """Make a table read-only and return it; raise MachineError if it has another SHA-256 than expected."""
-    if expected_sha256 is not None and (found := sha256(table)) != expected_sha256:
+    if expected_sha256 is not None and (actual := sha256(table)) != expected_sha256:
         raise MachineError(
-            f"a table has SHA-256 {found}; expected {expected_sha256}; reinstall unprocess_gen or use another Python"
+            f"a table has SHA-256 {actual}; expected {expected_sha256}; reinstall unprocess_gen or use another Python"
         )
     table.flags.writeable = False
     return table
@@ -164,7 +164,7 @@ def draw_variance(table: Float) -> Decimal:
     total = Decimal(0)
     for row, coefficients in enumerate(table.tolist()):
         octave, segment = divmod(row, SEGMENTS)
-        ends = (-(-(2**octave * (SEGMENTS + at)) // SEGMENTS) for at in (segment, segment + 1))
+        ends = (-(-(2**octave * (SEGMENTS + edge)) // SEGMENTS) for edge in (segment, segment + 1))
         first, end = (word | 1 for word in ends)  # words j are odd
         start = Decimal(first) / 2**octave - 1 - Decimal(segment) / SEGMENTS
         total += _sum_of_squares((end - first) // 2, start, Decimal(2) / 2**octave, *map(Decimal, coefficients))

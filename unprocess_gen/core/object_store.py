@@ -319,7 +319,7 @@ class ObjectPath:
                 shutil.copyfileobj(source, copy, MAX_PIECE)
             yield file
 
-    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """Apply a function that waits for the store to items, `THREADS` at a time; yield the results in order."""
         with ThreadPoolExecutor(THREADS, "requests") as pool:
             for future in started_ahead(pool, function, items, THREADS):

@@ -126,7 +126,7 @@ class LocalPath(_NativePath):
         with self.open("rb") as stream:
             return mmap.mmap(stream.fileno(), skipped + size, access=mmap.ACCESS_COPY, offset=start), skipped
 
-    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """Apply a function that reads files to items, one at a time."""
         return map(function, items)
 

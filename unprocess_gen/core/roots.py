@@ -62,10 +62,10 @@ class SourceRoots:
                 problem = f"{error.filename} cannot be read ({error.strerror}); expected readable folders"
                 raise ConfigError(f"source.roots[{number}]={root}: {problem}; change its permissions") from None
 
-    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """Apply a function that reads files to items: in threads if a root is in an object store."""
         remote = (root for root in self._roots if isinstance(root, ObjectPath))
-        return next(remote, self._roots[0]).each(function, items)
+        return next(remote, self._roots[0]).map(function, items)
 
 
 def root_path(root: Root) -> LocalPath | ObjectPath | SourceRoots:
@@ -81,4 +81,4 @@ def is_remote(root: Root) -> bool:
 
 def absolute_root(root: Root | None) -> Root | None:
     """Return a place that does not depend on the current folder."""
-    return tuple(absolute_text(one) or "" for one in root) if isinstance(root, tuple) else absolute_text(root)
+    return tuple(absolute_text(entry) or "" for entry in root) if isinstance(root, tuple) else absolute_text(root)

@@ -198,8 +198,8 @@ def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
     import tifffile
 
     if frame.dtype != np.uint16 or frame.ndim != 2:
-        found = f"{frame.dtype} {list(frame.shape)}"
-        raise ConfigError(f"--keys {row['key']}: its {name} frame is {found}; a DNG is made of uint16 mosaics [H, W]")
+        actual = f"{frame.dtype} {list(frame.shape)}"
+        raise ConfigError(f"--keys {row['key']}: its {name} frame is {actual}; a DNG is made of uint16 mosaics [H, W]")
     file = io.BytesIO()
     tifffile.imwrite(
         file,

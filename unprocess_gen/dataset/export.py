@@ -279,8 +279,8 @@ class _Lmdb:
                 for name, stored in arrays_of(row).items():
                     shape = ",".join(map(str, stored.array.shape))
                     lines.setdefault(unit.place / f"{name}.lmdb", []).append(f"{row['key']}.npy ({shape}) 0\n")
-        for environment, of_array in lines.items():
-            LocalPath(environment / "meta_info.txt").write("".join(of_array).encode(), str(unfinished))
+        for environment, array_lines in lines.items():
+            LocalPath(environment / "meta_info.txt").write("".join(array_lines).encode(), str(unfinished))
 
 
 def _name(row: Row) -> bytes:

@@ -109,7 +109,7 @@ def group_by_image(rows: Iterable[Row]) -> Iterator[list[Row]]:
     iterator of list of Row
         The rows of each source.
     """
-    return (list(some) for _, some in itertools.groupby(rows, key=image_key))
+    return (list(group) for _, group in itertools.groupby(rows, key=image_key))
 
 
 def group_by_sample(rows: Iterable[Row]) -> Iterator[list[Row]]:
@@ -125,4 +125,4 @@ def group_by_sample(rows: Iterable[Row]) -> Iterator[list[Row]]:
     iterator of list of Row
         The rows of each sample.
     """
-    return (list(some) for _, some in itertools.groupby(rows, key=sample_key))
+    return (list(group) for _, group in itertools.groupby(rows, key=sample_key))

@@ -527,10 +527,10 @@ def rows_with_offsets(path: AnyPath) -> Iterator[tuple[int, Row]]:
         If the file is not a manifest, or a value is not allowed.
     """
     with _opened(path) as (stream, header):
-        at = stream.tell()
+        offset = stream.tell()
         while line := stream.readline(MAX_LINE_BYTES + 1):
-            yield at, _typed(header, line)
-            at += len(line)
+            yield offset, _typed(header, line)
+            offset += len(line)
 
 
 def readable_rows(path: AnyPath) -> Iterator[Row]:
@@ -561,7 +561,7 @@ def read_columns(path: AnyPath) -> tuple[str, ...]:
         return manifest.header
 
 
-def read_row(path: AnyPath, at: int, columns: Sequence[str] = ()) -> Row:
+def read_row(path: AnyPath, offset: int, columns: Sequence[str] = ()) -> Row:
     """Read one row.
 
     Parameters
@@ -585,10 +585,10 @@ def read_row(path: AnyPath, at: int, columns: Sequence[str] = ()) -> Row:
     """
     try:
         with _opened(path, columns) as (stream, header):
-            stream.seek(at)
+            stream.seek(offset)
             return _typed(header, stream.readline(MAX_LINE_BYTES + 1))
     except DamageError as error:
-        raise DamageError(f"{path}: no row at byte {at} ({error})") from error
+        raise DamageError(f"{path}: no row at byte {offset} ({error})") from error
 
 
 @contextlib.contextmanager
@@ -738,7 +738,7 @@ def rows_of_json(content: bytes) -> list[Row]:
         loaded = json.loads(content)
         if not isinstance(loaded, dict) or not isinstance(others := loaded.pop(OTHERS, []), list):
             raise ValueError("expected an object")
-        return [_row_of_json(one) for one in (loaded, *others)]
+        return [_row_of_json(entry) for entry in (loaded, *others)]
     except (ValueError, RecursionError) as error:
         raise DamageError(f"the JSON of a sample cannot be read ({str(error)[:200]})") from error
 

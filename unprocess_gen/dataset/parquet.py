@@ -72,5 +72,5 @@ def parquet_schema(names: tuple[str, ...]) -> pyarrow.Schema:
     import pyarrow
 
     types = {TYPE_NAMES[int]: pyarrow.int64(), TYPE_NAMES[float]: pyarrow.float64()}
-    of_names = {column.name: types.get(column.type_name, pyarrow.string()) for column in COLUMNS}
-    return pyarrow.schema([pyarrow.field(name, of_names[name]) for name in names if name in of_names])
+    types_by_name = {column.name: types.get(column.type_name, pyarrow.string()) for column in COLUMNS}
+    return pyarrow.schema([pyarrow.field(name, types_by_name[name]) for name in names if name in types_by_name])

@@ -175,7 +175,7 @@ class RawPairs:
             check_split("RawPairs", split, self._datasets)
         self._offsets: NDArray[np.int64] = np.concatenate([np.empty(0, np.int64), *offsets])
         self._dataset_of: NDArray[np.int32] = np.repeat(
-            np.arange(len(offsets), dtype=np.int32), [len(some) for some in offsets]
+            np.arange(len(offsets), dtype=np.int32), [len(rows) for rows in offsets]
         )
 
     @property

@@ -86,8 +86,8 @@ def parse_keys(text: str) -> KeySelection:
     for item in map(str.strip, text.split(",")):
         if _INDEX.fullmatch(item):
             names[key_text(int(item))] = item
-        elif found := _RANGE.fullmatch(item):
-            first, last = int(found[1]), int(found[2])
+        elif span := _RANGE.fullmatch(item):
+            first, last = int(span[1]), int(span[2])
             if last < first:
                 raise ConfigError(f"--keys {item}: ends before it begins; expected {last}-{first}")
             ranges[item] = range(first, last + 1)
@@ -139,18 +139,18 @@ def select_rows(
             raise ConfigError(f"--rows {rows}: selects no row; expected A:B with A below B and below {count}")
         return
     selection = parse_keys(keys)
-    found: set[str] = set()
+    matches: set[str] = set()
     ends = "", ""
     for row in read_rows(manifest):
         ends = ends[0] or str(row["key"]), str(row["key"])
         named, ranges = selection.named(row), selection.in_ranges(row)
-        found |= named | ranges
+        matches |= named | ranges
         if named or (ranges and row["status"] == "ok"):
             yield row
         elif ranges and skipped is not None and row["status"] == "failed":
             skipped.append(row)
     for name, written in {**selection.names, **dict.fromkeys(selection.ranges)}.items():
-        if name not in found:
+        if name not in matches:
             known = f"it has keys from {ends[0]} to {ends[1]}" if ends[0] else "it has none"
             raise ConfigError(f"--keys {written or name}: {manifest} has no such key; {known}; {KEYS_FORM}")
 
@@ -187,7 +187,7 @@ def select_pairs(manifest: AnyPath, keys: str) -> SelectedPairs:
 
 
 def _positions(rows: str | None) -> tuple[int, int | None]:
-    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", rows if rows is not None else ":")
-    if found is None:
+    span = re.fullmatch(r"(\d{0,12}):(\d{0,12})", rows if rows is not None else ":")
+    if span is None:
         raise ConfigError(f"--rows {rows}: expected A:B, such as 0:10")
-    return int(found[1] or 0), int(found[2]) if found[2] else None
+    return int(span[1] or 0), int(span[2]) if span[2] else None

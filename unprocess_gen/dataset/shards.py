@@ -21,7 +21,6 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -163,7 +162,7 @@ class ShardWriter:
     def __enter__(self) -> ShardWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
         try:
             if kind is None:
                 self._write(END)
@@ -321,11 +320,11 @@ def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tup
             for member, digest, array in sample.frames:
                 head = array.header
                 size = len(head) + array.size
-                found = [*_check_bytes(stream, _tar_header(f"{sample.key}.{member}", size), "tar header")]
-                found += _check_bytes(stream, head, "npy header")
-                found += _check_digest(stream, size - len(head), digest)
-                found += _check_bytes(stream, b"\0" * _padding(size), "padding")
-                yield from ((sample.key, member, what) for what in found)
+                problems = [*_check_bytes(stream, _tar_header(f"{sample.key}.{member}", size), "tar header")]
+                problems += _check_bytes(stream, head, "npy header")
+                problems += _check_digest(stream, size - len(head), digest)
+                problems += _check_bytes(stream, b"\0" * _padding(size), "padding")
+                yield from ((sample.key, member, what) for what in problems)
             content = _tar_header(f"{sample.key}.{ROW}", len(sample.json)) + sample.json
             content += b"\0" * _padding(len(sample.json))
             yield from ((sample.key, ROW, what) for what in _check_bytes(stream, content, "member"))
@@ -337,16 +336,16 @@ def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tup
 def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dict[str, Frame]]:
     """Read the frames of a damaged shard that are intact and at their place."""
     with path.open("rb") if path.is_file() else io.BytesIO() as stream:
-        at = 0
+        position = 0
         for sample in samples:
             frames = {}
             for member, digest, array in sample.frames:
                 size, head = array.size, len(array.header)
-                content = _read_at(stream, Member(at + RECORD + head, size))
-                at += RECORD + head + size + _padding(head + size)
+                content = _read_at(stream, Member(position + RECORD + head, size))
+                position += RECORD + head + size + _padding(head + size)
                 if len(content) == size and xxhash.xxh3_128_hexdigest(content) == digest:
                     frames[member] = np.frombuffer(content, array.description).reshape(array.shape)
-            at += RECORD + len(sample.json) + _padding(len(sample.json))
+            position += RECORD + len(sample.json) + _padding(len(sample.json))
             yield frames
 
 
@@ -368,12 +367,12 @@ def _read_at(stream: BinaryIO, member: Member) -> bytes:
 
 
 def _check_bytes(stream: BinaryIO, wanted: bytes, what: str) -> Iterator[str]:
-    found = stream.read(len(wanted))
-    if len(found) < len(wanted):
+    content = stream.read(len(wanted))
+    if len(content) < len(wanted):
         yield f"its {what} is cut short"
-    elif found != wanted:
-        at = next(i for i, (a, b) in enumerate(zip(found, wanted, strict=True)) if a != b)
-        yield f"its {what} differs from what the manifest records, from byte {at} on"
+    elif content != wanted:
+        offset = next(i for i, (a, b) in enumerate(zip(content, wanted, strict=True)) if a != b)
+        yield f"its {what} differs from what the manifest records, from byte {offset} on"
 
 
 def _check_digest(stream: BinaryIO, size: int, wanted: str) -> Iterator[str]:

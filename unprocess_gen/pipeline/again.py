@@ -45,13 +45,13 @@ def _root(folder: AnyPath, kind: str, root: str | None) -> Root | None:
                 "leave source.root out"
             )
         return None
-    found = source_root(folder / "manifest.csv", root)
-    if found is None:
+    known_root = source_root(folder / "manifest.csv", root)
+    if known_root is None:
         raise ConfigError(
             f"again: source.root is missing: {folder} does not record the folder of its sources; expected "
             "that folder; give source.root=…"
         )
-    return found
+    return known_root
 
 
 def check_sources(folder: AnyPath, config: Config) -> None:

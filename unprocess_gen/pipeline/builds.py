@@ -84,24 +84,24 @@ class Build:
         assert spec is not None and spec.origin is not None
         folder = Path(spec.origin).parent / "data"
         for name, digest in {str(row["source"]): row["source_sha256"] for row in self.rows()}.items():
-            found = file_sha256(folder / name) if (folder / name).is_file() else "none, the file is missing"
-            if found != digest:
+            actual = file_sha256(folder / name) if (folder / name).is_file() else "none, the file is missing"
+            if actual != digest:
                 raise SourceChangedError(
-                    f"build {self.name}: {folder / name}: its SHA-256 is {found}; expected {digest}, as in "
+                    f"build {self.name}: {folder / name}: its SHA-256 is {actual}; expected {digest}, as in "
                     f"{PHOTOGRAPHS_FROM}; install one of them"
                 )
         return folder
 
     def check_folder(self, folder: Path, option: str) -> None:
         """Raise ConfigError if a folder cannot be written, or contains files that are no part of the build."""
-        found = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+        names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
         own = {*BESIDE, *(file.partition("/")[0] for file in self.digests)}
-        if foreign := [name for name in found if name not in own]:
+        if foreign := [name for name in names if name not in own]:
             raise ConfigError(
                 f"{option}: contains {foreign[0]}, which is no part of the build {self.name}; expected an empty "
                 "folder, or one in which this build began; choose another folder"
             )
-        if not found:
+        if not names:
             check_output_folder(folder, option)
 
     def overrides(self, folder: Path, photographs: Path | None) -> list[str]:
@@ -130,9 +130,9 @@ class Build:
         if damaged:  # the files contradict each other
             return
         for file, digest in self.digests.items():
-            found = file_sha256(folder / file) if (folder / file).is_file() else "none, the file is missing"
-            if found != digest and posixpath.basename(file) != MANIFEST:
-                yield Damage(file, f"its SHA-256 is {found}, that of the build is {digest}")
+            actual = file_sha256(folder / file) if (folder / file).is_file() else "none, the file is missing"
+            if actual != digest and posixpath.basename(file) != MANIFEST:
+                yield Damage(file, f"its SHA-256 is {actual}, that of the build is {digest}")
         yield from self._differing_cells(folder)
 
     def _differing_cells(self, folder: Path) -> Iterator[Damage]:

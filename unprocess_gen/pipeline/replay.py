@@ -309,9 +309,9 @@ def recorded_source(root: Root | None, source: Source, prepared: SourcePlan) -> 
 
 def _difference(arrays: Targets, row: Row) -> str:
     return "; ".join(
-        f"the XXH3-128 of {name} is {found}, the row records {stored.digest}"
+        f"the XXH3-128 of {name} is {digest}, the row records {stored.digest}"
         for name, stored in arrays_of(row).items()
-        if (found := array_xxh3(arrays[name])) != stored.digest
+        if (digest := array_xxh3(arrays[name])) != stored.digest
     )
 
 

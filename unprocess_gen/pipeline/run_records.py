@@ -225,7 +225,7 @@ class ShardRecords:
         """Find the committed ones among shards: their record is readable, not provisional, and fits the file."""
         sizes = (self._storage / "shards").entries()
         candidates = sorted(self.recorded(shards))
-        are_committed = self._storage.path.each(
+        are_committed = self._storage.path.map(
             lambda shard: self._is_committed(shard, sizes.get(shard_name(shard))), candidates
         )
         return {shard for shard, is_committed in zip(candidates, are_committed, strict=True) if is_committed}

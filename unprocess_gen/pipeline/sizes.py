@@ -109,9 +109,9 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask], headers: int = S
         total = mean * len(sources) + len(tasks) * shard_bytes([0])
         return SizeEstimate(total, shard_bytes([mean] * largest))
     by_index = {source.index: size for source, size in zip(sources, sizes, strict=True)}
-    in_shards = ([by_index[source.index] for source in task.sources] for task in tasks)
-    of_shards = [shard_bytes(list(filter(None, shard))) for shard in in_shards]
-    return SizeEstimate(sum(of_shards), max(of_shards))
+    shards = ([by_index[source.index] for source in task.sources] for task in tasks)
+    totals = [shard_bytes(list(filter(None, shard))) for shard in shards]
+    return SizeEstimate(sum(totals), max(totals))
 
 
 def resolve_pairs_per_shard(config: Config, sources: Sequence[Source]) -> Config:

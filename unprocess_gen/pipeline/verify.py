@@ -157,15 +157,15 @@ def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
         files.append((parquet.NAME, PARQUET_SHA256))
     for name, field in files:
         try:
-            found = file_sha256(folder / name)
+            digest = file_sha256(folder / name)
         except FileNotFoundError:
             yield Damage(name, "is missing")
             continue
         except OSError as error:
             yield Damage(name, f"cannot be read ({error.strerror})")
             continue
-        if facts.get(field, found) != found:
-            yield Damage(name, f"its SHA-256 is {found}, dataset.json records {facts[field]}")
+        if facts.get(field, digest) != digest:
+            yield Damage(name, f"its SHA-256 is {digest}, dataset.json records {facts[field]}")
 
 
 ShardRows = tuple[int, list[Row]]
@@ -191,16 +191,16 @@ def shard_rows(manifest: AnyPath) -> Iterator[ShardRows]:
         yield number, rows
 
 
-def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifest: Iterator[ShardRows]) -> list[Damage]:
+def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], expected: Iterator[ShardRows]) -> list[Damage]:
     """Compare the shards with ``dataset.json`` and the manifest, or with the one of them that is readable.
 
-    ``listed`` has the entries of shards with a file, in ascending order; ``of_manifest`` is empty if the manifest
+    ``listed`` has the entries of shards with a file, in ascending order; ``expected`` is empty if the manifest
     cannot be read. Raises DamageError if that is found out on the way.
     """
     present = {path.name for path in (folder / "shards").iterdir()} if (folder / "shards").is_dir() else set()
     foreign, damages = set(present), list[Damage]()
-    first = next(of_manifest, None)
-    shards = _merged(listed, itertools.chain([] if first is None else [first], of_manifest))
+    first = next(expected, None)
+    shards = _merged(listed, itertools.chain([] if first is None else [first], expected))
     for number, rows in with_bar(shards, "shard", len(listed)):
         pairs = [*filter(has_frames, rows)]
         if not pairs and number not in listed:
@@ -213,16 +213,16 @@ def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifes
         with any_path(path).local_copy() as file:
             problems = [] if first is None else list(check_members(file, expected_samples(pairs)))
             entry = listed.get(number)
-            if not problems and entry is not None and (found := file_sha256(file)) != entry["sha256"]:
-                problems = [("", "", f"its SHA-256 is {found}, dataset.json records {entry['sha256']}")]
+            if not problems and entry is not None and (digest := file_sha256(file)) != entry["sha256"]:
+                problems = [("", "", f"its SHA-256 is {digest}, dataset.json records {entry['sha256']}")]
             damages += [Damage(f"shards/{path.name}", what, key, member) for key, member, what in problems]
     return [Damage(f"shards/{name}", "is not part of this dataset") for name in sorted(foreign)] + damages
 
 
-def _merged(listed: Iterable[int], of_manifest: Iterable[ShardRows]) -> Iterator[ShardRows]:
+def _merged(listed: Iterable[int], expected: Iterable[ShardRows]) -> Iterator[ShardRows]:
     """Yield every shard that ``dataset.json`` or the manifest has, in ascending order; without rows if only listed."""
     without_rows: Iterable[ShardRows] = ((number, []) for number in listed)
-    shards = heapq.merge(without_rows, of_manifest, key=operator.itemgetter(0))
+    shards = heapq.merge(without_rows, expected, key=operator.itemgetter(0))
     for number, parts in itertools.groupby(shards, key=operator.itemgetter(0)):
         yield number, [row for _, rows in parts for row in rows]
 

@@ -94,9 +94,9 @@ class Workspace:
 
     def _refuse_foreign_files(self) -> None:
         """Refuse a folder that contains files but no dataset, so that no file of the user is overwritten."""
-        found = self.storage.path.entries()
-        foreign = sorted(found.keys() - {WORK})
-        if foreign and "config.yaml" not in found:
+        entries = self.storage.path.entries()
+        foreign = sorted(entries.keys() - {WORK})
+        if foreign and "config.yaml" not in entries:
             raise ConfigError(
                 f"out={self.out}: contains {foreign[0]}, but no config.yaml; expected an empty folder or a dataset; "
                 "choose another out"
@@ -172,9 +172,9 @@ class Workspace:
         for entry in facts["shards"]:
             size = sizes.get(entry["file"])
             if entry["file"] is not None and size != entry["bytes"]:
-                found = "is missing" if size is None else f"has {size} bytes"
+                problem = "is missing" if size is None else f"has {size} bytes"
                 raise DamageError(
-                    f"{self.out}/{entry['file']}: {found}, expected {entry['bytes']} bytes; gen-dataset verify "
+                    f"{self.out}/{entry['file']}: {problem}, expected {entry['bytes']} bytes; gen-dataset verify "
                     f"{self.out} --repair restores it"
                 )
         self.storage.remove_work(keep_records=False)
@@ -246,7 +246,7 @@ class Workspace:
     def _manifest(self, shards: int, entries: list[dict[str, Any]], tally: Tally) -> Iterator[bytes]:
         """Yield the text of the manifest; append the entry of each shard, and add its counts."""
         yield header_text().encode()
-        for record in self.storage.path.each(self.records.record, range(shards)):
+        for record in self.storage.path.map(self.records.record, range(shards)):
             entries.append(record.entry)
             tally.add(record.tally)
             yield record.csv
@@ -280,7 +280,7 @@ def _sources_of_rows(manifest: AnyPath) -> Iterator[Source]:
 
 def _first_of_files(sources: Iterable[Source]) -> Iterator[Source]:
     """Yield the first of consecutive sources that are in one file."""
-    return (next(of_file) for _, of_file in itertools.groupby(sources, key=operator.attrgetter("name")))
+    return (next(group) for _, group in itertools.groupby(sources, key=operator.attrgetter("name")))
 
 
 def _change(name: str, file: Source | None, source: Source | None, digest: Digest) -> str:
@@ -353,8 +353,8 @@ _END = "\n}\n"
 
 def _shard_number(name: str) -> int:
     """Return the number in a shard's file name, -1 for other names."""
-    found = re.fullmatch(r"shard-(\d{5,})\.tar", name)
-    return int(found[1]) if found else -1
+    match = re.fullmatch(r"shard-(\d{5,})\.tar", name)
+    return int(match[1]) if match else -1
 
 
 def _first(differing: Sequence[str]) -> str:

@@ -249,8 +249,8 @@ class Selection:
     def prediction(self, effect: str) -> Prediction:
         """Return the prediction of one effect; that of ``read`` is the one of dark frames if they replace it."""
         frame, on = (self.frame, self.on) if self.body is None or not BY_NAME[effect].is_fixed else self.body
-        found = _prediction(effect, frame, on, self.rules.forced[effect], self.rules.tolerance)
-        return replace(found, effect="dark_frame") if self.rules.dark_frames and effect == "read" else found
+        prediction = _prediction(effect, frame, on, self.rules.forced[effect], self.rules.tolerance)
+        return replace(prediction, effect="dark_frame") if self.rules.dark_frames and effect == "read" else prediction
 
     def predictions(self) -> tuple[Prediction, ...]:
         """Return the prediction of each of `PHYSICAL_EFFECTS`, in the order of image formation."""
@@ -292,7 +292,7 @@ def omit_weakest(
     for effect in sorted(free, key=strength):
         omitted.append(effect)
         rest = on - {effect}
-        if any(frame.outliers(each, rest) >= MIN_OUTLIERS for each in omitted):
+        if any(frame.outliers(other, rest) >= MIN_OUTLIERS for other in omitted):
             break
         if frame.ratio(omitted, rest) > tolerance:
             break
@@ -304,23 +304,23 @@ def _prediction(
     effect: str, frame: FrameModel, on: frozenset[str], forced: ForcedDecision | None, tolerance: float
 ) -> Prediction:
     """Describe an effect at the signal and in the statistic where it is strongest; the first one if several are."""
-    found = [(level_dn, frame.ratios([effect], level_dn, on)) for level_dn in frame.levels(on - {effect})]
-    level_dn, ratios = max(found, key=lambda one: max(one[1]))
-    at = next(n for n, ratio in enumerate(ratios) if ratio >= max(ratios) * (1 - 1e-9))
+    candidates = [(level_dn, frame.ratios([effect], level_dn, on)) for level_dn in frame.levels(on - {effect})]
+    level_dn, ratios = max(candidates, key=lambda candidate: max(candidate[1]))
+    index = next(n for n, ratio in enumerate(ratios) if ratio >= max(ratios) * (1 - 1e-9))
     masking = frame.masking_variance(effect, level_dn, on)
     contribution = frame.contribution(effect, level_dn, masking)
-    predicted_dn = math.sqrt(contribution.variances[at] + contribution.offset_dn * contribution.offset_dn)
+    predicted_dn = math.sqrt(contribution.variances[index] + contribution.offset_dn * contribution.offset_dn)
     simulated, outliers = effect in on, frame.outliers(effect, on)
-    why = f"{ratios[at]:.3g} of the noise there"  # recorded: decides bytes of datasets
+    why = f"{ratios[index]:.3g} of the noise there"  # recorded: decides bytes of datasets
     if BY_NAME[effect].has_outliers:
         why += f", {outliers:.3g} outliers"  # recorded: decides bytes of datasets
-    if simulated and ratios[at] <= tolerance and outliers < MIN_OUTLIERS:
+    if simulated and ratios[index] <= tolerance and outliers < MIN_OUTLIERS:
         why += ", too much together with the omitted effects"
     why += f" (tolerance {tolerance:g})"  # recorded: decides bytes of datasets
-    masking_dn = math.sqrt(masking / frame.counts[at])
+    masking_dn = math.sqrt(masking / frame.counts[index])
     return Prediction(
         effect,
-        STATISTICS[at],
+        STATISTICS[index],
         predicted_dn,
         masking_dn,
         outliers,

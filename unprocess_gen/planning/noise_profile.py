@@ -226,7 +226,7 @@ def _by_iso(iso: Decimal, *pairs: Decimal) -> Decimal:
 def _neighbours(iso: Decimal, pairs: Sequence[Decimal]) -> tuple[Decimal, Decimal, Decimal]:
     """Return the place of an ISO between its neighbours in a table, from 0 to 1 in ln ISO, and their values."""
     isos, values = pairs[::2], pairs[1::2]
-    above = next((place for place, one in enumerate(isos) if iso <= one), len(isos) - 1)
+    above = next((place for place, table_iso in enumerate(isos) if iso <= table_iso), len(isos) - 1)
     if iso >= isos[above] or not above:
         return Decimal(0), values[above], values[above]
     low, high = isos[above - 1], isos[above]
@@ -292,5 +292,5 @@ def _shape_at(table: Sequence[Any], iso: float) -> float:
 @functools.lru_cache(maxsize=256)
 def _interpolated(iso: float, *pairs: float) -> float:
     with localcontext(prec=DIGITS):
-        share, low, high = _neighbours(Decimal(iso), [Decimal(one) for one in pairs])
+        share, low, high = _neighbours(Decimal(iso), [Decimal(number) for number in pairs])
         return float(low + share * (high - low))

@@ -64,19 +64,19 @@ class Comparison(NamedTuple):
     verdict: str
 
     def __str__(self) -> str:
-        one, number = self.measured, self.measured.number
+        name, iso, site, number, unit = self.measured
         assert number is not None and self.profile is not None
-        place = "".join([f"ISO {one.iso:g}: " if one.iso else "", f"site {one.site}: " if one.site else ""])
-        unit = one.unit and f" {one.unit}"
-        text = f"{place}{one.name} of the frames is {short_number(number.value, 4)}{unit}"
+        place = "".join([f"ISO {iso:g}: " if iso else "", f"site {site}: " if site else ""])
+        unit = unit and f" {unit}"
+        text = f"{place}{name} of the frames is {short_number(number.value, 4)}{unit}"
         text += f" ({short_number(number.low, 4)} to {short_number(number.high, 4)})"
         if self.verdict == LACKS:
-            return f"{text}; the profile lacks it: effect {EFFECTS[one.name]} is missing in the dataset"
+            return f"{text}; the profile lacks it: effect {EFFECTS[name]} is missing in the dataset"
         if self.verdict == UNSEEN:
             return f"{text}; the profile has {short_number(self.profile, 4)}: the camera does not show it"
         side = "above" if self.score.total > 0 else "below"
         off = f"{short_number(abs(self.score.total), 3)}{unit}"
-        off += f" or {abs(self.percent):.1f} %" if one.name not in ABSOLUTE else ""
+        off += f" or {abs(self.percent):.1f} %" if name not in ABSOLUTE else ""
         errors = f"{abs(self.score.errors):,.0f} standard errors"
         return f"{text}, {off} {side} that of the profile, {short_number(self.profile, 4)} ({errors})"
 
@@ -88,12 +88,12 @@ class Comparison(NamedTuple):
     @property
     def cells(self) -> list[str]:
         """Cells of the line in the list."""
-        one, score = self.measured, self.score
-        number = one.number or Estimate(math.nan, math.nan, math.nan)
+        name, iso, site, number, unit = self.measured
+        number = number or Estimate(math.nan, math.nan, math.nan)
         values = [number.value, number.low, number.high, math.nan if self.profile is None else self.profile]
-        values += [math.nan] * 2 if self.verdict == UNKNOWN else [self.percent, score.errors]
+        values += [math.nan] * 2 if self.verdict == UNKNOWN else [self.percent, self.score.errors]
         numbers = [f"{value:.7g}" if math.isfinite(value) else "" for value in values]
-        return [one.name, "" if one.iso is None else f"{one.iso:g}", one.site or "", one.unit, *numbers, self.verdict]
+        return [name, "" if iso is None else f"{iso:g}", site or "", unit, *numbers, self.verdict]
 
 
 class Comparisons(NamedTuple):
@@ -105,10 +105,12 @@ class Comparisons(NamedTuple):
     @property
     def differences(self) -> list[Comparison]:
         """Numbers that differ; of a number that differs at all sites together, not those of the sites."""
-        differing = [one for one in self.numbers if one.verdict not in (AGREES, UNKNOWN)]
-        whole = {(one.measured.name, one.measured.iso) for one in differing if one.measured.site is None}
+        differing = [line for line in self.numbers if line.verdict not in (AGREES, UNKNOWN)]
+        whole = {(line.measured.name, line.measured.iso) for line in differing if line.measured.site is None}
         return [
-            one for one in differing if one.measured.site is None or (one.measured.name, one.measured.iso) not in whole
+            line
+            for line in differing
+            if line.measured.site is None or (line.measured.name, line.measured.iso) not in whole
         ]
 
 
@@ -128,39 +130,41 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
     profile = Profile(config, captures.sensor, captures.isos)
     dark_only = [iso for iso in captures.isos if iso not in with_flats]
     known = {iso: Estimate(*[profile.numbers(iso, None)["dn_per_e"][0] or 1.0] * 3) for iso in dark_only}
-    found = measure_all(captures, True, watch, KnownGain("the profile of the dataset", "", known))
-    return Comparisons(list(_compared(found, profile, known)), found.notes)
+    calibration = measure_all(captures, True, watch, KnownGain("the profile of the dataset", "", known))
+    return Comparisons(list(_compared(calibration, profile, known)), calibration.notes)
 
 
-def _compared(found: Calibration, profile: Profile, known: dict[float, Estimate]) -> Iterator[Comparison]:
+def _compared(calibration: Calibration, profile: Profile, known: dict[float, Estimate]) -> Iterator[Comparison]:
     """Yield the comparison of each estimate."""
-    celsius, isos = found.body.dark_reference_c, found.captures.isos
-    variances = [Named("b_dn2", result.iso, None, dark_variance(result), "DN²") for result in found.isos]
-    listed = [one for one in [*estimates(found), *variances] if one.name in EFFECTS]
-    limit, sites = math.log(2 * len(listed) / FALSE_ALARM), site_names(found.sensor)
+    celsius, isos = calibration.body.dark_reference_c, calibration.captures.isos
+    variances = [Named("b_dn2", result.iso, None, dark_variance(result), "DN²") for result in calibration.isos]
+    listed = [estimate for estimate in [*estimates(calibration), *variances] if estimate.name in EFFECTS]
+    limit, sites = math.log(2 * len(listed) / FALSE_ALARM), site_names(calibration.sensor)
     tukey = {
-        (one.iso, place): shape.is_tukey for one in found.isos for place, shape in enumerate([one.shape, *one.shapes])
+        (result.iso, place): shape.is_tukey
+        for result in calibration.isos
+        for place, shape in enumerate([result.shape, *result.shapes])
     }
-    for one in listed:
-        numbers = profile.numbers(one.iso or isos[0], celsius)
-        place = 1 + sites.index(one.site) if one.site else 0
-        if one.name not in numbers:
+    for estimate in listed:
+        numbers = profile.numbers(estimate.iso or isos[0], celsius)
+        place = 1 + sites.index(estimate.site) if estimate.site else 0
+        if estimate.name not in numbers:
             continue
-        expected = numbers[one.name][place]
-        is_open = one.number is None or not math.isfinite(one.number.high) or expected is None
-        is_open |= one.name == "dn_per_e" and one.iso in known
-        is_open |= one.name in AT_TEMPERATURE and celsius is None and bool(expected)
+        expected = numbers[estimate.name][place]
+        is_open = estimate.number is None or not math.isfinite(estimate.number.high) or expected is None
+        is_open |= estimate.name == "dn_per_e" and estimate.iso in known
+        is_open |= estimate.name in AT_TEMPERATURE and celsius is None and bool(expected)
         # a normal distribution is nearest to Tukey's at a shape that a fit may miss
-        is_open |= one.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[one.iso or 0.0, place]
-        if is_open or one.number is None or expected is None:
-            yield Comparison(one, expected, Score(0.0, 1.0, 0.0), UNKNOWN)
+        is_open |= estimate.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[estimate.iso or 0.0, place]
+        if is_open or estimate.number is None or expected is None:
+            yield Comparison(estimate, expected, Score(0.0, 1.0, 0.0), UNKNOWN)
             continue
-        score = _score(one.number, expected)
+        score = _score(estimate.number, expected)
         verdict = AGREES
         if score.surprise > limit:
-            verdict = DIFFERS if expected and one.number.value else UNSEEN if expected else LACKS
-            verdict = DIFFERS if one.name == "black_error_dn" else verdict
-        yield Comparison(one, expected, score, verdict)
+            verdict = DIFFERS if expected and estimate.number.value else UNSEEN if expected else LACKS
+            verdict = DIFFERS if estimate.name == "black_error_dn" else verdict
+        yield Comparison(estimate, expected, score, verdict)
 
 
 def _score(number: Estimate, expected: float) -> Score:
@@ -183,7 +187,7 @@ class Profile:
         noise = config.noise
         if is_physical(noise):
             noise = dataclasses.replace(noise, iso=None, scatter="off")
-        elif len(isos) > 1 or any(one.kind != "constant" for one in noise_distributions(noise)):
+        elif len(isos) > 1 or any(distribution.kind != "constant" for distribution in noise_distributions(noise)):
             problem = "is for one ISO" if len(isos) > 1 else "draws its numbers"
             raise ConfigError(f"verify: --against: noise={noise.name} {problem}; expected frames and a profile of one")
         self.config = dataclasses.replace(config, sensor=levels, noise=noise, mixture=None)
@@ -225,10 +229,10 @@ def check_list(to: Path) -> None:
     check_output_file(to, f"--to {to}", "an earlier list of --against", ",".join(FIELDS).encode())
 
 
-def write_list(found: Comparisons, to: Path) -> None:
+def write_list(comparisons: Comparisons, to: Path) -> None:
     """Write all comparisons as CSV."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerows([FIELDS, *(one.cells for one in found.numbers)])
+    writer.writerows([FIELDS, *(comparison.cells for comparison in comparisons.numbers)])
     with machine_errors(to):
         to.write_text(file.getvalue(), encoding="utf-8")

@@ -38,21 +38,20 @@ def check_page(page: Path) -> None:
     check_output_file(page, f"--report {page}", "an HTML page", b"<!doctype html")
 
 
-def write_page(found: Calibration, name: str, command: str, page: Path) -> None:
+def write_page(calibration: Calibration, name: str, command: str, page: Path) -> None:
     """Write the page of a calibration."""
-    figures = [
-        (f"ISO {result.iso:g}", data_uri(_drawn(result, site_names(found.sensor)), "png")) for result in found.isos
-    ]
+    sites = site_names(calibration.sensor)
+    figures = [(f"ISO {result.iso:g}", data_uri(_drawn(result, sites), "png")) for result in calibration.isos]
     text = render_page(
         "calibration.html",
         title=f"Calibration of {name}",
         command=command,
-        frames=len(found.captures.captures),
-        notes=found.notes,
+        frames=len(calibration.captures.captures),
+        notes=calibration.notes,
         figures=figures,
-        against_iso=data_uri(_against_iso(found)) if len(found.isos) > 1 else "",
-        table=_table(estimates(found)),
-        sensors=_sensors(found, name),
+        against_iso=data_uri(_against_iso(calibration)) if len(calibration.isos) > 1 else "",
+        table=_table(estimates(calibration)),
+        sensors=_sensors(calibration, name),
     )
     with machine_errors(page):
         page.write_text(text, encoding="utf-8")
@@ -62,13 +61,13 @@ def _table(named: list[Named]) -> PageTable:
     """Return the estimates of all sites together as a table."""
     lines = [
         (
-            one.name,
-            "" if one.iso is None else f"{one.iso:g}",
-            *(["–"] * 3 if one.number is None else [short_number(getattr(one.number, end), 4) for end in ENDS]),
-            one.unit,
+            name,
+            "" if iso is None else f"{iso:g}",
+            *(["–"] * 3 if number is None else [short_number(getattr(number, end), 4) for end in ENDS]),
+            unit,
         )
-        for one in named
-        if one.site is None
+        for name, iso, site, number, unit in named
+        if site is None
     ]
     return PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4))
 
@@ -76,15 +75,15 @@ def _table(named: list[Named]) -> PageTable:
 ENDS = ("value", "low", "high")
 
 
-def _sensors(found: Calibration, name: str) -> PageTable:
+def _sensors(calibration: Calibration, name: str) -> PageTable:
     """Return gain and read noise of this sensor and of the built-in profiles, in electrons."""
     lines = []
-    for result in found.isos:
+    for result in calibration.isos:
         gain = result.gain.sensor.value
         electrons = [short_number(value / gain, 3) for value in (result.read.value, result.row.value)]
-        full = short_number(found.sensor.span_dn / gain, 3)
+        full = short_number(calibration.sensor.span_dn / gain, 3)
         lines.append((f"{name}, measured", f"{result.iso:g}", short_number(gain, 3), *electrons, full))
-    isos = {result.iso for result in found.isos}
+    isos = {result.iso for result in calibration.isos}
     for option in group_options("noise"):
         if "branches:" not in (conf_dir() / "noise" / f"{option}.yaml").read_text(encoding="utf-8"):
             continue  # two numbers, which may depend on the sensor
@@ -167,25 +166,25 @@ def _draw_histogram(axes: Axes, result: IsoResult) -> None:
     axes.legend()
 
 
-def _against_iso(found: Calibration) -> bytes:
+def _against_iso(calibration: Calibration) -> bytes:
     """Draw gain, read noise and row noise against ISO, with intervals and the laws of the profile."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    isos = [result.iso for result in found.isos]
+    isos = [result.iso for result in calibration.isos]
     for place, (axes, label, law, numbers) in enumerate(
         (
-            (left, "DN per electron", gain_law, [result.gain.sensor for result in found.isos]),
-            (right, "read noise (DN)", std_law, [result.read for result in found.isos]),
-            (right, "row noise (DN)", std_law, [result.row for result in found.isos]),
+            (left, "DN per electron", gain_law, [result.gain.sensor for result in calibration.isos]),
+            (right, "read noise (DN)", std_law, [result.read for result in calibration.isos]),
+            (right, "row noise (DN)", std_law, [result.row for result in calibration.isos]),
         )
     ):
-        values = [one.value or math.nan for one in numbers]
-        errors = [[one.value - one.low for one in numbers], [one.high - one.value for one in numbers]]
+        values = [number.value or math.nan for number in numbers]
+        errors = [[number.value - number.low for number in numbers], [number.high - number.value for number in numbers]]
         axes.errorbar(isos, values, np.maximum(errors, 0), fmt="o", markersize=3, label=label, color=f"C{place}")
-        for branch in iso_branches(found.isos):
-            form = law([isos[one] for one in branch], [numbers[one] for one in branch])
+        for branch in iso_branches(calibration.isos):
+            form = law([isos[index] for index in branch], [numbers[index] for index in branch])
             grid = np.geomspace(isos[branch[0]], isos[branch[-1]], 50)
             laws = [number(form, iso=iso) or math.nan for iso in grid.tolist()]
             axes.plot(grid, laws, linewidth=0.8, color=f"C{place}")

@@ -303,10 +303,10 @@ def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> float:
     for group in plans[: len(entries)]:
         for _ in make_pairs(srgb, group):
             pass
-    of_run = set().union(*needed[: len(entries)])
-    for kernels in of_run:
+    run_kernels = set().union(*needed[: len(entries)])
+    for kernels in run_kernels:
         self_test.failures(kernels)  # a run does so before its first pair
     seconds = time.perf_counter() - started
-    for kernels in missing - of_run:
+    for kernels in missing - run_kernels:
         self_test.failures(kernels)  # records that they are compiled
-    return 0.0 if of_run & missing else seconds
+    return 0.0 if run_kernels & missing else seconds

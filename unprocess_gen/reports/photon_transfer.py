@@ -136,9 +136,9 @@ def _row_variances(sums: Sums, planes: list[Plane], influence: Float) -> Float:
     if not offsets.variance:
         return np.zeros(2)
     by_square, by_offset = np.zeros((2, 2, 2, sums.height // 2))  # slope and intercept, even and odd rows
-    for plane, of_plane in zip(planes, np.split(influence, ends[:-1], axis=1), strict=True):
+    for plane, plane_influence in zip(planes, np.split(influence, ends[:-1], axis=1), strict=True):
         y, expected = plane.noise.site.place[0], plane.expected
-        by_site = of_plane / plane.count
+        by_site = plane_influence / plane.count
         by_square[:, y] += plane.row_sums(by_site)
         by_offset[:, y] += plane.row_sums(by_site * expected.slope / expected.by_variance)
     squares, linear = ((values**2).sum(axis=(1, 2)) for values in (by_square, by_offset))

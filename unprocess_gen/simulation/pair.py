@@ -114,12 +114,12 @@ def _pairs(
         return
     srgb = _dequantise(srgb, plans[0], origin)
     clean: Frame | None = None
-    for some in _passes(plans):
-        if some[0].accuracy.uses_reference:
-            for plan in some:
+    for group in _passes(plans):
+        if group[0].accuracy.uses_reference:
+            for plan in group:
                 yield _reference_pair(srgb, plan, origin, _curve(srgb, plan), dark_pixels)
             continue
-        for pair in render_pairs(srgb, some, origin, dark_pixels):
+        for pair in render_pairs(srgb, group, origin, dark_pixels):
             clean = pair.clean if clean is None else clean
             yield pair if clean is pair.clean else replace(pair, clean=clean)
 

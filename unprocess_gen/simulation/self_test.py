@@ -147,8 +147,8 @@ def _failures(kernel_set: str) -> Iterator[str]:
     for name in (name for name, plan in GOLDEN_PLANS.items() if kernels(plan) == kernel_set):
         pair = make_pair(golden_image(), GOLDEN_PLANS[name], (1, 57))
         for member, digest in zip(("clean", "noisy"), GOLDEN[name], strict=True):
-            if (found := array_xxh3(getattr(pair, member))) != digest:
-                yield f"the golden {member} frame ({name}) is {found}, expected {digest}"
+            if (actual := array_xxh3(getattr(pair, member))) != digest:
+                yield f"the golden {member} frame ({name}) is {actual}, expected {digest}"
     note_run(kernel_set)  # also after a failure: nothing is left to compile
 
 

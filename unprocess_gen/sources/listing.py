@@ -155,7 +155,7 @@ def list_file(root: Root, file: str, limit: int | None) -> Listing:
     if not lines:
         raise ConfigError(f"source.list={file}: names no file; expected a path in each line")
     in_order = sorted(lines, key=os.fsencode)[:limit]
-    entries = root_path(root).each(partial(_listed_entry, root), in_order)
+    entries = root_path(root).map(partial(_listed_entry, root), in_order)
     return Listing(tuple(_source(index, entry) for index, entry in enumerate(entries)))
 
 
@@ -179,8 +179,8 @@ def _listed_paths(file: str) -> Iterator[tuple[int, str]]:
 
 def _path_below(root: Root, text: str) -> str:
     """Return the path of a listed file below the root, with ``/`` between its segments; others stay as they are."""
-    numbered = [(f"{number}/", one) for number, one in enumerate(root)] if isinstance(root, tuple) else [("", root)]
-    for prefix, folder in numbered:
+    roots = [(f"{number}/", folder) for number, folder in enumerate(root)] if isinstance(root, tuple) else [("", root)]
+    for prefix, folder in roots:
         start = f"{absolute_text(folder)}".rstrip("/") + "/"
         if text.startswith(start):
             return prefix + posixpath.normpath(text.removeprefix(start))
@@ -237,10 +237,10 @@ def matcher(include: Iterable[str]) -> Callable[[str], bool]:
     patterns: dict[bool, list[str]] = {True: [], False: []}
     for glob in include:
         patterns["/" in glob].append(fnmatch.translate(glob))
-    of_path, of_name = (
+    matches_path, matches_name = (
         re.compile("|".join(patterns[is_full]) or r"(?!)", re.IGNORECASE).match for is_full in (True, False)
     )
-    return lambda path: of_name(path.rpartition("/")[2]) is not None or of_path(path) is not None
+    return lambda path: matches_name(path.rpartition("/")[2]) is not None or matches_path(path) is not None
 
 
 def _unreadable_folder(root: Root, folder: str, reason: str) -> ConfigError:

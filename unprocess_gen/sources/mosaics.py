@@ -98,8 +98,8 @@ def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
         raise ConfigError(f"{key}: {path} holds no Bayer mosaic; expected one")
     if len(blacks) > 1:
         raise ConfigError(
-            f"{key}: {path} states the black levels {', '.join(f'{one:g}' for one in sorted(blacks))}; expected one; "
-            "convert the frames to NPY, and set noise.dark_frames_black_dn"
+            f"{key}: {path} states the black levels {', '.join(f'{black:g}' for black in sorted(blacks))}; "
+            "expected one; convert the frames to NPY, and set noise.dark_frames_black_dn"
         )
     return Mosaic(frame.pixels, blacks.pop(), facts.pattern)
 

@@ -35,7 +35,7 @@ def number_twins(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
             by_size.setdefault(source.size_bytes, []).append(source)
     groups = [group for group in by_size.values() if len(group) > 1]
     candidates = list(_sharing_tails(root, groups))
-    digests = root_path(root).each(partial(_complete_digest, root), candidates)
+    digests = root_path(root).map(partial(_complete_digest, root), candidates)
     numbered, seen = {source.index: source for source in sources}, Counter[str]()
     for source, digest in zip(candidates, digests, strict=True):
         if digest is not None:
@@ -47,7 +47,7 @@ def number_twins(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
 def _sharing_tails(root: Root, groups: Iterable[Sequence[Source]]) -> Iterator[Source]:
     """Yield the sources whose last bytes equal those of another source of their group, group by group."""
     groups = list(groups)
-    tails = root_path(root).each(partial(_tail_digest, root), itertools.chain.from_iterable(groups))
+    tails = root_path(root).map(partial(_tail_digest, root), itertools.chain.from_iterable(groups))
     for group in groups:
         group_tails = list(itertools.islice(tails, len(group)))
         counts = Counter(group_tails)

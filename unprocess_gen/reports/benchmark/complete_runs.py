@@ -211,7 +211,7 @@ def measure_runs(
         for name, tier in tiers.items()
     }
     times = measure_in_turns(runs, rounds, advance)
-    return {key: [time for time in of_key if time is not None] for key, of_key in times.items()}
+    return {key: [time for time in durations if time is not None] for key, durations in times.items()}
 
 
 def run_rows(

@@ -112,8 +112,8 @@ def _draw_points(axes: Axes, rows: Sequence[Measurement]) -> None:
     _set_axes(axes, [point.ns for point in points], [point.error for point in points])
     in_front = []
     for stage in dict.fromkeys(point.stage for point in points):
-        of_stage = [point for point in points if point.stage == stage]
-        front = sorted(of_stage[index] for index in pareto_front([point[:2] for point in of_stage]))
+        stage_points = [point for point in points if point.stage == stage]
+        front = sorted(stage_points[index] for index in pareto_front([point[:2] for point in stage_points]))
         axes.plot(*zip(*(point[:2] for point in front), strict=True), color=GREY, linewidth=1.2, zorder=1)
         in_front += front
     lowest = sorted(point for point in points if point.error == min(point.error for point in points))

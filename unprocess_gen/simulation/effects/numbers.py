@@ -138,4 +138,4 @@ def rate(meaning: str, **details: Any) -> Any:
 
 def numbers_of(record: type[Any]) -> dict[str, Number]:
     """Return the declared numbers of a dataclass by the names of its fields."""
-    return {one.name: one.metadata[METADATA] for one in dataclasses.fields(record) if METADATA in one.metadata}
+    return {field.name: field.metadata[METADATA] for field in dataclasses.fields(record) if METADATA in field.metadata}

@@ -192,9 +192,9 @@ def _fill_signal(codes: Pointer, strip: Strip, scene: Any, signal: Pointer) -> N
     even = simd.pointer_to(scene.products, 3 * code_count * channels[0])
     odd = simd.pointer_to(scene.products, 3 * code_count * channels[1])
     for x in range(strip.length):
-        of_site = odd if x & 1 else even
+        table = odd if x & 1 else even
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
-        signal[x] = (of_site[r] + of_site[code_count + g]) + of_site[2 * code_count + b]
+        signal[x] = (table[r] + table[code_count + g]) + table[2 * code_count + b]
 
 
 @inner

@@ -164,9 +164,9 @@ def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
     }
 
 
-def _by_site(of_tile: Sequence[float], top: int) -> Float:
+def _by_site(tile: Sequence[float], top: int) -> Float:
     """Return the values of eight sites of an even and of an odd row, [2, 8], of a frame whose first row is ``top``."""
-    return np.roll(np.tile(np.array(of_tile).reshape(2, 2), VECTOR_WIDTH // 2), -top, axis=0)
+    return np.roll(np.tile(np.array(tile).reshape(2, 2), VECTOR_WIDTH // 2), -top, axis=0)
 
 
 def _purpose(stream: str) -> np.uint64:

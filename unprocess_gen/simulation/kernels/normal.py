@@ -106,12 +106,12 @@ def fill_rows(count: int, words: Pointer, rows: Pointer) -> None:
 @inner
 def exact_values(words: Pointer, rows: Pointer, x: np.uint64, quadratics: Pointer) -> Vector:
     """Return the quantiles of eight words, the values of `exact_value`."""
-    of_words = simd.load(words, x)
-    bits = simd.to_bits(simd.to_float64(of_words & _LOW31) + 0.5)
+    lanes = simd.load(words, x)
+    bits = simd.to_bits(simd.to_float64(lanes & _LOW31) + 0.5)
     t = simd.from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
     start, slope, curvature = simd.load_columns(quadratics, rows, x)
     z = start + t * (slope + t * curvature)
-    signed: Vector = simd.from_bits(simd.to_bits(z) ^ (simd.to_uint64(of_words & _SIGN) << _32))
+    signed: Vector = simd.from_bits(simd.to_bits(z) ^ (simd.to_uint64(lanes & _SIGN) << _32))
     return signed
 
 

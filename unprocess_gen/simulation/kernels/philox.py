@@ -81,14 +81,14 @@ def fill_word_blocks(key: PhiloxKey, strip: Strip, purpose_word: np.uint64, out:
     """Fill ``out`` (uint32) with one word per pixel, for the complete blocks of a strip, from index -`lead` on."""
     for block in range(strip.blocks):
         counter = (strip.block + np.uint64(block)) * _LANES
-        at = block * BLOCK - strip.lead
+        first = block * BLOCK - strip.lead
         for lane in range(LANES):
             c0, c1, c2, c3 = counter + np.uint64(lane), strip.row, purpose_word | key[2], key[3]
             k0, k1 = key[0], key[1]
             for _ in range(ROUNDS):
                 c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
                 k0, k1 = (k0 + KEY_STEP0) & LOW32, (k1 + KEY_STEP1) & LOW32
-            out[at + lane] = np.uint32(c0 & LOW32)
-            out[at + LANES + lane] = np.uint32(c1 & LOW32)
-            out[at + 2 * LANES + lane] = np.uint32(c2 & LOW32)
-            out[at + 3 * LANES + lane] = np.uint32(c3 & LOW32)
+            out[first + lane] = np.uint32(c0 & LOW32)
+            out[first + LANES + lane] = np.uint32(c1 & LOW32)
+            out[first + 2 * LANES + lane] = np.uint32(c2 & LOW32)
+            out[first + 3 * LANES + lane] = np.uint32(c3 & LOW32)

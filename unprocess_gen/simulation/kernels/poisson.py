@@ -308,12 +308,12 @@ def _bounds_by_first_terms(rate: float, z: float) -> tuple[float, float]:
 def _refine_normal(tail: float, z: float, tails: Pointer) -> float:
     """Return the upper normal quantile of ``tail`` by one Newton step from ``z``, in the reference's order."""
     cell = np.int64(z * TAIL_CELLS)
-    offset, at = z - (cell + 0.5) / TAIL_CELLS, cell * (ORDER + 1)
-    value, slope = tails[at + ORDER], tails[at + ORDER] * ORDER
+    offset, start = z - (cell + 0.5) / TAIL_CELLS, cell * (ORDER + 1)
+    value, slope = tails[start + ORDER], tails[start + ORDER] * ORDER
     for n in range(ORDER - 1, 0, -1):
-        value = tails[at + n] + offset * value
-        slope = tails[at + n] * n + offset * slope
-    value = tails[at] + offset * value
+        value = tails[start + n] + offset * value
+        slope = tails[start + n] * n + offset * slope
+    value = tails[start] + offset * value
     return float(z - (value - tail) / slope)
 
 
@@ -341,8 +341,8 @@ def _power_sum(which: int, s: float) -> float:
 def _count_by_cdf(word: np.uint32, rate: float, z: float, tables: CountTables) -> float:
     """Return the least k with P(K <= k) >= u, from an estimate by the normal of the word up or down."""
     root = np.sqrt(rate)
-    of_cell = simd.pointer_to(tables.cells, 4 * np.int64(root * RATE_CELLS))
-    first, least, most, offset = np.int64(of_cell[0]), of_cell[1], of_cell[2], rate - of_cell[3]
+    record = simd.pointer_to(tables.cells, 4 * np.int64(root * RATE_CELLS))
+    first, least, most, offset = np.int64(record[0]), record[1], record[2], rate - record[3]
     # rank of the word by its normal: invert the top bit, and the other bits too if it was 0
     bits = np.uint64(word)
     uniform = (np.float64(bits ^ (_SIGN | (((bits >> _31) - _1) & _LOW31))) + 0.5) * 2.0**-32
@@ -357,8 +357,8 @@ def _count_by_cdf(word: np.uint32, rate: float, z: float, tables: CountTables) -
 @inner
 def _cdf_at(cdf: Pointer, row: int, offset: float) -> float:
     """Return P(K <= k) of a table row, ``offset`` from the middle of its cell, in the reference's order."""
-    at = row * (ORDER + 1)
-    total: float = cdf[at + ORDER]
+    start = row * (ORDER + 1)
+    total: float = cdf[start + ORDER]
     for n in range(ORDER - 1, -1, -1):
-        total = cdf[at + n] + offset * total
+        total = cdf[start + n] + offset * total
     return total

@@ -187,13 +187,13 @@ def _pointer_type(member: Any) -> Any:
     return member
 
 
-def _build_pointers(context: Any, builder: Any, of_type: Any, member: Any) -> Any:
-    if isinstance(of_type, types.Array):
-        return context.make_array(of_type)(context, builder, member).data
-    if isinstance(of_type, types.NamedTuple | types.NamedUniTuple):
-        members = zip(of_type.types, cgutils.unpack_tuple(builder, member), strict=True)
+def _build_pointers(context: Any, builder: Any, member_type: Any, member: Any) -> Any:
+    if isinstance(member_type, types.Array):
+        return context.make_array(member_type)(context, builder, member).data
+    if isinstance(member_type, types.NamedTuple | types.NamedUniTuple):
+        members = zip(member_type.types, cgutils.unpack_tuple(builder, member), strict=True)
         converted = [_build_pointers(context, builder, kind, value) for kind, value in members]
-        return context.make_tuple(builder, _pointer_type(of_type), converted)
+        return context.make_tuple(builder, _pointer_type(member_type), converted)
     return member
 
 
@@ -212,18 +212,18 @@ def _flatten(member: Any) -> Any:
 
 
 @_compiled(
-    lambda array, at: _pointer_type(array),
+    lambda array, index: _pointer_type(array),
     lambda context, builder, call, arguments: builder.gep(
         _build_pointers(context, builder, call.args[0], arguments[0]), [arguments[1]]
     ),
 )
-def pointer_to(array: NDArray[Any], at: Index) -> Pointer:
-    """Return a pointer to the data of a C-contiguous array, from the flat index ``at`` on.
+def pointer_to(array: NDArray[Any], index: Index) -> Pointer:
+    """Return a pointer to the data of a C-contiguous array, from the flat index ``index`` on.
 
     Compiled code checks no index and counts no reference: the count costs a locked instruction per call. So the array
     must outlive the pointer, as arguments of the outer kernel do.
     """
-    return array.reshape(-1)[at:]
+    return array.reshape(-1)[index:]
 
 
 class BuffersType(types.Type):
@@ -233,7 +233,7 @@ class BuffersType(types.Type):
     """
 
     def __init__(self, name: str, places: Mapping[str, tuple[np.dtype[Any], int]]) -> None:
-        self.places = {member: (types.CPointer(from_dtype(dtype)), at) for member, (dtype, at) in places.items()}
+        self.places = {member: (types.CPointer(from_dtype(dtype)), start) for member, (dtype, start) in places.items()}
         super().__init__(name=name)
 
 
@@ -254,8 +254,8 @@ class _BufferTemplate(AttributeTemplate):
 
 
 def _build_buffer(context: Any, builder: Any, buffers_type: BuffersType, memory: Any, member: str) -> Any:
-    pointer_type, at = buffers_type.places[member]
-    place = builder.gep(memory, [ir.Constant(ir.IntType(64), at)])
+    pointer_type, start = buffers_type.places[member]
+    place = builder.gep(memory, [ir.Constant(ir.IntType(64), start)])
     return builder.bitcast(place, context.get_value_type(pointer_type))
 
 
@@ -280,8 +280,8 @@ def buffers_at(
     )
 
 
-def _address(builder: Any, llvm_type: ir.Type, pointer: Any, at: Any) -> Any:
-    return builder.bitcast(builder.gep(pointer, [at]), llvm_type.as_pointer())
+def _address(builder: Any, llvm_type: ir.Type, pointer: Any, index: Any) -> Any:
+    return builder.bitcast(builder.gep(pointer, [index]), llvm_type.as_pointer())
 
 
 def _build_load(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
@@ -289,33 +289,33 @@ def _build_load(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
     return builder.load(address, align=call.args[0].dtype.bitwidth // 8)
 
 
-@_compiled(lambda pointer, at: _VECTORS[pointer.dtype], _build_load)
-def load(pointer: Pointer, at: Index) -> Vector:
-    """Load the vector of elements ``at`` to ``at + 7``."""
-    return pointer[at : at + VECTOR_WIDTH].copy()
+@_compiled(lambda pointer, index: _VECTORS[pointer.dtype], _build_load)
+def load(pointer: Pointer, index: Index) -> Vector:
+    """Load the vector of elements ``index`` to ``index + 7``."""
+    return pointer[index : index + VECTOR_WIDTH].copy()
 
 
 def _build_store(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
-    pointer, at, lanes = arguments
+    pointer, index, lanes = arguments
     element = call.args[0].dtype
     if element == types.uint16:
         lanes = builder.trunc(lanes, ir.VectorType(ir.IntType(16), VECTOR_WIDTH))
-    builder.store(lanes, _address(builder, lanes.type, pointer, at), align=element.bitwidth // 8)
+    builder.store(lanes, _address(builder, lanes.type, pointer, index), align=element.bitwidth // 8)
     return context.get_dummy_value()
 
 
-@_compiled(lambda pointer, at, lanes: types.none, _build_store)
-def store(pointer: Pointer, at: Index, lanes: Vector) -> None:
-    """Store a vector as elements ``at`` to ``at + 7``; uint32 lanes are truncated to uint16 elements."""
-    pointer[at : at + VECTOR_WIDTH] = lanes.astype(pointer.dtype)
+@_compiled(lambda pointer, index, lanes: types.none, _build_store)
+def store(pointer: Pointer, index: Index, lanes: Vector) -> None:
+    """Store a vector as elements ``index`` to ``index + 7``; uint32 lanes are truncated to uint16 elements."""
+    pointer[index : index + VECTOR_WIDTH] = lanes.astype(pointer.dtype)
 
 
 def _build_columns(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
     """Load each row at once and transpose, because single loads would take three times as long."""
-    table, starts, at = arguments
+    table, starts, index = arguments
     row_type, rows = ir.VectorType(_FLOAT64.llvm.element, 4), []
     for lane in range(VECTOR_WIDTH):
-        start = builder.load(builder.gep(starts, [builder.add(at, ir.Constant(at.type, lane))]))
+        start = builder.load(builder.gep(starts, [builder.add(index, ir.Constant(index.type, lane))]))
         start = builder.zext(start, ir.IntType(64))
         rows.append(builder.load(_address(builder, row_type, table, start), align=8))
     columns = []
@@ -328,10 +328,10 @@ def _build_columns(context: Any, builder: Any, call: Any, arguments: Any) -> Any
     return context.make_tuple(builder, call.return_type, columns)
 
 
-@_compiled(lambda table, starts, at: types.UniTuple(_FLOAT64, 3), _build_columns)
-def load_columns(table: Pointer, starts: Pointer, at: Index) -> tuple[Vector, Vector, Vector]:
+@_compiled(lambda table, starts, index: types.UniTuple(_FLOAT64, 3), _build_columns)
+def load_columns(table: Pointer, starts: Pointer, index: Index) -> tuple[Vector, Vector, Vector]:
     """Load the first three of four columns of eight rows of a float64 table; they begin at ``starts[at]`` and so on."""
-    rows = table[starts[at : at + VECTOR_WIDTH].astype(np.int64)[:, None] + np.arange(3)]
+    rows = table[starts[index : index + VECTOR_WIDTH].astype(np.int64)[:, None] + np.arange(3)]
     return rows[:, 0], rows[:, 1], rows[:, 2]
 
 

@@ -141,9 +141,9 @@ def _places(dtype: np.dtype[Any]) -> dict[str, tuple[np.dtype[Any], int]]:
     """
     places, end = {}, 0
     for name, annotation in get_type_hints(Workspace).items():
-        of_buffer = np.dtype(_DTYPES.get(annotation, dtype))
-        places[name] = of_buffer, end + BLOCK * of_buffer.itemsize
-        end += (BLOCK + _LENGTHS.get(name, SIZE)) * of_buffer.itemsize
+        buffer_dtype = np.dtype(_DTYPES.get(annotation, dtype))
+        places[name] = buffer_dtype, end + BLOCK * buffer_dtype.itemsize
+        end += (BLOCK + _LENGTHS.get(name, SIZE)) * buffer_dtype.itemsize
     return places
 
 
@@ -173,8 +173,8 @@ def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
 
 def allocate_scratch(dtype: Any = np.float64) -> Scratch:
     """Allocate zeroed buffers: kernels also compute the padding of vectors, which must hold finite numbers."""
-    of_last, at = _places(np.dtype(dtype))["count_by_mask"]
-    size = at + (SIZE + BLOCK) * of_last.itemsize
+    last_dtype, last_start = _places(np.dtype(dtype))["count_by_mask"]
+    size = last_start + (SIZE + BLOCK) * last_dtype.itemsize
     memory = np.zeros(size + CACHE_LINE, dtype=np.uint8)
     start = -memory.ctypes.data % CACHE_LINE
     scratch: Scratch = memory[start : start + size].view(dtype)
@@ -195,22 +195,22 @@ def workspace_in(scratch: Scratch) -> Workspace:
     # a view ends with a further block, which negative indices reach in uncompiled kernels
     return Workspace(
         *(
-            memory[at : at + (_LENGTHS.get(name, SIZE) + BLOCK) * dtype.itemsize].view(dtype)
-            for name, (dtype, at) in _places(scratch.dtype).items()
+            memory[start : start + (_LENGTHS.get(name, SIZE) + BLOCK) * dtype.itemsize].view(dtype)
+            for name, (dtype, start) in _places(scratch.dtype).items()
         )
     )
 
 
 @inner
-def list_lanes(lanes: Vector, x: np.uint64, found: int, workspace: Workspace) -> int:
+def list_lanes(lanes: Vector, x: np.uint64, count: int, workspace: Workspace) -> int:
     """Append the indices of set lanes (`simd.less_than`) of the vector at ``x`` to ``uncertain``; return the length.
 
     Every call writes all eight lanes, and the next one overwrites the others: a branch would be mispredicted about
     every second time.
     """
     mask = simd.movemask(lanes)
-    simd.store(workspace.uncertain, found, simd.load(workspace.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
-    length: int = found + workspace.count_by_mask[mask]
+    simd.store(workspace.uncertain, count, simd.load(workspace.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
+    length: int = count + workspace.count_by_mask[mask]
     return length
 
 

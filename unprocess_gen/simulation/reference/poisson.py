@@ -129,8 +129,8 @@ def poisson_tables() -> Tables:
     ends = np.cumsum(most - least + 1)
     first = ends - most - 1
     tables = Tables(_tails(), polynomials[kept], first, least, most, middle)
-    if (found := digest(tables)) != TABLES_SHA256:
-        raise MachineError(f"the Poisson tables have SHA-256 {found}; expected {TABLES_SHA256}; use another Python")
+    if (actual := digest(tables)) != TABLES_SHA256:
+        raise MachineError(f"the Poisson tables have SHA-256 {actual}; expected {TABLES_SHA256}; use another Python")
     for table in tables:
         table.flags.writeable = False
     return tables

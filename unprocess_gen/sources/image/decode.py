@@ -227,9 +227,9 @@ def _imdecode(data: bytes | bytearray, flags: int) -> tuple[Srgb | None, bytes]:
 
 def _check_array(decoded: Srgb, header: Header) -> None:
     expected = (header.height, header.width, f"uint{header.bits}")
-    found = (*decoded.shape[:2], decoded.dtype.name)
-    if found != expected:
-        raise SourceError("corrupt", f"the header declares {expected} (rows, columns, type), the data have {found}")
+    actual = (*decoded.shape[:2], decoded.dtype.name)
+    if actual != expected:
+        raise SourceError("corrupt", f"the header declares {expected} (rows, columns, type), the data have {actual}")
 
 
 def _check_opaque(decoded: Srgb, data: bytes, header: Header) -> None:

@@ -452,11 +452,11 @@ _WEBP_ALPHA, _WEBP_ANIMATION = 0x10, 0x02
 
 def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
     """Yield (kind, start, end) of each chunk; the last may extend past the end of the file."""
-    at = _WEBP_HEAD
-    while at + 8 <= len(data):
-        kind, length = struct.unpack_from("<4sI", data, at)
-        yield kind, at + 8, at + 8 + length
-        at += 8 + length + length % 2
+    position = _WEBP_HEAD
+    while position + 8 <= len(data):
+        kind, length = struct.unpack_from("<4sI", data, position)
+        yield kind, position + 8, position + 8 + length
+        position += 8 + length + length % 2
 
 
 def _webp(data: bytes) -> Header:
@@ -480,21 +480,21 @@ def _webp(data: bytes) -> Header:
     )
 
 
-def _webp_canvas(data: bytes, at: int) -> tuple[int, int, int]:
+def _webp_canvas(data: bytes, start: int) -> tuple[int, int, int]:
     """Return (width, height, flags) of an extended file: 24-bit sizes minus one."""
-    flags, width, height = struct.unpack_from("<B3x3s3s", data, at)
+    flags, width, height = struct.unpack_from("<B3x3s3s", data, start)
     return 1 + int.from_bytes(width, "little"), 1 + int.from_bytes(height, "little"), flags
 
 
-def _webp_lossy(data: bytes, at: int) -> tuple[int, int, int]:
+def _webp_lossy(data: bytes, start: int) -> tuple[int, int, int]:
     """Return (width, height, flags) of a VP8 key frame: 14-bit sizes; the upper two bits request scaling."""
-    width, height = struct.unpack_from("<HH", data, at + 6)
+    width, height = struct.unpack_from("<HH", data, start + 6)
     return width & 0x3FFF, height & 0x3FFF, 0
 
 
-def _webp_lossless(data: bytes, at: int) -> tuple[int, int, int]:
+def _webp_lossless(data: bytes, start: int) -> tuple[int, int, int]:
     """Return (width, height, flags) of a VP8L stream: two 14-bit sizes minus one, then the alpha bit."""
-    (packed,) = struct.unpack_from("<I", data, at + 1)
+    (packed,) = struct.unpack_from("<I", data, start + 1)
     return 1 + (packed & 0x3FFF), 1 + (packed >> 14 & 0x3FFF), _WEBP_ALPHA * (packed >> 28 & 1)
 
 

@@ -202,9 +202,9 @@ def _noise(draws: _Draws, height: int, width: int, cell: tuple[int, int]) -> Flo
 
 def _stretch(lattice: Float, length: int, cell: int) -> Float:
     """Interpolate the first axis of ``lattice`` to ``length`` samples, ``cell`` of them between two points."""
-    at = np.arange(length)
-    low = at // cell
-    weight = _smooth((at % cell) / float(cell))[:, None]
+    position = np.arange(length)
+    low = position // cell
+    weight = _smooth((position % cell) / float(cell))[:, None]
     return lattice[low] + (lattice[low + 1] - lattice[low]) * weight
 
 
@@ -457,9 +457,9 @@ def _dusk(draws: _Draws, height: int, width: int) -> Float:
     """Return an evening sky."""
     y, x = _grid(height, width)
     stops = np.array([(24, 34, 74), (72, 84, 140), (190, 140, 150), (244, 176, 110), (255, 222, 160)]) / 255.0
-    at = y[:, 0] / height * (len(stops) - 1.001)
-    low = np.floor(at).astype(np.int64)
-    sky = (stops[low] + (stops[low + 1] - stops[low]) * (at - low)[:, None]).T[:, :, None]
+    position = y[:, 0] / height * (len(stops) - 1.001)
+    low = np.floor(position).astype(np.int64)
+    sky = (stops[low] + (stops[low + 1] - stops[low]) * (position - low)[:, None]).T[:, :, None]
     dx, dy = (x - draws.one(0.2, 0.8) * width) / width, (y - 1.02 * height) / height
     return sky + _planes(np.array([0.30, 0.22, 0.10])) / (1.0 + 14.0 * (dx * dx + dy * dy)) - 0.04
 
@@ -559,15 +559,15 @@ def _sources(canvas: Float, draws: _Draws, y: Float, x: Float, horizon: int) -> 
     colour = LAMP_LIGHTS[draws.pick(len(LAMP_LIGHTS))]
     for far in (6.5, 4.0, 2.6, 1.7):
         for side in (-1.0, 1.0):
-            at = vanish + side * 0.72 * width / far
+            column = vanish + side * 0.72 * width / far
             top, foot = horizon - 0.52 * height / far, horizon + 0.30 * height / far
             thick = 5.0 / far
-            post = _box(y, x, top, at - thick / 2, foot, at + thick / 2)
+            post = _box(y, x, top, column - thick / 2, foot, column + thick / 2)
             _cover(canvas, np.array([0.001, 0.001, 0.001]), post)
-            _glow(canvas, streaks, y, x, (top, at, foot), 11.0 / far, colour * draws.one(0.85, 1.15), horizon)
+            _glow(canvas, streaks, y, x, (top, column, foot), 11.0 / far, colour * draws.one(0.85, 1.15), horizon)
     for light in SIGN_LIGHTS[draws.order(len(SIGN_LIGHTS))]:
-        top, at = horizon - draws.one(0.04, 0.22) * height, draws.one(0.08, 0.92) * width
-        _glow(canvas, streaks, y, x, (top, at, horizon + 0.5 * (horizon - top)), draws.one(1.6, 3.0), light, horizon)
+        top, column = horizon - draws.one(0.04, 0.22) * height, draws.one(0.08, 0.92) * width
+        _glow(canvas, streaks, y, x, (top, column, horizon + (horizon - top) / 2), draws.one(1.6, 3.0), light, horizon)
 
 
 def _glow(
@@ -575,17 +575,17 @@ def _glow(
     streaks: Float,
     y: Float,
     x: Float,
-    at: tuple[float, float, float],
+    lamp: tuple[float, float, float],
     size: float,
     colour: Float,
     horizon: int,
 ) -> None:
-    """Draw a lamp at ``at`` = (row, column, row of its foot): a core above white, a halo, a streak on wet ground."""
-    dy, dx = (y - at[0]) / size, (x - at[1]) / size
+    """Draw a lamp at ``lamp`` = (row, column, row of its foot): a core above white, a halo, a streak on wet ground."""
+    dy, dx = (y - lamp[0]) / size, (x - lamp[1]) / size
     square = dx * dx + dy * dy
     near = 1.0 / (1.0 + square)
     light = 6.0 * near * near + 0.05 / (1.0 + square / 60.0)
-    down = (y[horizon:] - (2.0 * at[2] - at[0])) / (9.0 * size)
+    down = (y[horizon:] - (2.0 * lamp[2] - lamp[0])) / (9.0 * size)
     wide = 1.0 + 0.6 * dx * dx + down * down
     light[horizon:] += streaks[horizon:] * 0.9 / (wide * wide)
     canvas += _planes(colour) * light

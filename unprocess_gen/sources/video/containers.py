@@ -31,29 +31,29 @@ def missing_part(file: BinaryIO) -> str:
 
 
 def _missing_boxes(file: BinaryIO, size: int) -> str:
-    at, kinds = 0, set()
-    while at + 8 <= size:
-        file.seek(at)
+    position, kinds = 0, set()
+    while position + 8 <= size:
+        file.seek(position)
         head = file.read(16).ljust(16, b"\0")
         length, kind = struct.unpack(">I4s", head[:8])
-        length = {0: size - at, 1: int.from_bytes(head[8:16], "big")}.get(length, length)
+        length = {0: size - position, 1: int.from_bytes(head[8:16], "big")}.get(length, length)
         if kind not in _BOXES and b"moov" in kinds:
             break
         kinds.add(kind)
-        at += max(length, 8)
-    if at > size:
-        return f"{at - size} bytes at its end"
+        position += max(length, 8)
+    if position > size:
+        return f"{position - size} bytes at its end"
     return "" if b"moov" in kinds else "its index (moov)"
 
 
 def _matroska_end(head: bytes) -> int:
     """Return where the header places the end of the segment; 0 if it does not, as in an interrupted recording."""
     length, size_bytes = _vint(head[4:])
-    at = 4 + size_bytes + length
-    if head[at : at + 4] != _SEGMENT:
+    position = 4 + size_bytes + length
+    if head[position : position + 4] != _SEGMENT:
         return 0
-    length, size_bytes = _vint(head[at + 4 :])
-    return 0 if length == (1 << 7 * size_bytes) - 1 else at + 4 + size_bytes + length
+    length, size_bytes = _vint(head[position + 4 :])
+    return 0 if length == (1 << 7 * size_bytes) - 1 else position + 4 + size_bytes + length
 
 
 def _vint(content: bytes) -> tuple[int, int]:

@@ -318,11 +318,11 @@ def _has_idr(packet: bytes, extradata: bytes) -> bool:
     if extradata[:1] != b"\1":
         return any(part[0] & 31 == 5 for part in packet.split(b"\0\0\1")[1:] if part)
     length = (extradata[4] & 3) + 1
-    at = 0
-    while at + length < len(packet):
-        if packet[at + length] & 31 == 5:
+    position = 0
+    while position + length < len(packet):
+        if packet[position + length] & 31 == 5:
             return True
-        at += length + int.from_bytes(packet[at : at + length], "big")
+        position += length + int.from_bytes(packet[position : position + length], "big")
     return False
 
 
