@@ -1,6 +1,6 @@
 """Add camera noise to sRGB pictures: make the raw pair of a picture, and develop both frames.
 
-The raw frames are those of `make_pair`, exact on every machine. Developing uses OpenCV and float32, so codes may differ
+The raw frames are made by `make_pair`, exact on every machine. Developing uses OpenCV and float32, so codes may differ
 by one between machines. No byte of a dataset depends on this module.
 """
 
@@ -129,8 +129,8 @@ class CameraNoise:
         picture : array_like of uint8 or uint16, [H, W, 3]
             Display-referred codes, R, G, B; at least 2 x 2.
         index : int, optional
-            Number that selects the random values; by default that of the call: 0, 1, … Copies of an instance, such as
-            those of the workers of a DataLoader, count their calls separately, so state it there.
+            Number that selects the random values; by default the number of the call: 0, 1, … Copies of an instance,
+            such as in the workers of a DataLoader, count their calls separately, so state it there.
 
         Returns
         -------

@@ -171,7 +171,7 @@ class _Kind(NamedTuple):
 
     @property
     def is_steep(self) -> bool:
-        """Return whether the power curve of dark colours would magnify the rounding of float32 to 1e-3."""
+        """True if the power curve of dark colours would magnify the rounding of float32 to 1e-3."""
         return not self.is_smooth and self.gamma not in (SRGB, 1.0)
 
 

@@ -283,7 +283,7 @@ def _with_source(overrides: list[str], root: str | None) -> list[str]:
 
 
 def path_hint(word: str) -> str:
-    """Return what to write instead of the bare name of a file or folder; empty if there is none of that name."""
+    """Remedy for the bare name of a file or folder; empty if there is none of that name."""
     path = Path(word)
     if not word or not os.path.lexists(word):
         return ""
@@ -293,7 +293,7 @@ def path_hint(word: str) -> str:
 
 
 def _setting_hint(verb: Verb, flag: str) -> str:
-    """Return what to write instead of a setting with hyphens, such as ``--out``."""
+    """Remedy for a setting with hyphens, such as ``--out``; empty for other flags."""
     from unprocess_gen.config.schema import GROUPS, Config, group_settings  # imports NumPy, too slow for --help
 
     name, _, value = flag.lstrip("-").partition("=")
@@ -305,7 +305,7 @@ def _setting_hint(verb: Verb, flag: str) -> str:
 
 
 def _expected(verb: Verb, word: str) -> str:
-    """Return what a verb accepts, and what ``word`` may have meant."""
+    """Arguments that a verb accepts, and the one that ``word`` may have meant."""
     names = [name for argument in verb.accepted for name in argument.names]
     spelled_out = [name for name in names if not re.match("-[^-]", name)]
     return f"expected {', '.join(spelled_out)}{did_you_mean(word.partition('=')[0], spelled_out)}"

@@ -44,7 +44,7 @@ def completion(call: Call) -> int:
 
 
 def complete(line: str) -> tuple[str, list[str]]:
-    """Return how the last word of a line can be completed: the kind, and for ``words`` the complete candidates.
+    """Complete the last word of a line: return the kind of completion, and for ``words`` the complete candidates.
 
     The shell completes names of ``folders`` and ``files`` by itself.
     """
@@ -87,7 +87,7 @@ def _starting(prefix: str, candidates: Iterable[str]) -> list[str]:
 
 
 def _option_folders(words: list[str]) -> list[Path]:
-    """Return the folders of options: the built-in one, and those of ``--config-dir`` on the line."""
+    """Return the folders of options: the built-in folder, and the folders of ``--config-dir`` on the line."""
     named = [word.partition("=")[2] for word in words if re.match("(--config-dir|-cd)=", word)]
     named += [value for flag, value in itertools.pairwise(words) if flag in ("--config-dir", "-cd")]
     return [conf_dir(), *(Path(folder).expanduser() for folder in named)]

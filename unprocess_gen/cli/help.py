@@ -36,7 +36,7 @@ its options and, in parentheses, its keys:
 """
 
 SHOWN_HYDRA_FLAGS = ("multirun", "cfg", "config_dir", "hydra_help")
-"""Flags of Hydra that the help of the program names; that of a verb names all."""
+"""Flags of Hydra that the help of the program names; the help of a verb names all."""
 
 ENDING = """
 Tab completion: eval "$(gen-dataset completion bash)", or zsh.

@@ -72,9 +72,9 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:
-    """Return the help of the verb; without one, of the verb or group after ``--help``; else that of the program.
+    """Return the help of the verb; without one, of the verb or group after ``--help``; else the program's help.
 
-    The group may be that of a setting, such as ``noise.iso``.
+    The group may be named by one of its settings, such as ``noise.iso``.
     """
     word = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "-")
     if verb or word.startswith("-"):

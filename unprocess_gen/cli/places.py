@@ -50,7 +50,7 @@ def given_root(call: Call) -> str | None:
 
 
 def dark_frames_of(manifest: AnyPath, call: Call) -> DarkPlaces:
-    """Return where the dark frames of a dataset and their map are, by the call or by ``dataset.json``."""
+    """Places of the dark frames of a dataset and of their map, by the call or by ``dataset.json``."""
     from unprocess_gen.pipeline.replay import dark_places
 
     return dark_places(manifest, call.values.get("dark_frames"), call.values.get("dark_shading"))

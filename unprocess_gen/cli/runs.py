@@ -66,7 +66,7 @@ def again(call: Call) -> int:
 
 
 def _executor(call: Call) -> ExecutorConfig:
-    """Return the settings of the executor that a call names, those of ``executor=local`` without one."""
+    """Return the settings of the executor that a call names, by default of ``executor=local``."""
     from dataclasses import replace
 
     from unprocess_gen.config.serialization import read_option

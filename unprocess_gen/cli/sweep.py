@@ -37,7 +37,7 @@ SHARES = ("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy
 
 FIRST_COLUMNS = ("folder", "overrides")
 LAST_COLUMNS = ("rows", "failed", "filtered", *(f"{name}_share" for name in SHARES), "seconds", "bytes", "exit")
-"""Columns of ``sweep.csv`` before and after those of the swept keys."""
+"""Columns of ``sweep.csv`` before and after the columns of the swept keys."""
 
 
 def sweep_out(out: str) -> Path:
@@ -139,7 +139,7 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
 
 
 def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:
-    """Read the rows of the file, add those of jobs, and replace the file."""
+    """Read the rows of the file, add the rows of jobs, and replace the file."""
     rows = {row["folder"]: row for row in read_table(path)}
     for job in jobs:
         row = dict(job.cells)
@@ -174,7 +174,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 
 def swept_keys(rows: Iterable[Mapping[str, str]]) -> list[str]:
-    """Return the keys that a sweep varies: the columns of its table between those of every sweep."""
+    """Return the keys that a sweep varies: the columns of its table between the columns of every sweep."""
     return list(dict.fromkeys(key for row in rows for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS}))
 
 

@@ -4,9 +4,9 @@ Each `Method` states its largest error against the reference. Tests prove the st
 finite. Methods are tried in a fixed order of cost, never in a measured one: the data must not depend on the machine.
 ``gen-dataset accuracy`` measures the time and the error of each method.
 
-Errors of the clean frame are those of a frame whose stages all have the method's precision, because one kernel computes
-them all. Errors of normal deviates are against the true quantile, in standard deviations; so the reference has one too
-(the quadratics of `core.lookup_tables.normal_table`).
+A method's error of the clean frame is the error of a frame whose stages all have its precision, because one kernel
+computes all stages. Errors of normal deviates are against the true quantile, in standard deviations; so the reference
+has one too (the quadratics of `core.lookup_tables.normal_table`).
 
 How the error statements were obtained: ``docs/design/accuracy.md``.
 """
@@ -55,11 +55,11 @@ class Method:
 
     @property
     def readable(self) -> bool:
-        """Return whether the method belongs to the NumPy reference."""
+        """True if the method belongs to the NumPy reference."""
         return self.implementation == "numpy"
 
     def fits(self, budget: AccuracyConfig) -> bool:
-        """Return whether all errors of the method are within a budget."""
+        """True if all errors of the method are within a budget."""
         return (
             (self.readable or not budget.readable)
             and self.clean_dn <= budget.clean_dn
@@ -120,7 +120,7 @@ hold. The cameras and gains of ``conf/`` reach 3, and 20 in highlights at the de
 
 
 def is_steep(camera: CameraPlan, exposure: float) -> bool:
-    """Return whether colours and gains at an exposure amplify rounding errors too much for float32.
+    """True if colours and gains at an exposure amplify rounding errors too much for float32.
 
     The light of a channel is i · (gain + headroom · m²) with m = (i - threshold) / (1 - threshold). Here i is the sum
     of table entries times one row of the matrix. The limits are `MAX_ERROR_GAIN` and `MAX_HIGHLIGHT_ERROR_GAIN`.

@@ -165,7 +165,7 @@ def typed_config(node: DictConfig, overrides: Sequence[str]) -> Config:
 def _with_entries(config: Config, node: DictConfig, settings: Any, overrides: Sequence[str]) -> Config:
     """Compose each entry of a mixture like a config, with Hydra's ``settings`` of the composed ``node``.
 
-    The groups of the first entry become those of the config.
+    The groups of the first entry become the groups of the config.
     """
     places = {source.provider: Path(source.path) for source in settings.runtime.config_sources if source.path}
     folders = OptionFolders(places["main"], settings.job.config_name, places.get("command-line"))
@@ -224,7 +224,7 @@ def _settings_outside(
 
 
 def is_multirun(node: DictConfig) -> bool:
-    """Return whether option files request a sweep."""
+    """True if option files request a sweep."""
     mode = resolved_value(node, "hydra.mode")
     return str(getattr(mode, "name", mode)) == "MULTIRUN"
 

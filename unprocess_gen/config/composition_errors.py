@@ -109,7 +109,7 @@ def assignment(key: str, overrides: Sequence[str]) -> str:
 
 
 def _wrong_value(error: OmegaConfBaseException, key: str, overrides: Sequence[str]) -> str:
-    """Return what is expected where OmegaConf refuses the type of a value, else its message."""
+    """Expected type of a value that OmegaConf refuses, else its message."""
     message = str(error.msg or error).splitlines()[0]
     if isinstance(error, InterpolationResolutionError):
         return re.sub(r'^\w+ raised while resolving interpolation: "?(.*?)"?$', r"\1", message)

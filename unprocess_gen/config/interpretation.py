@@ -86,7 +86,7 @@ def entry_config(config: Config, number: int) -> Config:
 
 
 def entry_configs(config: Config) -> tuple[Config, ...]:
-    """Return the configs that images draw from: those of the entries of a mixture, or the config itself."""
+    """Return the configs that images draw from: the configs of the entries of a mixture, or the config itself."""
     return (config,) if config.mixture is None else tuple(entry_config(config, n) for n in range(len(config.mixture)))
 
 
@@ -118,12 +118,12 @@ def _level(noise: NoiseConfig, level: Any) -> NoiseConfig:
 
 
 def is_physical(noise: NoiseConfig) -> bool:
-    """Return whether a noise profile is physical: in electrons, with separate effects."""
+    """True if a noise profile is physical: in electrons, with separate effects."""
     return bool(noise.branches)
 
 
 def uses_physics(noise: NoiseConfig) -> bool:
-    """Return whether pairs of a noise profile are simulated by the kernels of the physical effects."""
+    """True if pairs of a noise profile are simulated by the kernels of the physical effects."""
     return is_physical(noise) or noise.law == "poisson"
 
 
@@ -172,7 +172,7 @@ def missing_number(noise: NoiseConfig, effect: str) -> str | None:
 
 
 def uses_dark_frames(noise: NoiseConfig) -> bool:
-    """Return whether the noise of the read-out is sampled from dark frames."""
+    """True if the noise of the read-out is sampled from dark frames."""
     return noise.dark_frames is not None or noise.dark_frames_sha256 is not None
 
 
@@ -193,7 +193,7 @@ def without_dark_frames(config: Config) -> Config:
 
 
 def uses_assumed(config: Config) -> bool:
-    """Return whether effects with assumed numbers are simulated like others."""
+    """True if effects with assumed numbers are simulated like others."""
     return config.effects.assumed == "use" and is_physical(config.noise) and bool(config.noise.assumed)
 
 
@@ -258,15 +258,15 @@ def effect_switch(effects: EffectsConfig, effect: str) -> str:
 
 
 def dequantize_method(source: SourceConfig) -> str:
-    """Return how 8-bit codes are dequantized."""
+    """Return the method that dequantizes 8-bit codes."""
     return str(limits.DEQUANTIZE.word(source.dequantize))
 
 
 def has_float_clean(config: Config) -> bool:
-    """Return whether clean frames are normalised and noisy frames are integer DN."""
+    """True if clean frames are normalised and noisy frames are integer DN."""
     return config.output.clean_dtype == FLOAT32 and not is_normalised(config)
 
 
 def is_normalised(config: Config) -> bool:
-    """Return whether noisy frames are normalised."""
+    """True if noisy frames are normalised."""
     return config.output.dtype == FLOAT32

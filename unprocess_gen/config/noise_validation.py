@@ -38,7 +38,7 @@ FARTHEST_NORMAL = 6.4
 """No normal deviate of a 32-bit uniform is farther from 0."""
 
 DARKEST = 0.01
-"""Least relative illumination. Chosen: far below that of lenses."""
+"""Least relative illumination. Chosen: far below the illumination of lenses."""
 
 
 def check_noise(noise: NoiseConfig, scene: SceneConfig) -> None:
@@ -138,7 +138,7 @@ def _is_range(iso: Sequence[float]) -> bool:
 
 
 def well_ends_first(noise: NoiseConfig, scene: SceneConfig) -> bool:
-    """Return whether a full well can end below white, so that the clean frame depends on the ISO."""
+    """True if a full well can end below white, so that the clean frame depends on the ISO."""
     if not is_physical(noise) or noise.full_well_e is None:
         return False
     drawn = parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, limits.ISO)

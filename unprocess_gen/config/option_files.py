@@ -95,7 +95,7 @@ def check_override(override: str) -> None:
 
 
 def file_hint(group: str, name: str) -> str:
-    """Return how to use a file of the user's own as an option; empty if the name is no path of a YAML file."""
+    """Remedy for the path of a user's YAML file as an option; empty if the name is no such path."""
     if "/" not in name and not name.endswith((".yaml", ".yml")):
         return ""
     return f"; for a file of your own, put it in FOLDER/{group} and write --config-dir FOLDER {group}={Path(name).stem}"

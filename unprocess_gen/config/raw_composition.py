@@ -20,7 +20,7 @@ NOT_APPLIED = {
 """Groups that undo what a photograph went through."""
 
 OF_FILE = "sensor=source"
-"""Override with which the sensor of raw sources is that of their files."""
+"""Override that takes the sensor of raw sources from their files."""
 
 LEVELS = tuple(f"sensor.{name}" for name in ("bits", "black_level_dn", "white_level_dn", "pattern"))
 

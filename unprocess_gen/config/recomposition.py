@@ -51,7 +51,7 @@ class Recomposition:
         return [folder for folder in (self._folders.own, self._folders.main) if folder is not None]
 
     def config(self, overrides: Sequence[str]) -> Config:
-        """Return what `load_config` returns; ConfigError with its sentence."""
+        """Return the config that `load_config` returns; ConfigError with the sentence of `load_config`."""
         values = [override for override in overrides if _is_value(override)]
         options = tuple(override for override in overrides if override not in values)
         if any(override.startswith("mixture=") for override in values):  # its entries are composed with all overrides
@@ -85,7 +85,7 @@ class Recomposition:
 
 
 def _is_value(override: str) -> bool:
-    """Return whether an override sets one value of a config, and chooses no option."""
+    """True if an override sets one value of a config, and chooses no option."""
     key, equals, _ = override.partition("=")
     group, dot, _ = key.partition(".")
     return bool(equals) and (group in GROUPS if dot else key in Config.__dataclass_fields__ and key not in GROUPS)

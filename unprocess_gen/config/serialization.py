@@ -181,7 +181,7 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
 
 
 def _entries(loaded: dict[str, Any]) -> Iterator[MixtureEntry]:
-    """Yield the entries of a mixture; groups that an entry lacks are those of the config."""
+    """Yield the entries of a mixture; an entry has the groups of the config that it lacks itself."""
     settings_of(Config)["mixture"].check("mixture", frozen(loaded["mixture"]))
     common = {group: loaded[group] for group in ENTRY_GROUPS}
     for number, entry in enumerate(loaded["mixture"]):

@@ -36,7 +36,7 @@ FIXED_KEYS: dict[str, tuple[Any, ...]] = {
     "job.env_copy": ([],),
     "callbacks": ({}, None),
 }
-"""Settings of Hydra that have no effect here, with the values that are accepted: those of ``conf/`` and of Hydra."""
+"""Settings of Hydra that have no effect here, with the accepted values: the values in ``conf/`` and in Hydra."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class _Choice:
 
     @property
     def adds_group(self) -> bool:
-        """Return whether it chooses option files that can contain settings of Hydra."""
+        """True if the override chooses option files that can contain settings of Hydra."""
         return self.key.startswith("+") and "." not in self.key and not hasattr(Config(), self.name)
 
     def overrides(self) -> list[str]:

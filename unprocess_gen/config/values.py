@@ -25,12 +25,12 @@ def one_of(key: str, value: Any, allowed: Collection[str]) -> None:
 
 
 def is_integer(value: Any) -> bool:
-    """Return whether a value is an integer other than a bool."""
+    """True if a value is an integer other than a bool."""
     return isinstance(value, int) and not isinstance(value, bool)
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a finite float, or an integer other than a bool that a float can hold."""
+    """True if a value is a finite float, or an integer other than a bool that a float can hold."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
     try:

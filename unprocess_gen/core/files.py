@@ -99,7 +99,7 @@ def sync(path: Path) -> None:
 
 
 def leads_outside(path: str) -> bool:
-    """Return whether a relative path with ``/`` between its segments is absolute or contains ``..``.
+    """True if a relative path with ``/`` between its segments is absolute or contains ``..``.
 
     On Windows, backslashes separate segments too, and a drive leads outside.
     """

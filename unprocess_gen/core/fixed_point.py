@@ -280,7 +280,7 @@ def normal_quantile(p: int, error: int) -> tuple[int, int] | None:
     density is smaller. By Lagrange, the series then lacks at most P(node + `REACH`) / n! · `REACH`**n, where n is the
     first order left out and P the polynomial of `_derivative`. An error of the tail moves z by 1/φ(z) times as much,
     less than 1.2/φ(node), because `MAX_QUANTILE` · `REACH` is 0.105. Roundings of the node and of t count as less than
-    3 units of the tail, those of the series as less than 8 units of z.
+    3 units of the tail, roundings of the series as less than 8 units of z.
 
     Parameters
     ----------

@@ -148,7 +148,7 @@ class LockFile:
 
 
 def is_held(path: Path) -> bool:
-    """Return whether the owner of a lock file still runs, as far as other processes can see.
+    """True if the owner of a lock file still runs, as far as other processes can see.
 
     A file that does not exist is held for as long as its folder is younger than `STALE_S`.
     """
@@ -157,7 +157,7 @@ def is_held(path: Path) -> bool:
 
 
 def has_ended(path: Path) -> bool | None:
-    """Return whether the owner of a lock file has ended, if this host's process table shows it.
+    """True if the owner of a lock file has ended, if this host's process table shows it.
 
     None if the owner ran on another host or is not named, or if this system reports no processes.
     """

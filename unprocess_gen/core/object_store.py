@@ -116,7 +116,7 @@ class Entry(NamedTuple):
 
 
 def is_url(text: object) -> bool:
-    """Return whether a text is the URL of an object store: ``s3://…``, ``gs://…`` or ``az://…``."""
+    """True if a text is the URL of an object store: ``s3://…``, ``gs://…`` or ``az://…``."""
     return isinstance(text, str) and _URL.match(text) is not None
 
 
@@ -230,15 +230,15 @@ class ObjectPath:
         self.is_dir()
 
     def is_dir(self) -> bool:
-        """Return whether any object is below this prefix."""
+        """True if any object is below this prefix."""
         return next(self.walk_entries(), None) is not None
 
     def is_file(self) -> bool:
-        """Return whether an object has this key."""
+        """True if an object has this key."""
         return self._head() is not None
 
     def exists(self) -> bool:
-        """Return whether an object has this key or is below it."""
+        """True if an object has this key or is below it."""
         return self.is_file() or self.is_dir()
 
     is_listed = exists
@@ -491,7 +491,7 @@ def _store(scheme: str, bucket: str) -> Any:
 
 @contextmanager
 def _request(path: ObjectPath) -> Iterator[tuple[Any, Any]]:
-    """Provide obstore and the client of a bucket; turn the exceptions of the body into those of this module."""
+    """Provide obstore and the client of a bucket; turn exceptions of the body into exceptions of this module."""
     require("obstore", f"{path}: object stores need obstore", "remote", ", or give a local path")
     import obstore
     from obstore import exceptions

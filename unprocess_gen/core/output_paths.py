@@ -22,7 +22,7 @@ def enclosing_dataset(path: Path) -> Path | None:
 
 
 def is_dataset(folder: AnyPath) -> bool:
-    """Return whether a folder or prefix is a dataset, finished or begun."""
+    """True if a folder or prefix is a dataset, finished or begun."""
     try:
         return (
             (folder / "dataset.json").is_file()

@@ -47,7 +47,7 @@ class NotAFileError(OSError, ValueError):
 class LocalPath(_NativePath):
     """Path of a local file or folder, with the methods of `ObjectPath`."""
 
-    if not TYPE_CHECKING:  # the signature is that of Path
+    if not TYPE_CHECKING:  # Path has the signature
 
         def open(self, mode="r", *arguments, **options):
             """Open the file; reading neither waits for a pipe nor opens anything else than a regular file."""
@@ -59,7 +59,7 @@ class LocalPath(_NativePath):
         return LocalPath(os.path.realpath(self, strict=strict))
 
     def is_listed(self) -> bool:
-        """Return whether a file or folder has this name, also a link to nothing."""
+        """True if a file or folder has this name, also a link to nothing."""
         return os.path.lexists(self)  # also False for a name that is too long
 
     def entries(self) -> dict[str, int]:

@@ -39,7 +39,7 @@ class SourceRoots:
         return any(isinstance(root, ObjectPath) for root in self._roots)
 
     def is_dir(self) -> bool:
-        """Return whether all roots are folders or prefixes."""
+        """True if all roots are folders or prefixes."""
         return all(root.is_dir() for root in self._roots)
 
     exists = is_dir
@@ -74,7 +74,7 @@ def root_path(root: Root) -> LocalPath | ObjectPath | SourceRoots:
 
 
 def is_remote(root: Root) -> bool:
-    """Return whether sources are in an object store."""
+    """True if sources are in an object store."""
     path = root_path(root)
     return path.is_remote if isinstance(path, SourceRoots) else isinstance(path, ObjectPath)
 

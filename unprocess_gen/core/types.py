@@ -623,7 +623,7 @@ class Plan:
         return self.noise.physics
 
     def __hash__(self) -> int:
-        """Hash a few numbers: those of all fields take ten times as long, and patches look up their plan's records."""
+        """Hash a few numbers: hashes of all fields take ten times as long, and patches look up their plan's records."""
         return hash((self.stream_key, self.noise.level, self.noise.draw, self.noise.frame, self.noise.epoch))
 
     def replace(self, **values: Any) -> Plan:

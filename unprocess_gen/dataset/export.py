@@ -3,7 +3,7 @@
     TO/export.json             format, and digest of the exported manifest; written first
     TO/manifest.csv            a copy of the manifest; written last, so its presence means that the export is complete
     TO/noisy/KEY.npy           each array of a pair by the key of the pair, so that folders have the same names; or .tif
-    TO/shard-00000.h5          noisy/KEY and other arrays of a shard; TO/pairs.h5 links to those of all shards
+    TO/shard-00000.h5          noisy/KEY and other arrays of a shard; TO/pairs.h5 links to the arrays of all shards
     TO/noisy.lmdb              arrays by key, as NPY files; TO/row.lmdb has the rows as JSON
 
 With splits, all but the first two are in TO/SPLIT; of a sweep, TO has a folder for each dataset. Files appear complete
@@ -37,7 +37,7 @@ UNFINISHED = ".unfinished"
 """Folder below ``TO`` for files that are being written."""
 
 LMDB_MARGIN = 2**27
-"""Bytes of a map beyond twice those of the arrays: pages of keys, and of transactions in progress."""
+"""Bytes of a map beyond twice the bytes of the arrays: pages of keys, and of transactions in progress."""
 
 
 class ExportSummary(NamedTuple):

@@ -261,7 +261,7 @@ class _Dataset:
         return map_array(path, member, form)
 
     def _index(self, shard: int, path: AnyPath) -> dict[str, Member]:
-        """Return the members of a shard; those of shards that were read before are kept, up to `MAX_MEMBERS`."""
+        """Return the members of a shard; keep the members of shards that were read before, up to `MAX_MEMBERS`."""
         index = self._indexes.get(shard)
         if index is None:
             index = read_index(path)
@@ -309,7 +309,7 @@ def check_split(reader: str, split: str, datasets: Sequence[Folder]) -> None:
 
 
 def dataset_folders(path: AnyPath) -> list[AnyPath]:
-    """Return the folder of a dataset, or those of the finished datasets of a sweep."""
+    """Return the folder of a dataset, or the folders of the finished datasets of a sweep."""
     table = path / SWEEP_TABLE
     if (path / "manifest.csv").exists() or not table.exists():
         return [path]

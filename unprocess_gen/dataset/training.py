@@ -97,7 +97,7 @@ def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
 
 
 def random_crop(frames: Sequence[Frame], side: int, integer: Callable[[int], int]) -> tuple[Frame, ...]:
-    """Cut the same square from each mosaic, at an even row and column, so that the CFA pattern stays that of the row.
+    """Cut the same square from each mosaic, at an even row and column, so that the row's CFA pattern holds.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ def recorded_config(
 ) -> Config:
     """Return the settings of a dataset with ``changes``, which contain another ``out``.
 
-    ``given`` names those of ``dark_frames`` and ``dark_shading`` that the user gives; a dataset without them has none.
+    ``given`` names the places that the user gives: ``dark_frames``, ``dark_shading``. A dataset without them has none.
     """
     config, kind = read_dataset_yaml(folder / "config.yaml")
     out = any_path(changes["out"])

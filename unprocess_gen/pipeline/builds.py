@@ -105,7 +105,7 @@ class Build:
             check_output_folder(folder, option)
 
     def overrides(self, folder: Path, photographs: Path | None) -> list[str]:
-        """Return the settings that make the build in a folder; those of a sweep have several values."""
+        """Return the settings that make the build in a folder; settings of a sweep have several values."""
         source = []
         if photographs is not None:
             names = ",".join(self.recipe.photographs)

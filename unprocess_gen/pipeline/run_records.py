@@ -124,7 +124,7 @@ class RecordedListing:
 
 
 def recorded_sources(storage: Storage) -> Iterator[Source]:
-    """Yield every recorded source, those of version 0.1 with name, size and digest only; nothing without a record."""
+    """Yield every recorded source, from version 0.1 with name, size and digest only; nothing without a record."""
     if (storage / INDEX).is_listed():
         listing = RecordedListing(storage)
         yield from listing.sources(0, listing.count)

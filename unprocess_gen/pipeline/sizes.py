@@ -209,7 +209,7 @@ def _check_temporary_space(needed: int, out: ObjectPath) -> None:
 def _sampled_bytes(config: Config, sources: Sequence[Source], count: int) -> list[int]:
     """Bytes of at most ``count`` evenly spaced sources in their shards, 0 for sources that will fail.
 
-    Frames of all videos are taken to be as large as those of the first one, because opening a video reads all of it.
+    Frames of all videos are taken to be as large as frames of the first, because opening a video reads all of it.
     """
     sizes: list[int] = []
     frame_size = None

@@ -1,7 +1,7 @@
 """Hold the place that ``out`` names for a run: check and lock it, and write its files and the records of the run.
 
-Unfinished files of a folder are below ``.work/tmp``, those of an object store in the local temporary folder. Object
-stores have no rename and no locks, and need neither. An object appears under its key complete or not at all,
+Unfinished files for a folder are below ``.work/tmp``, for an object store in the local temporary folder. Object stores
+have no rename and no locks, and need neither. An object appears under its key complete or not at all,
 ``config.yaml`` and the record of the sources are created only if they do not exist, and any number of writers may put
 the same shard, because all of them make the same bytes.
 """

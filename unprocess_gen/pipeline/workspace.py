@@ -103,7 +103,7 @@ class Workspace:
             )
 
     def is_complete(self) -> bool:
-        """Return whether the dataset is finished: no shard is missing or provisional."""
+        """True if the dataset is finished: no shard is missing or provisional."""
         facts = self.facts()
         return facts is not None and not any(entry.get("provisional") for entry in facts["shards"])
 
@@ -316,7 +316,7 @@ def dataset_facts(
 
 
 def fingerprint(config_sha256: str, manifest_sha256: str) -> str:
-    """Return the digest that identifies a dataset, from those of its config and of its manifest."""
+    """Return the digest that identifies a dataset, from the digests of its config and of its manifest."""
     return hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
 
 

@@ -247,7 +247,7 @@ class Selection:
         return forced.reason if forced is not None else self.prediction(effect).reason
 
     def prediction(self, effect: str) -> Prediction:
-        """Return the prediction of one effect; that of ``read`` is the one of dark frames if they replace it."""
+        """Return the prediction of one effect; ``read`` has the prediction of dark frames if they replace it."""
         frame, on = (self.frame, self.on) if self.body is None or not BY_NAME[effect].is_fixed else self.body
         prediction = _prediction(effect, frame, on, self.rules.forced[effect], self.rules.tolerance)
         return replace(prediction, effect="dark_frame") if self.rules.dark_frames and effect == "read" else prediction

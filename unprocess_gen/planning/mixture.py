@@ -17,14 +17,14 @@ WORDS = 2**64
 
 
 def image_config(config: Config, source_sha256: str, occurrence: int = 0) -> Config:
-    """Return the config of an image: that of its entry, whose ``mixture`` is its number, or the config itself."""
+    """Return the config of an image: its entry's config, whose ``mixture`` is the entry's number, or ``config``."""
     if config.mixture is None:
         return config
     return config_of_key(config, stream_key(config.seed, source_sha256, occurrence))
 
 
 def config_of_key(config: Config, key: int, epoch: int = 0) -> Config:
-    """Return what `image_config` does, for the key of an image's random streams, in an epoch."""
+    """Return the config of an image like `image_config`, by the key of its random streams, in an epoch."""
     if config.mixture is None:
         return config
     return entry_config(config, entry_number(config, key, epoch))

@@ -152,8 +152,8 @@ class Planner:
     Parameters
     ----------
     config : Config
-        A configuration that `validate_config` accepts, and that does not change; of a mixture, that of one entry
-        (`mixture.image_config`). Its seed is not used.
+        A configuration that `validate_config` accepts, and that does not change; of a mixture, the configuration of one
+        entry (`mixture.image_config`). Its seed is not used.
     """
 
     def __init__(self, config: Config) -> None:
@@ -259,7 +259,7 @@ class Planner:
 def without_filters(camera: types.CameraPlan) -> types.CameraPlan:
     """Return a camera whose channels are equal: each is the mean of the three, gains included.
 
-    Highlights are kept as those of the mean, whose gain is the mean of the three.
+    Highlights are kept like highlights of the mean, whose gain is the mean of the three.
     """
     gains, rgb2cam = camera.inverse_gains, camera.rgb2cam
     sums = [sum(gain * rgb2cam[3 * row + column] for row, gain in enumerate(gains)) for column in range(3)]

@@ -56,7 +56,7 @@ LACKS, UNSEEN = "missing in the profile", "missing in the frames"
 
 
 class Comparison(NamedTuple):
-    """A measured number, that of the profile (None if it states none), and the verdict."""
+    """A measured number, the profile's number (None if it states none), and the verdict."""
 
     measured: Named
     profile: float | None
@@ -104,7 +104,7 @@ class Comparisons(NamedTuple):
 
     @property
     def differences(self) -> list[Comparison]:
-        """Numbers that differ; of a number that differs at all sites together, not those of the sites."""
+        """Numbers that differ; sites are left out of a number that differs at all sites together."""
         differing = [line for line in self.numbers if line.verdict not in (AGREES, UNKNOWN)]
         whole = {(line.measured.name, line.measured.iso) for line in differing if line.measured.site is None}
         return [

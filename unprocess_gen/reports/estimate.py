@@ -1,7 +1,7 @@
 """Estimate the pairs, shards, bytes, time and effects of a run, without writing anything.
 
-The pairs of up to `SAMPLE` evenly spaced sources are made, or those of all on request. Bytes follow from the headers of
-all sources, because the size of a pair depends only on its width, height and name; they are exact if all were read.
+The pairs of up to `SAMPLE` evenly spaced sources are made, or of all sources on request. Bytes follow from the headers
+of all sources, because the size of a pair depends only on its width, height and name; they are exact if all were read.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ TRIAL_BYTES = 2**24
 class SourceEstimate:
     """The pairs of a source, or why it has none: ``status`` is ``ok``, ``failed`` or ``filtered``.
 
-    ``bytes`` are those of its pairs in a shard, ``seconds`` the time it took to make them. ``levels`` and
+    ``bytes`` is the size of its pairs in a shard, ``seconds`` the time it took to make them. ``levels`` and
     ``predictions`` have an item for each noise level. ``unused_pixels`` are in no patch. ``clean_levels`` counts the
     distinct DN of the first clean frame, 0 if it is not rounded. ``noise_ratio`` compares the noise of the source with
     the simulated noise; None if it is not known.
@@ -288,7 +288,7 @@ def _tier_ns(
 def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> float:
     """Make pairs of a tiny image, so that the time of the first source does not include compilation.
 
-    Log first that kernels will be compiled, those of the tiers included, because it takes up to 20 seconds. Return the
+    Log first that kernels will be compiled, also for the tiers, because it takes up to 20 seconds. Return the
     seconds that a run spends on its kernels, 0 if they had to be compiled: a run then only loads them.
     """
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)

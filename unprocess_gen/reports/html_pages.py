@@ -25,8 +25,8 @@ INVISIBLE = re.compile(
 class PageTable(NamedTuple):
     """A table of a page.
 
-    ``numeric`` holds the indices of columns aligned right, ``wrapped`` those of columns with long text, and ``groups``
-    those of lines that begin a new group.
+    ``numeric`` holds the indices of columns aligned right, ``wrapped`` of columns with long text, ``groups`` of lines
+    that begin a new group.
     """
 
     headings: Sequence[str]

@@ -40,7 +40,7 @@ class NoiseFit:
     estimate, error, expected : ndarray of float64, [2]
         Slope (DN) and intercept (DN²) of the variance, their standard errors, and their values according to the row.
     signal_dn, variance_dn2 : ndarray of float64, [N]
-        The fitted points: signal above black, and variance without that of rounding.
+        The fitted points: signal above black, and variance without the variance of rounding.
     """
 
     key: str
@@ -102,7 +102,7 @@ def examine_pairs(pairs: Iterable[Sample], checker: Checker, dark_pixels: DarkPi
 def fit_sums(key: str, sums: Sums) -> NoiseFit | None:
     """Fit the noise of a pair by weighted least squares; None if fewer than three clean values are used.
 
-    The covariance of slope and intercept is (XᵀWX)⁻¹ for independent sites, and that of the offsets of rows is added.
+    The covariance of slope and intercept is (XᵀWX)⁻¹ for independent sites, plus the covariance of the offsets of rows.
     """
     planes = [plane for plane in sums.planes if len(plane.bins)]
     points = joined(map(variance_points, planes))

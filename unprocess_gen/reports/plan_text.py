@@ -121,7 +121,7 @@ def _failure_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[
 
 
 def _accuracy_line(chosen: AccuracyConfig, tier_ns: dict[str, float]) -> str:
-    """The chosen budget, and its time compared with that of the tiers."""
+    """The chosen budget, and its time compared with the time of the tiers."""
     law_distance = chosen.law_distance if chosen.normal_shot else 0
     line = (
         f"accuracy  {chosen.name}: clean within {chosen.clean_dn:g} DN ({100 * chosen.clean_changed_share:g} % "

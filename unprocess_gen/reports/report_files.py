@@ -61,7 +61,7 @@ def check_report_folder(out: Path, verb: str) -> None:
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
-    """Write files into a folder, replacing those of an earlier report; MachineError if that fails."""
+    """Write files into a folder, replacing the files of an earlier report; MachineError if that fails."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name, content in contents.items():

@@ -83,7 +83,7 @@ def write_sweep_page(folder: Path, jobs: Table, swept: Sequence[str], to: Path |
 def _rows(
     jobs: Table, across: str, down: Sequence[str], cells: Mapping[str, SweepCell]
 ) -> list[tuple[list[str], dict[str, list[SweepCell]]]]:
-    """Group the cells by the values of the keys ``down``, then by that of ``across``, as in the table of the sweep."""
+    """Group the cells by the values of the keys ``down``, then of the key ``across``, as in the table of the sweep."""
     rows: dict[tuple[str, ...], dict[str, list[SweepCell]]] = {}
     for job in jobs:
         row = rows.setdefault(tuple(job.get(key, "") for key in down), {})

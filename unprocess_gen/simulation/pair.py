@@ -127,7 +127,7 @@ def _pairs(
 def make_crop(
     srgb: Srgb, plan: Plan, origin: tuple[int, int], epoch: int, dark_pixels: DarkPixels | None = None
 ) -> tuple[Frame, Frame, Callable[[], Counts]]:
-    """Simulate the pair of a crop in an epoch, with little fixed cost if the plan is that of earlier crops.
+    """Simulate the pair of a crop in an epoch, with little fixed cost if earlier crops had the same plan.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def _reference_pair(
 
 
 def _scene_light(light: Float, plan: Plan, origin: tuple[int, int]) -> Float:
-    """Return the light of the scene at each CFA site from that of the photograph, before clipping to the levels."""
+    """Return the light of the scene at each CFA site, from the photograph's light, before clipping to the levels."""
     if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
         light = np.minimum(light, 1) * plan.scene.exposure
     factor = order.light_factor(plan, light.shape, origin)

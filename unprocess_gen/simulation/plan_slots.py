@@ -41,7 +41,7 @@ def fixed_patterns(plan: Plan) -> Patterns:
 
 
 def _two_numbers(plan: Plan, black_dn: float) -> Slots:
-    """Return counts of light and normal noise whose variance line is that of the plan."""
+    """Return counts of light and normal noise that have the variance line of the plan."""
     a_dn, b_dn2 = plan.noise.variance_line
     noise = SiteNoise(NORMAL_STREAM, math.sqrt(max(b_dn2, 0.0)))
     return Slots(black_dn, a_dn, light_stream="shot", noise=noise)

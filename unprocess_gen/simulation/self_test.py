@@ -110,7 +110,7 @@ def kernels(plan: Plan) -> str:
 
 
 def are_compiled(kernel_set: str) -> bool:
-    """Return whether a set of kernels has machine code, so that the first pair does not wait for the compiler."""
+    """True if a set of kernels has machine code, so that the first pair does not wait for the compiler."""
     return kernel_set == "reference" or has_run(kernel_set)
 
 

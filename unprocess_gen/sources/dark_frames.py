@@ -75,7 +75,7 @@ class DarkFolder:
     def shading(self, sha256: str) -> NDArray[np.float32]:
         """Return the map that is subtracted from the frames, float32 [H, W] in DN of the frames.
 
-        ``sha256`` is that of the set for the mean of all frames, or that of the file of a map.
+        ``sha256`` is the digest of the set, for the mean of all frames, or of the file of a map.
         """
         if sha256 == self.sha256:
             return _mean(self)
@@ -238,8 +238,8 @@ def _around_map(
 ) -> tuple[float, DarkShading]:
     """Measure the variance of the frames around a map; ConfigError if the map does not fit the frames.
 
-    ``level`` is the statistic that gives the black level, None if the level is stated. That of the frames contains the
-    shading. For a map above black, the black level is therefore that of the frames minus the map.
+    ``level`` is the statistic that gives the black level, None if the level is stated. The statistic of the frames
+    contains the shading. For a map above black, the black level is therefore the level of the frames minus the map.
     """
     path, sha256 = shading_map
     values = folder.shading(sha256)

@@ -34,8 +34,8 @@ KEPT_MAPS = 2
 """Maps that a process keeps: 0.1 GB for 24 megapixels each, except NPY files of float32, which are mapped."""
 
 FARTHEST = 1e-4
-"""Fraction of the sites at each end, such as hot pixels, that is left out of the variance. It lowers that of normal
-noise by 0.3 %."""
+"""Fraction of the sites at each end, such as hot pixels, that is left out of the variance. It lowers the variance
+of normal noise by 0.3 %."""
 
 STEPS_PER_DN = 16
 """Steps in which differences from a map are counted."""
@@ -196,7 +196,7 @@ def is_above_black(values: Map, black_dn: float) -> bool:
 
 
 def check_residual(path: Path, median_dn: float, variance_dn2: float) -> None:
-    """Refuse a map that does not fit the frames, such as that of a camera with another black level.
+    """Refuse a map that does not fit the frames, such as a map of a camera with another black level.
 
     Raises ConfigError.
     """

@@ -27,7 +27,7 @@ from unprocess_gen.sources.twins import number_twins
 from unprocess_gen.sources.video.decode import Video
 
 OPEN_VIDEOS = 2
-"""Videos that a process keeps open: that of the current shard, and the next one."""
+"""Videos that a process keeps open: the video of the current shard, and the next one."""
 
 
 def list_photographs(config: SourceConfig) -> Listing:

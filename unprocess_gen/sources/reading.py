@@ -96,7 +96,7 @@ def _check_size(source: Source, size_bytes: int, when: str) -> None:
 
 
 def content_sha256(root: Root, source: Source) -> str:
-    """SHA-256 of a source's file, known or computed; that of its name if the file cannot be read."""
+    """SHA-256 of a source's file, known or computed; of its name if the file cannot be read."""
     if source.sha256 is not None:
         return source.sha256
     try:

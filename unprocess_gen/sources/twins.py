@@ -45,7 +45,7 @@ def number_twins(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
 
 
 def _sharing_tails(root: Root, groups: Iterable[Sequence[Source]]) -> Iterator[Source]:
-    """Yield the sources whose last bytes equal those of another source of their group, group by group."""
+    """Yield the sources whose last bytes equal the last bytes of another source of their group, group by group."""
     groups = list(groups)
     tails = root_path(root).map(partial(_tail_digest, root), itertools.chain.from_iterable(groups))
     for group in groups:

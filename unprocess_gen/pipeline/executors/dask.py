@@ -314,7 +314,7 @@ class DaskRun:
     # ----------------------------------------------------------------------------------------------------- assignment
 
     def _assign(self) -> None:
-        """Give each usable worker as many chunks as `window` allows; without waiting shards, share those of others."""
+        """Give each usable worker as many chunks as `window` allows; without waiting shards, share running ones."""
         workers = self.workers.usable(time.monotonic())
         held = Counter(chunk.worker for chunk in self._running.values())
         for count, worker in itertools.product(range(self._executor.window), workers):

@@ -62,7 +62,7 @@ class RunTimes(NamedTuple):
 class RunMeasurement:
     """Time and error of complete runs of one setting in one tier: one row of ``accuracy_runs.csv``.
 
-    None means that the value was not measured. Errors are those of the noisy frames against the reference.
+    None means that the value was not measured. Errors are of the noisy frames against the reference.
     """
 
     setting: str

@@ -83,7 +83,7 @@ def measure_accuracy(
 ) -> BenchmarkReport:
     """Measure every method and tier on photographs of a config's source; report progress on stderr.
 
-    Rows are in the order of `METHODS`, then those of tiers. ConfigError if no photograph can be read, or the config
+    Rows are in the order of `METHODS`, then rows of tiers. ConfigError if no photograph can be read, or the config
     cannot be measured.
     """
     if is_normalised(config):

@@ -5,8 +5,8 @@ method is the error of pairs made with the budget that chooses it (`session.budg
 those against the exact quantile of a fixed, dense set of random words.
 
 Times are ns per pixel of processor time of one thread. Kernels fuse stages: the curve is part of the colour matrix, and
-only the channel of each CFA site is computed. So ``curve``, ``colour`` and ``mosaic`` of kernels have one time, that of
-a clean frame; ``normal`` is the time that noise and its read-out add to it. The times of ``shot`` and ``effects`` are
+only the channel of each CFA site is computed. So ``curve``, ``colour`` and ``mosaic`` of kernels have one time, of a
+clean frame; ``normal`` is the time that noise and its read-out add to it. The times of ``shot`` and ``effects`` are
 differences between complete pairs with and without them. NumPy methods are measured on smaller crops, which are still
 large enough that their arrays do not fit the CPU caches.
 """
@@ -83,7 +83,7 @@ STAGE_ERRORS = {
     "tier_electrons": StageError(sessions.PHYSICAL, "unchanged", "noisy_std", "σ"),
     "tier_own": CLEAN_ERROR._replace(config=sessions.GIVEN),
 }
-"""Errors of the stages of methods, and of complete tiers; that of ``normal`` is `normal_error`, in σ."""
+"""Errors of the stages of methods, and of complete tiers; the error of ``normal`` is `normal_error`, in σ."""
 
 
 def method_error(session: BenchmarkSession, method: Method) -> Deviation:

@@ -47,7 +47,7 @@ def report_text(report: BenchmarkReport) -> str:
 
 
 def write_benchmark(report: BenchmarkReport, out: Path) -> None:
-    """Write the files of a report, replacing those of an earlier one; MachineError if that fails."""
+    """Write the files of a report, replacing an earlier report; MachineError if that fails."""
     picture = benchmark_figure(report.rows, report.runs)
     texts = (csv_text(kind, rows) for kind, rows in ((Measurement, report.rows), (RunMeasurement, report.runs)))
     contents = (*(text.encode() for text in texts), picture, benchmark_page(report, picture).encode())

@@ -50,7 +50,7 @@ class BenchmarkProfiles:
 
 @dataclass(frozen=True, slots=True)
 class SampleSizes:
-    """Sizes of the measurement; those of images are the largest height and width.
+    """Sizes of the measurement; sizes of images are the largest height and width.
 
     Errors are measured on ``sampled`` photographs, NumPy methods on ``readable`` crops, kernels on ``compiled`` crops.
     ``run_files`` and ``run_pixels`` limit complete runs to photographs and, if there are several, to pixels.
@@ -103,7 +103,7 @@ class BenchmarkSession:
 
     @property
     def all_configs(self) -> dict[str, Config]:
-        """Every config by name; that of complete runs with the given settings is replaced by its mosaics."""
+        """Every config by name; complete runs with the given settings have the configs of its mosaics."""
         return self.run_configs | self.configs
 
     @property

@@ -2,7 +2,7 @@
 
 The page is one self-contained file. It is not part of the dataset: nothing reads it. It describes ``dataset.json``,
 ``config.yaml`` and ``manifest.csv``, whose SHA-256 are checked first; ``gen-dataset verify`` checks every byte. Of the
-arrays, only a few evenly spaced pairs are read: `PAIRS_FITTED` for the noise check, and those of the contact sheet.
+arrays, only a few evenly spaced pairs are read: `PAIRS_FITTED` for the noise check, and the pairs of the contact sheet.
 """
 
 from __future__ import annotations

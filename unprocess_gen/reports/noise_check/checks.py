@@ -74,7 +74,7 @@ CHECKS = {
 """Checks by name."""
 
 TESTS = len(CHECKS) + 8
-"""Scores of one pair: those of the mean and of the variance against the signal have one for each plane too."""
+"""Scores of one pair: the mean and the variance against the signal have a score for each plane too."""
 
 
 class Alarm(NamedTuple):

@@ -64,7 +64,7 @@ class PlaneNoise:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Limits of the noisy frame without offsets: those of the converter, and the full well."""
+        """Limits of the noisy frame without offsets, by the converter and the full well."""
         plan = self.site.plan
         low, high = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
         full_dn = min((effect.largest_dn for effect in self.effects), default=math.inf)

@@ -184,7 +184,7 @@ def mean_points(plane: Plane) -> Points:
 def variance_points(plane: Plane) -> Points:
     """Variance of the noise, DN²: (mean of cos z - expectation at the mean x) / derivative by the variance.
 
-    In rounded frames the mean noise is that of x - c. Its own noise is independent of cos z, which is symmetric.
+    In rounded frames the mean noise is the mean of x - c. Its own noise is independent of cos z, which is symmetric.
     """
     expected, count, offsets = plane.expected, plane.count, row_offsets(plane.noise)
     is_rounded, scale = not plane.noise.site.plan.output.clean_normalised, np.abs(expected.by_variance)

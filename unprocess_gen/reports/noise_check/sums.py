@@ -18,7 +18,7 @@ Single = NDArray[np.float32]
 SEGMENTS = 8
 """Parts into which lines are divided."""
 SAMPLED = 3
-"""Distance of the rows and of the columns that are compared with those of the pair before."""
+"""Distance of the rows and of the columns that are compared with the pair before."""
 LARGEST_SAMPLE = 3.0
 """Bound of z in these rows and columns."""
 
@@ -157,7 +157,7 @@ class Sums:
     bits : ndarray of float64, [2]
         Sites whose noisy value has the last bit, and the last but one; 0 in frames that are not rounded.
     sample : Sample
-        Values that are compared with those of the next pair.
+        Values that are compared with the values of the next pair.
     """
 
     def __init__(self, plan: Plan, patch: Patch, clean: Any, noisy: Any, dark_pixels: DarkPixels | None) -> None:

@@ -3,7 +3,7 @@
 The figures are computed with the code that makes datasets. The template of the page has the captions, with differences
 from the article's text; the functions give it the numbers of the photograph. Raw frames are grey, from the lowest DN
 (black) to the highest (white), as in the article. The article's photographs are not published, so its claims are
-checked on other photographs: those of Figure 6 on up to `PHOTOGRAPHS_COUNTED`.
+checked on other photographs: the claims of Figure 6 on up to `PHOTOGRAPHS_COUNTED`.
 
 Figure 6 of the article has two interpretations (`INTERPRETATIONS`). The formula divides by g_rgb, so the
 largest g_rgb gives the darkest raw frame. The caption describes the most saturation for the largest g_rgb, which

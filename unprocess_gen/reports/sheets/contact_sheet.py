@@ -86,7 +86,7 @@ def write_sheets(
 def contact_sheet(folder: AnyPath, keys: Sequence[str] = (), source: AnyPath | None = None) -> Picture:
     """Draw an overview, RGB, with one strip per pair in the order of the manifest.
 
-    ``keys`` are those of pairs, or of images and patches, which select all of their pairs; by default, `PAIRS_SHOWN`
+    ``keys`` identify pairs, or images and patches, which select all of their pairs; by default, `PAIRS_SHOWN`
     evenly spaced pairs. ``source`` is the folder of the photographs, by default the recorded one. ConfigError for an
     unknown key or folder; DamageError if the dataset is damaged.
     """

@@ -86,7 +86,7 @@ class Physics(
     GainByColourNumbers, ReadNumbers, RowNumbers, ColumnNumbers, ColumnTemporalNumbers, BlackErrorNumbers,
     DsnuNumbers, DeadPixelNumbers,
 ):  # fmt: skip
-    """Numbers of a physical noise profile for one scene and sensor: those of its effects, and the following.
+    """Numbers of a physical noise profile for one scene and sensor: the numbers of its effects, and the following.
 
     Attributes
     ----------

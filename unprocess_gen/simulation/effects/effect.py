@@ -170,7 +170,7 @@ class Effect:
         """Return the electrons that the effect adds to the average of many frames."""
 
     def slots(self, plan: Plan) -> SlotValues:
-        """Return what the effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
+        """Return the slots that the effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
         return {}
 
     def expected(self, site: Site) -> EffectNoise:

@@ -116,7 +116,7 @@ class EffectNoise(NamedTuple):
     tail : callable
         Fraction of values above a distance (DN).
     row_variance, row_correlation : float
-        Variance of the common offset of a row (DN²), and its correlation with that of the next row.
+        Variance of the common offset of a row (DN²), and its correlation with the offset of the next row.
     offset_dn : float or ndarray, broadcast to [H/2, W/2]
         Known offset of the noisy frame; NaN for sites that cannot be checked.
     clean_offset_dn : float
@@ -197,7 +197,7 @@ def tukey_noise(std_dn: float, law: str, shape: float) -> EffectNoise:
 LEAST_TAIL = 2.0**-33
 """Least tail probability of a random word."""
 _FREQUENCIES = np.linspace(0.0, 8.0, 801)
-"""Radians per standard deviation; those of cos 2z are at most 2, those of codes are larger."""
+"""Radians per standard deviation, for cos 2z at most 2, for codes more."""
 
 
 @functools.lru_cache(maxsize=256)

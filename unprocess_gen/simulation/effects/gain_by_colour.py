@@ -40,7 +40,7 @@ class GainByColour(Effect):
     since = "0.2"
 
     def plane_gains(self, plan: Plan) -> tuple[float, ...]:
-        """Return the gain of the colour of each site of the tile; that of green for a sensor without filters."""
+        """Return the gain of the colour of each site of the tile; the gain of green for a sensor without filters."""
         return tuple(plan.physics.gain_by_colour[channel] for row in tile(plan.sensor.pattern) for channel in row)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:

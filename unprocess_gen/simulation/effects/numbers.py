@@ -39,7 +39,7 @@ class Number:
     key : str
         Key of the profile; empty if it has the name of the field.
     key_meaning, key_unit : str
-        Meaning and unit of the key, if they differ from those of the field.
+        Meaning and unit of the key, if they differ from the field's.
     key_default : Any
         Value of a key that a profile does not name; None if the number is not known then.
     optional : str

@@ -75,7 +75,7 @@ def electron_noise(
 
 @functools.lru_cache(maxsize=256)
 def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, int]) -> Electrons:
-    """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it.
+    """Return the noise without the body; ``origin`` belongs to the first block, as far as the noise depends on it.
 
     Crops of a body whose columns are fixed cut theirs from 1024 or more: each of their own takes a tenth of a crop of
     128 x 128.

@@ -63,7 +63,7 @@ _RATE_ERROR32 = np.float32(FLOAT32_RATE)
 
 
 class Electrons(NamedTuple):
-    """Hold the slots of N frames of one body; P columns are those of complete blocks."""
+    """Hold the slots of N frames of one body; P is the number of columns of complete blocks."""
 
     numbers: Float  # [N, NUMBERS]: see `FrameNumbers`
     site_lines: NDArray[np.uint64]  # [N, 4097]: quantiles of the noise of a site

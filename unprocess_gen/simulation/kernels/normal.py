@@ -2,7 +2,7 @@
 
 A value that is rounded later, to a count or to a DN, needs few exact bits. If its approximation is farther from a
 rounding boundary than its error bound, the exact value rounds alike. Callers recompute the other sites exactly, so
-frames equal those of `reference.noise.normals` bit for bit.
+frames equal the frames of `reference.noise.normals` bit for bit.
 
 A word's tail probability is p = f / 2**32, f = i + 1/2, where i is its lower 31 bits; its top bit is the sign. Two
 approximations:

@@ -1,6 +1,6 @@
 """Generate counter-based random words in kernels: Philox4x32-10 in the layout of `core.random_streams`.
 
-The values are those of `core.random_streams.words`; tests compare them with Random123's known answers. Each word
+The values equal `core.random_streams.words`; tests compare them with Random123's known answers. Each word
 depends only on its key and counter, so strips, workers and crops cannot change it.
 """
 
@@ -35,7 +35,7 @@ def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Philo
 def philox_keys(plans: Sequence[Plan], epoch: int | None = None) -> NDArray[np.uint64]:
     """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row.
 
-    ``epoch`` replaces that of the plans.
+    ``epoch`` replaces the epoch of the plans.
     """
     rows = []
     for plan in plans:

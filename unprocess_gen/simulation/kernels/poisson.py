@@ -1,6 +1,6 @@
 """Draw Poisson counts by inversion: one 32-bit random word, one count, coupled to the normal of the same word.
 
-Counts are those of `reference.poisson`, for rates up to 1e9. They are computed in two steps.
+Counts equal `reference.poisson`, for rates up to 1e9. They are computed in two steps.
 
 1. Approximately, float32, eight sites at a time, with a bound of the error that is 0 where the count is certain. Below
    rate 5: comparison of the word's rank with the distribution function, summed term by term. From rate 5 up: the first
@@ -84,7 +84,7 @@ def count_thresholds(rate: float) -> tuple[int, NDArray[np.uint32]]:
     """Return the smallest count of a rate, and the last rank of each count except the largest.
 
     The rank of a word is its place among all words, ordered by their normals. A count is the smallest one plus the
-    number of ranks that the word's rank exceeds: exactly that of `reference.poisson`, without any other computation.
+    number of ranks that the word's rank exceeds: exactly the count of `reference.poisson`, by comparisons only.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def fill_counts(
 def _range_of_block(
     first: np.uint64, vectors: int, rates: Pointer, workspace: Workspace
 ) -> tuple[bool, bool, np.float32]:
-    """Return whether any rate of a block is below `LOW_RATE`, whether any is not, and the highest one below it."""
+    """Compare the rates of a block with `LOW_RATE`: any below it, any not below it, and the highest one below it."""
     any_low = any_high = simd.uint32_zeros()
     low = simd.from_bits(any_low)
     for n in range(vectors):
@@ -230,8 +230,8 @@ NORMAL_REACH2 = 9.0, 0.5
 EXPANSION_ERRORS = 2e-4, 6.5e-7, 0.034
 """Error of the expansion's first terms: less than the sum of these, times 1, the rate and 1 / rate.
 
-The last term is the truncation, from rate 5 up. The others are those of the approximate normal, 6e-6 (8 + √rate), which
-is at most 6e-6 (8 + 12.5 + rate / 50), of the rate, and of rounding to float32.
+The last term is the truncation, from rate 5 up. The others are errors of the approximate normal, 6e-6 (8 + √rate),
+which is at most 6e-6 (8 + 12.5 + rate / 50), of the rate, and of rounding to float32.
 """
 
 TRUNCATION_ERRORS = 2e-7, 0.0325
@@ -240,7 +240,7 @@ TRUNCATION_ERRORS = 2e-7, 0.0325
 _TERMS, _OF_RECIPROCAL = (1 / 6, -1 / 72, 3.74468638e-3, -1.52239065e-3, 6.95733048e-4), -0.0305402523
 """Coefficients of x - rate - √rate·z ≈ (z² + 2)·P(s) + c / rate, s = z / √rate.
 
-The first two are those of the expansion; the others minimise the largest error times the rate.
+The first two are coefficients of the expansion; the others minimise the largest error times the rate.
 """
 
 
@@ -248,7 +248,7 @@ The first two are those of the expansion; the others minimise the largest error 
 def _count_high_rates(
     first: np.uint64, vectors: int, has_low: bool, rates: Pointer, normals: Pointer, out: Pointer, error: Pointer
 ) -> None:
-    """Fill up to a block with the counts of rates from `LOW_RATE` up; ``has_low`` keeps those of lower rates."""
+    """Fill up to a block with the counts of rates from `LOW_RATE` up; ``has_low`` keeps the counts of lower rates."""
     c, (error_of_1, error_of_rate, error_of_reciprocal) = _TERMS, EXPANSION_ERRORS
     for n in range(vectors):
         x = first + np.uint64(n) * _8

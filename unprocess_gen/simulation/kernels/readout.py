@@ -161,7 +161,7 @@ _exact_site = by_class(
 )
 """Return the exact DN of a site; arguments: noise, n, x, strip, workspace."""
 _has_errors = by_class({Gaussian: lambda noise: True, Gaussian32: lambda noise: False, Electrons: lambda noise: True})
-"""Return whether ``error_dn`` has bounds, so that sites can be uncertain; argument: noise."""
+"""True if ``error_dn`` has bounds, so that sites can be uncertain; argument: noise."""
 _fill_exact = by_class({Gaussian: gaussian.exact_gaussian, Electrons: electrons.exact_electrons})
 """Fill ``exact_dn`` with the DN of all sites; arguments: noise, n, strip, workspace."""
 average_patterns = by_class(
@@ -279,7 +279,7 @@ def _read_normalised(
 
 @inner
 def _is_direct(readout: Any, strip: Strip) -> bool:
-    """Return whether a strip of float32 is computed in its frame: complete vectors of a mosaic.
+    """True if a strip of float32 is computed in its frame: complete vectors of a mosaic.
 
     A copy from a buffer takes 8 to 14 % of a pair in float32.
     """

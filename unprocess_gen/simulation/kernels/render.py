@@ -1,9 +1,9 @@
 """Render clean and noisy frames strip by strip: the one compiled entry of all pairs.
 
 Per strip: the clean frame (`clean`), then for each noisy frame a sampler and a read-out. Numba chooses the sampler by
-the class of ``noise``, the precision by that of ``scene``, and the read-out by that of ``readout``; so compiled code
-contains only what a pair needs. Every form gives the same DN as `pair.reference_pair` on every processor, except
-`clean.Scene32` with `gaussian.Gaussian32`, whose errors are stated in `config.accuracy`.
+the class of ``noise``, the precision by the class of ``scene``, and the read-out by the class of ``readout``; so
+compiled code contains only what a pair needs. Every form gives the same DN as `pair.reference_pair` on every processor,
+except `clean.Scene32` with `gaussian.Gaussian32`, whose errors are stated in `config.accuracy`.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _fill_frames(
 ) -> tuple[Frame, Frame, NDArray[np.int64]]:
     """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`.
 
-    Only the first numbers include those of the clean frame.
+    Only the numbers of the first noisy frame include the counts of the clean frame.
     """
     first, shape = plans[0], (srgb.shape[0], srgb.shape[1])
     frame_shape = (4, shape[0] // 2, shape[1] // 2) if first.output.layout == PACKED else shape
@@ -151,7 +151,7 @@ def _records(
 
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
-    """Return what the plans of one pass have in common: the kernels, and the fixed patterns of the body."""
+    """Key that the plans of one pass have in common: the kernels, and the fixed patterns of the body."""
     return (
         plan.accuracy.uses_reference,
         plan.accuracy.uses_float32,
@@ -162,7 +162,7 @@ def pass_key(plan: Plan) -> tuple[object, ...]:
 
 
 def uses_scene32(plan: Plan) -> bool:
-    """Return whether a plan is rendered in float32: only integer frames with one normal per site are."""
+    """True if a plan is rendered in float32, as only integer frames with one normal per site are."""
     return plan.accuracy.uses_float32 and not plan.output.clean_normalised and not plan.noise.counts_electrons
 
 

@@ -113,7 +113,7 @@ def _lanewise(
 ) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles a function of vectors as ``code(builder, LLVM type of the result, *operands)``.
 
-    ``result`` returns the type of the result from that of the operands. Operands without a vector are single numbers,
+    ``result`` maps the type of the operands to the type of the result. Operands without a vector are single numbers,
     converted to the type of the first; Numba's own functions of numbers are compiled for each type, in 0.03 s.
     """
     return _compiled(lambda *operands: result(_vector_type(operands) or operands[0]), _per_lane(code))
@@ -153,7 +153,7 @@ def _shuffle(builder: Any, lanes: list[int], x: Any, y: Any) -> Any:
 
 
 def _is_set(builder: Any, mask: Any) -> Any:
-    """Return whether the top bit of each lane is set."""
+    """True if the top bit of each lane is set."""
     return builder.icmp_signed("<", mask, ir.Constant(mask.type, None))
 
 
@@ -394,7 +394,7 @@ def _build_any(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
 
 @_compiled(lambda x: types.boolean, _build_any)
 def has_any_bit(x: Vector) -> bool:
-    """Return whether any bit of any unsigned lane is set."""
+    """True if any bit of any unsigned lane is set."""
     return bool(np.any(x != 0))
 
 

@@ -39,7 +39,7 @@ _COUNT_BY_MASK = _MASK_BITS.sum(axis=1)
 
 
 def padded_width(left: int, width: int) -> int:
-    """Return how many columns the complete blocks around ``width`` pixels from column ``left`` have."""
+    """Return the number of columns of the complete blocks around ``width`` pixels from column ``left``."""
     return -(-(left % BLOCK + width) // BLOCK) * BLOCK
 
 
@@ -70,7 +70,7 @@ def locate(origin: tuple[int, int], y: int, x: int, length: int) -> Strip:
 
 
 class SiteMap(NamedTuple):
-    """A value for each pixel, whose columns are those of complete blocks; else `SIZE` equal numbers.
+    """A value for each pixel and for the columns that complete blocks add; else `SIZE` equal numbers.
 
     ``steps`` are the elements from row to row and from column to column, 0 if all are equal.
     """

@@ -1,1 +1,1 @@
-"""Compute each step of the simulation in NumPy, as the article states it; the results define those of the kernels."""
+"""Compute each step of the simulation in NumPy, as the article states it; this defines the results of the kernels."""

@@ -1,6 +1,6 @@
 """Compute the white-balance gains of a camera under a light, from its matrix and the chromaticity of the light.
 
-Only + − × ÷ and √ are used, so that gains have the same bits on every machine. The matrix is that of D65. A camera's
+Only + − × ÷ and √ are used, so that gains have the same bits on every machine. The matrix is for D65. A camera's
 matrix for lamps differs, so the gains under them are approximate.
 """
 
@@ -25,7 +25,7 @@ class Light:
     low_k, high_k : float
         Lowest and highest colour temperature, kelvin.
     on_daylight : bool
-        Whether the locus is that of daylight; else it is Planck's.
+        Whether the locus is the daylight locus; else it is Planck's.
     offset : float
         Distance from the locus in CIE 1960 uv, towards green.
     scatter : float

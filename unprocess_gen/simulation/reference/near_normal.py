@@ -1,8 +1,8 @@
 """Normal deviates in place of Poisson counts, as versions 0.1 and 0.2 drew them with ``accuracy=fast`` (NumPy).
 
 New runs count everywhere: the method saved 2 % of a run. Rows and recorded settings of those versions name it as
-`NEAR_NORMAL`, and get their bytes from this module. Deviates are those of straight lines in float32, because the frames
-of those versions were computed so.
+`NEAR_NORMAL`, and get their bytes from this module. Deviates follow straight lines in float32, because frames of
+those versions were computed so.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]
 
 
 CORE_MARGIN = 1.05
-"""Factor by which law distances with read noise of the law ``tukey_lambda`` may exceed those of `gaussian_distance`.
+"""Factor by which law distances with read noise of the law ``tukey_lambda`` may exceed `gaussian_distance`.
 
 It covers the steps of single electrons, of which a peaked density shows more."""
 
@@ -155,7 +155,7 @@ shapes show the skewness of the counts; no calibration has such shapes."""
 
 @functools.lru_cache(maxsize=64)
 def core_share(shape: float) -> float:
-    """Return how much less than normal read noise Tukey's lambda distribution smooths the steps and skewness of counts.
+    """Return the relative std of normal read noise that smooths counts no more than Tukey's lambda distribution does.
 
     The first Edgeworth term is the curvature of the density of normal shot noise plus read noise. A mixture of normal
     densities has, by Jensen's inequality, at most that of the normal one with its curvature at 0

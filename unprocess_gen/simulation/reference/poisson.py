@@ -160,7 +160,7 @@ def _tails() -> Float:
 def _cdf_polynomials(middle: Float) -> Float:
     """Return P(K <= k) and its derivatives in the rate, divided by n!, at each centre, [CELLS, MOST, 8].
 
-    The derivative of P(K <= k) is -P(K = k), and that of P(K = k) is P(K = k - 1) - P(K = k).
+    The derivative of P(K <= k) is -P(K = k); the derivative of P(K = k) is P(K = k - 1) - P(K = k).
     """
     with localcontext() as context:
         context.prec = DIGITS

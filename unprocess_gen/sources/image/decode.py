@@ -161,7 +161,7 @@ def _refuse_cicp(cicp: tuple[int, int, int, int], icc: str) -> None:
 
 @lru_cache(maxsize=32)
 def _profile_objection(icc: bytes) -> str:
-    """Return why an embedded profile is not sRGB, or an empty text; judged by its effect, since names prove little."""
+    """Reason why an embedded profile is not sRGB, or an empty text; judged by its effect, since names prove little."""
     from PIL import ImageCms
 
     try:

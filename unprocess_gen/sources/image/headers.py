@@ -382,7 +382,7 @@ def _tiff_mode(page: _Directory) -> str:
 
 
 def _tiff_missing(page: _Directory) -> str:
-    """Return what the file lacks of the strips or tiles that its first page lists; empty if it is complete."""
+    """Missing part of the strips or tiles that the first page of a file lists; empty if the file is complete."""
     is_tiled = page.values(_TILE_OFFSETS, 0) != (0,)
     offsets, lengths = (page.values(tag, 0) for tag in (_TILE_PLACES if is_tiled else _STRIP_PLACES))
     if 0 in offsets or 0 in lengths or len(offsets) != len(lengths):

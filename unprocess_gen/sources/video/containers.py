@@ -12,7 +12,7 @@ _EBML, _SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
 
 
 def missing_part(file: BinaryIO) -> str:
-    """Return what a container declares beyond the end of the file; an empty text if it is complete.
+    """Part of a container that is declared beyond the end of the file; an empty text if the file is complete.
 
     Raises SourceError (``unsupported``) for other kinds of files.
     """
@@ -47,7 +47,7 @@ def _missing_boxes(file: BinaryIO, size: int) -> str:
 
 
 def _matroska_end(head: bytes) -> int:
-    """Return where the header places the end of the segment; 0 if it does not, as in an interrupted recording."""
+    """End of the segment by its header; 0 if the header states none, as in an interrupted recording."""
     length, size_bytes = _vint(head[4:])
     position = 4 + size_bytes + length
     if head[position : position + 4] != _SEGMENT:

@@ -69,7 +69,7 @@ _ORIENTATIONS = {
 
 
 def is_installed() -> bool:
-    """Return whether PyAV is installed."""
+    """True if PyAV is installed."""
     return find_spec("av") is not None
 
 
@@ -246,7 +246,7 @@ class _Decoder:
         self._failure: Exception | None = None
 
     def continues_to(self, number: int, start: int) -> bool:
-        """Return whether continuing gives the frame that a new decoder from ``start`` would give."""
+        """True if continuing gives the frame that a new decoder from ``start`` would give."""
         if self._intra_only:
             return self._failure is None and number == self._reached + 1
         return self._start == start and number > self._reached
@@ -314,7 +314,7 @@ def _packet_infos(codec: str, container: InputContainer, stream: VideoStream) ->
 
 
 def _has_idr(packet: bytes, extradata: bytes) -> bool:
-    """Return whether an H.264 packet contains an IDR picture (type 5), which discards all references."""
+    """True if an H.264 packet contains an IDR picture (type 5), which discards all references."""
     if extradata[:1] != b"\1":
         return any(part[0] & 31 == 5 for part in packet.split(b"\0\0\1")[1:] if part)
     length = (extradata[4] & 3) + 1
