@@ -189,7 +189,7 @@ def _scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
 
 def _two_number_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     """The numbers and the effects of a profile with two numbers."""
-    sensor, noise, first = config.sensor, config.noise, plans[0].noise
+    noise, first = config.noise, plans[0].noise
     profile_levels = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
     numbers = "; ".join(dict.fromkeys(f"a={level.a}, b={level.b}" for level in interpretation.noise_levels(noise)))
     fitted = [plan.noise for plan in plans if "heteroscedastic" in plan.noise.effects and plan.noise.a_dn]
@@ -198,8 +198,7 @@ def _two_number_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     return [
         f"noise     {noise.name}: {numbers} ({noise.units}, black {profile_levels[0]} "
         f"{noise.black}, white {profile_levels[1]})",
-        f"          on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}): "
-        f"a_dn {value_range([plan.noise.a_dn for plan in plans])}, "
+        f"          on this sensor ({_levels_text(plans)}): a_dn {value_range([plan.noise.a_dn for plan in plans])}, "
         f"b_dn2 {value_range([plan.noise.b_dn2 for plan in plans])}; variance = a_dn·(x - black) + b_dn2",
         *([f"          {below}"] if zero_dn > 0 else []),
         f"effects   {', '.join(first.effects)}",
@@ -207,15 +206,21 @@ def _two_number_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     ]
 
 
+def _levels_text(plans: Sequence[Plan]) -> str:
+    """The levels of the pairs: with sensor=source those of the files."""
+    black, white = ([getattr(plan.sensor, f"{end}_level_dn") for plan in plans] for end in ("black", "white"))
+    return f"black {value_range(black)}, white {value_range(white)}"
+
+
 def _physical_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     """The numbers of a physical noise profile for the sources that were read, where they come from, and the effects."""
-    sensor, noise = config.sensor, config.noise
+    noise = config.noise
     assert noise.white_level_dn is not None and noise.black_level_dn is not None
     physics = [plan.noise.physics for plan in plans if plan.noise.physics is not None]
     distributions = sorted({"Gaussian" if numbers.read_law == "gaussian" else "Tukey lambda" for numbers in physics})
     distribution = "dark frames" if interpretation.uses_dark_frames(noise) else ", ".join(distributions)
     gains, stds = zip(*((numbers.dn_per_e, numbers.read_std_dn) for numbers in physics), strict=True)
-    scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
+    scale = value_range([plan.sensor.span_dn / (noise.white_level_dn - noise.black_level_dn) for plan in plans])
     assumed = ", ".join(f"{key}={_number_text(noise, key)}" for key in noise.assumed)
     provenance = (
         f"{', '.join(origin.numbers)}: {origin.source}; uncertainty: {origin.uncertainty}"
@@ -224,7 +229,7 @@ def _physical_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     simulated = {name for plan in plans for name in plan.noise.effects}
     return [
         f"noise     {noise.name}: in DN of black {noise.black_level_dn}, white {noise.white_level_dn}; "
-        f"on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}) times {scale:.6g}",
+        f"on this sensor ({_levels_text(plans)}) times {scale}",
         f"          system gain {value_range(gains, 4)} DN per electron, read noise {value_range(stds, 4)} DN standard "
         f"deviation ({distribution})",
         *_labelled("", [assumed and f"assumed, without a source: {assumed}", _assumed_sentence(config, plans)]),
