@@ -11,7 +11,8 @@ PARTS = {"camera": "colour matrix", "sensor": "set of raw levels", "noise": "noi
 def body_sentence(config: Config) -> str:
     """Return a sentence about what a config does not take from its body; empty if it has all, or there is none."""
     body = config.body
-    sentences = [f"no {PARTS[group]} of it is published, so {_chosen(config, group)} applies" for group in body.missing]
+    missing = [group for group in body.missing if group != "camera" or config.source.kind != "raw"]
+    sentences = [f"no {PARTS[group]} of it is published, so {_chosen(config, group)} applies" for group in missing]
     if body.replaced:
         sentences.append(f"settings that take precedence over it: {', '.join(body.replaced)}")
     return f"body={body.name}: {'; '.join(sentences)}" if body.name is not None and sentences else ""
