@@ -8,6 +8,7 @@ Design: ``docs/design/composition_and_sweeps.md``.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import threading
@@ -37,7 +38,7 @@ from unprocess_gen.config.composition_errors import assignment, explain, unknown
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.mixture import read_entries
 from unprocess_gen.config.option_files import OPTIONAL_GROUPS, check_override, conf_dir
-from unprocess_gen.config.raw_composition import NOT_APPLIED, OF_FILE, source_overrides
+from unprocess_gen.config.raw_composition import OF_FILE, source_overrides
 from unprocess_gen.config.schema import ENTRY_GROUPS, Config, MixtureEntry
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import entry_errors, validate_config
@@ -177,14 +178,13 @@ def _with_entries(config: Config, node: DictConfig, settings: Any, overrides: Se
     for number, (weight, options, values) in enumerate(read_entries(config.mixture)):
         with entry_errors(number):
             for key in (*options, *values):
-                if config.source.kind == "raw" and (group := key.partition(".")[0]) in NOT_APPLIED:
-                    raise ConfigError(f"{key}: source.kind=raw: {group} inverts the {NOT_APPLIED[group]}; remove it")
                 if key in outside:
                     problem = f"{outside[key]} is set outside of the mixture too; expected one of both; remove one"
                     raise ConfigError(f"{key}: {problem}")
             written = [f"{group}={option}" for group, option in options.items()]
             entry = compose_node([*given, *written], folders)
             written += [f"{key}={value_text(value)}" for key, value in values.items()]
+            source_overrides(entry, written)  # refuses values that do not apply to raw sources
             try:
                 entry.merge_with(_nested(values))
             except (OmegaConfBaseException, *PLAIN_ERRORS) as error:
@@ -201,7 +201,7 @@ def _nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     groups: dict[str, dict[str, Any]] = {}
     for key, value in values.items():
         group, _, name = key.partition(".")
-        groups.setdefault(group, {})[name] = value
+        groups.setdefault(group, {})[name] = json.loads(json.dumps(value))  # OmegaConf refuses subclasses of dict
     return groups
 
 
@@ -209,9 +209,8 @@ def _settings_outside(
     node: DictConfig, choices: DictConfig, given: Sequence[str], overrides: Sequence[str], folders: OptionFolders
 ) -> dict[str, str]:
     """Return the options and keys of a mixture's groups that overrides or the user's files set, as they set them."""
-    outside = {
-        f"{group}": f"{group}={choices[group]}" for group in ENTRY_GROUPS if choices[group] != default_options()[group]
-    }
+    chosen = {group: f"{group}={choices[group]}" for group in ENTRY_GROUPS if choices[group] != default_options()[group]}
+    outside = {group: text for group, text in chosen.items() if text != OF_FILE or OF_FILE in overrides}
     if any(text.startswith("+") for text in given) or (folders.main, folders.name) != (conf_dir().absolute(), "config"):
         own = folders.own or (None if folders.main == conf_dir().absolute() else folders.main)
         plain = compose_node([f"{group}={choices[group]}" for group in ENTRY_GROUPS], OptionFolders(own=own))
