@@ -197,6 +197,8 @@ def make_pair(
         image = _planned(pixels, identity, config, seed)
     elif config.noise.dark.sha256:
         raise ConfigError("make_pair: the plan names a dark frame, whose folder it lacks; expected a config")
+    elif config.source.is_raw:
+        raise ConfigError("make_pair: the plan is of a raw frame; expected that of a photograph; use ug.LivePairs")
     elif seed is None and key is None:
         recorded = _downscaled(pixels, config.source.downscale)
         image = PlannedImage(recorded, (config,), _full_frame(recorded, config.output.layout))

@@ -211,6 +211,11 @@ def test_functions_of_photographs_refuse_raw_sources(tmp_path: Path) -> None:
     for call in calls:
         with pytest.raises(ConfigError, match=r"source\.kind=raw: .* pixels of photographs; expected srgb"):
             call()
+    _, plan = simulated(
+        raw_config(tmp_path, *LEVELS), mosaics(raw_config(tmp_path, *LEVELS), picture[..., 0] + np.uint16(2000))
+    )
+    with pytest.raises(ConfigError, match="make_pair: the plan is of a raw frame"):
+        ug.make_pair(picture, plan)
 
 
 @pytest.mark.parametrize("override", ["source.shrink=2", "source.own_noise=subtract", "sensor=source",

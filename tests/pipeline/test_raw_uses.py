@@ -1,4 +1,4 @@
-"""Raw sources have the uses of photographs: clips, levels, splits, mixtures, parts, clusters, stores, pictures, exports."""
+"""Raw sources have the uses of photographs: clips, levels, mixtures, parts, clusters, stores, pictures and exports."""
 
 from __future__ import annotations
 

@@ -209,8 +209,10 @@ def _settings_outside(
     node: DictConfig, choices: DictConfig, given: Sequence[str], overrides: Sequence[str], folders: OptionFolders
 ) -> dict[str, str]:
     """Return the options and keys of a mixture's groups that overrides or the user's files set, as they set them."""
-    chosen = {group: f"{group}={choices[group]}" for group in ENTRY_GROUPS if choices[group] != default_options()[group]}
-    outside = {group: text for group, text in chosen.items() if text != OF_FILE or OF_FILE in overrides}
+    chosen = {group: choices[group] for group in ENTRY_GROUPS if choices[group] != default_options()[group]}
+    outside = {
+        group: text for group, name in chosen.items() if (text := f"{group}={name}") != OF_FILE or text in overrides
+    }
     if any(text.startswith("+") for text in given) or (folders.main, folders.name) != (conf_dir().absolute(), "config"):
         own = folders.own or (None if folders.main == conf_dir().absolute() else folders.main)
         plain = compose_node([f"{group}={choices[group]}" for group in ENTRY_GROUPS], OptionFolders(own=own))
