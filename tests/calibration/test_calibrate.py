@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,7 @@ def test_numbers_of_the_body_are_measured(light: tuple[float, float, float], cal
     """Gains by colour, full well, dark current and its doubling agree with the true values in their errors."""
     gains, full_e = (1.1, 1.0, 0.9), 2000.0
     numbers = Numbers(4.0, 5.0, 0.0, gains=gains, full_well_e=full_e, dark_e_per_s=20.0, prnu_std=0.01, light=light)
+    numbers = replace(numbers, hot_share=0.004, hot_e_per_s=50.0)
     darks = [Shot(0.0, seconds, celsius) for celsius in (20.0, 32.0) for seconds in (0.01, 1.0, 4.0) for _ in range(3)]
     lights = (0.03, 0.08, 0.13, 0.18, 0.23, 0.28, 0.4, 0.7)
     shots = [*darks, *(Shot(light) for light in lights for _ in range(2))]
@@ -101,7 +103,8 @@ def test_numbers_of_the_body_are_measured(light: tuple[float, float, float], cal
     found, written = estimates(profile), yaml.safe_load(profile.read_text(encoding="utf-8"))
     for name, true in (
         *(("full_well_e", full_e), ("dark_e_per_s", 80.0), ("dark_doubling_c", 6.0)),
-        *(("prnu_std", 0.01), ("hot_pixel_share", 0.0), ("dead_pixel_share", 0.0)),
+        *(("prnu_std", 0.01), ("dead_pixel_share", 0.0)),
+        *(("hot_pixel_share", 0.004), ("hot_pixel_e_per_s", 200.0)),
     ):
         row = found[name, None, None]
         low, high = (row["value"] + 2 * (row[end] - row["value"]) for end in ("low", "high"))  # 4 standard errors

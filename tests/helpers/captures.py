@@ -29,6 +29,8 @@ class Numbers:
     black_error_dn: float = 0.5
     prnu_std: float = 0.0
     dark_e_per_s: float = 0.0
+    hot_share: float = 0.0
+    hot_e_per_s: float = 0.0
     full_well_e: float = math.inf
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
     light: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -59,12 +61,15 @@ def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequ
     folder.mkdir(parents=True)
     rng, lines = np.random.default_rng(seed), [COLUMNS]
     pattern = 1 + rng.normal(0, numbers.prnu_std, (side, side))
+    defects = np.random.default_rng([seed, 1])
+    hot = (defects.random((side, side)) < numbers.hot_share) * defects.exponential(numbers.hot_e_per_s, (side, side))
     gains, colours = (np.tile([rgb[:2], rgb[1:]], (side // 2, side // 2)) for rgb in (numbers.gains, numbers.light))
     gains = gains * numbers.dn_per_e
     for place, shot in enumerate(shots):
-        dark = numbers.dark_e_per_s * shot.seconds * 2 ** ((shot.celsius - 20) / 6)
+        seconds = shot.seconds * 2 ** ((shot.celsius - 20) / 6)
+        dark = numbers.dark_e_per_s * seconds
         light = shot.light * (WHITE - BLACK) / numbers.dn_per_e * pattern * colours
-        electrons = np.minimum(rng.poisson(light + dark), numbers.full_well_e) - dark
+        electrons = np.minimum(rng.poisson(light + dark + hot * seconds), numbers.full_well_e) - dark
         rows = rng.normal(0, numbers.row_std_dn, (side, 1))
         noise = rng.normal(BLACK + numbers.black_error_dn, numbers.read_std_dn, (side, side)) + rows
         np.save(folder / f"{place}.npy", np.clip(np.rint(electrons * gains + noise), 0, WHITE).astype(np.uint16))

@@ -16,12 +16,14 @@ from unprocess_gen.calibration.gain import (
     root_estimate,
     weighted_slope,
 )
-from unprocess_gen.calibration.measure import Dark, IsoResult, usable
+from unprocess_gen.calibration.measure import IsoResult, usable
 
 LEAST_EXPOSURE_RATIO = 2.0
 """Least ratio of exposures from which dark current is measured."""
 LEAST_HOT_EXPOSURE_S = 0.2
 """Least exposure of darks that show hot pixels. Chosen: their excess is some electrons then."""
+LARGEST_HOT = 0.95
+"""Signal of hot pixels, as a fraction of white and of the full well, from which their current is not known."""
 LEAST_WARMING_C = 4.0
 """Least range of temperatures from which their effect is measured."""
 
@@ -54,9 +56,9 @@ def measure_body(results: Sequence[IsoResult], black_dn: float) -> BodyResult:
     current = combined(currents[warmest]) if warmest is not None else None
     if current is not None and current.low <= 0:
         current = None
-    hot_share, hot_e_per_s = _hot(results)
-    dead_share, dead_level = _dead(results, black_dn)
     wells = [_in_electrons(result.full_well_dn, result.gain.sensor) for result in results if result.full_well_dn]
+    hot_share, hot_e_per_s = _hot(results, wells[0].value if wells else math.inf)
+    dead_share, dead_level = _dead(results, black_dn)
     dsnu = [result.dsnu_dn.scaled(1 / result.gain.sensor.value) for result in results if result.dsnu_dn.value]
     return BodyResult(
         prnu=_positive(_prnu(results, range(4))) if has_flats else None,
@@ -160,30 +162,32 @@ def _is_mean_removed(results: Sequence[IsoResult]) -> bool:
     return True
 
 
-def _hot(results: Sequence[IsoResult]) -> tuple[Estimate | None, Estimate | None]:
-    """Return share and mean current of hot pixels, from the darks that show the smallest currents.
+def _hot(results: Sequence[IsoResult], full_well_e: float) -> tuple[Estimate | None, Estimate | None]:
+    """Return share and mean current of hot pixels, from the darks that show the most currents.
 
     The currents are exponentially distributed (the profile's law), so those above a threshold have the mean of all plus
-    the threshold.
+    the threshold. Full pixels are censored: they add to the sum of the currents, but not to their number.
     """
     from scipy.stats import chi2
 
-    longest = [(result, result.darks[-1]) for result in results if result.darks[-1].exposure_s >= LEAST_HOT_EXPOSURE_S]
-    if not longest:
+    measured = list[tuple[int, float, int, float]]()
+    for result in results:
+        gain, dark = result.gain.sensor.value, result.darks[-1]
+        if dark.exposure_s < LEAST_HOT_EXPOSURE_S:
+            continue
+        limit = LARGEST_HOT * min(dark.hot_white_dn, full_well_e * gain)
+        known = int(np.count_nonzero(dark.hot_dn < limit))
+        above = float((np.minimum(dark.hot_dn, limit) - dark.hot_threshold_dn).sum()) / (gain * dark.exposure_s)
+        least = dark.hot_threshold_dn / (gain * dark.exposure_s)
+        measured.append((known, least, len(dark.hot_dn), max(above, 1e-3 * least)))
+    if not measured:
         return None, None
-
-    def threshold(result: IsoResult, dark: Dark) -> float:
-        return dark.hot_threshold_dn / result.gain.sensor.value / dark.exposure_s
-
-    result, dark = min(longest, key=lambda pair: threshold(*pair))
-    least, sites = threshold(result, dark), 4 * dark.measured.sites
-    if not len(dark.hot_dn):
-        return share_estimate(0, sites), None
-    excess = dark.hot_dn / result.gain.sensor.value / dark.exposure_s
-    mean = max(float(excess.mean()) - least, 1e-3 * least)
-    factor = math.exp(min(least / mean, 1.0))
-    total, (low, high) = 2 * mean * len(excess), chi2.ppf((0.025, 0.975), 2 * len(excess))
-    return share_estimate(len(excess), sites).scaled(factor), Estimate(mean, total / float(high), total / float(low))
+    known, least, count, total = max(measured, key=lambda numbers: numbers[0])
+    share = share_estimate(count, 4 * results[0].dark.measured.sites)
+    if not known:
+        return share, None
+    mean, ends = total / known, 2 * total / chi2.ppf((0.975, 0.025), 2 * known)
+    return share.scaled(math.exp(min(least / mean, 1.0))), Estimate(mean, *map(float, ends))
 
 
 def share_estimate(count: int, sites: int) -> Estimate:

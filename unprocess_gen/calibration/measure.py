@@ -60,7 +60,10 @@ DEAD_RESPONSE, DEAD_SIGNAL = 0.2, 0.05
 
 @dataclass(frozen=True, slots=True)
 class Dark:
-    """Darks of one exposure: frames, noise, mean by block of sites, and high values of their fixed pattern."""
+    """Darks of one exposure: frames, noise, mean by block of sites, and high values of their fixed pattern.
+
+    ``hot_white_dn`` is the value of that pattern at white.
+    """
 
     frames: list[Capture]
     measured: Measured
@@ -68,6 +71,7 @@ class Dark:
     shading: Float
     hot_dn: Float
     hot_threshold_dn: float
+    hot_white_dn: float
 
     @property
     def exposure_s(self) -> float:
@@ -221,7 +225,8 @@ def _dark(frames: list[Capture], sensor: Sensor, watch: Watch) -> Dark:
     spread = [ROBUST * float(np.median(np.abs(pattern - np.median(pattern)))) for pattern in patterns]
     threshold = FAR * max(*spread, 0.05)
     hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
-    return Dark(frames, measured, sums.column_offsets(), _block_means(mean), hot, threshold)
+    white_dn = sensor.white_dn - float(measured.mean_dn.max())
+    return Dark(frames, measured, sums.column_offsets(), _block_means(mean), hot / SMOOTH, threshold / SMOOTH, white_dn)
 
 
 def _block_means(frame: Float) -> Float:
