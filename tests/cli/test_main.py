@@ -566,7 +566,10 @@ def test_log_file_is_not_appended_to_a_photograph(moved: Path, run_main: RunMain
 
 NOISE_FILES = [
     (("--noise", "--to", "noise.txt"), "--to noise.txt: is not a PNG file"),
-    (("--noise", "--to", "no/noise.png"), "--to no/noise.png: expected the name of a file in a folder that exists"),
+    (
+        ("--noise", "--to", "no/noise.png"),
+        "--to no/noise.png: expected a file in a folder that exists; run mkdir -p no first",
+    ),
     (("--noise", "--to", "moved/002.png"), "--to moved/002.png: exists and is not an earlier figure"),
     (("--to", "noise.png"), "verify: --to noise.png: is for --noise or --against; add one of them"),
 ]

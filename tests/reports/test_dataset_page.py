@@ -375,8 +375,11 @@ def test_report_is_written_to_another_file_unless_it_is_no_page(
     [
         ((), "report: expected the folder of a dataset"),
         (("ds", "--too", "x"), "report: --too: no such flag; expected --to, "),
-        (("ds", "--to", "."), "--to .: expected the name of a file"),
-        (("ds", "--to", "no/such.html"), "--to no/such.html: expected the name of a file in a folder that exists"),
+        (("ds", "--to", "."), "--to .: is a folder; expected the name of a file"),
+        (
+            ("ds", "--to", "no/such.html"),
+            "--to no/such.html: expected a file in a folder that exists; run mkdir -p no first",
+        ),
         (("ds", "--to", "locked/page.html"), "--to locked/page.html: cannot be written (Permission denied)"),
     ],
 )

@@ -55,8 +55,10 @@ def check_output_file(file: Path, option: str, expected: str, *marks: bytes) -> 
     one of the ``marks``, in lower case. The folder of the file must exist.
     """
     _refuse_dataset(file, option, "file")
-    if file.is_dir() or not file.parent.is_dir():
-        raise ConfigError(f"{option}: expected the name of a file in a folder that exists")
+    if file.is_dir():
+        raise ConfigError(f"{option}: is a folder; expected the name of a file")
+    if not file.parent.is_dir():
+        raise ConfigError(f"{option}: expected a file in a folder that exists; run mkdir -p {file.parent} first")
     if not os.access(file.parent, os.W_OK | os.X_OK):
         raise ConfigError(f"{option}: cannot be written (Permission denied); choose another folder")
     beginning = _first_bytes(file, option).lower() if file.is_file() else b""
