@@ -1,11 +1,13 @@
 """Draw page.png, sweep.jpg, figure6.png and dng.png for the documentation: python .readme/draw_pages.py.
 
-They show the report of a dataset, a figure of the article and DNG files, made from built-in scenes in a temporary
-folder. Requires the extras figures and dng, rawpy, and Chromium.
+They show the report of a dataset, that of a sweep, a figure of the article and DNG files, made from built-in scenes in
+a temporary folder; the page of the sweep is written too. Requires the extras figures and dng, rawpy, and Chromium.
 """
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -36,20 +38,26 @@ def developed(path: Path) -> np.ndarray:
         return raw.postprocess(use_camera_wb=True, no_auto_bright=True, bright=2.0, adjust_maximum_thr=0)
 
 
-def screenshot(page: Path, height: int) -> np.ndarray:
-    """Return the top of a page, RGB, at half size."""
+def screenshot(page: Path, width: int, height: int, scale: float) -> np.ndarray:
+    """Return the top of a page, RGB, scaled."""
     to = page.with_suffix(".png")
-    shot = (f"--window-size=1220,{height}", f"--screenshot={to}", f"--user-data-dir={page.parent}/profile")
+    shot = (f"--window-size={width},{height}", f"--screenshot={to}", f"--user-data-dir={page.parent}/profile")
     subprocess.run([*BROWSER, *shot, page.as_uri()], check=True, capture_output=True)
-    return cv2.resize(cv2.imread(str(to), cv2.IMREAD_COLOR_RGB), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+    whole = cv2.imread(str(to), cv2.IMREAD_COLOR_RGB)
+    return cv2.resize(whole, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def draw_sweep() -> None:
-    """Generate a sweep of built-in scenes, and write the picture of its page."""
+    """Generate a sweep of built-in scenes, and write its page, without links to datasets, and a picture of it."""
     with tempfile.TemporaryDirectory() as name:
-        gen_dataset("+sweep=camera_by_iso", f"out={name}/sweep", "source.limit=2", "n_jobs=1")
-        gen_dataset("report", f"{name}/sweep")
-        picture = screenshot(Path(name) / "sweep" / "report.html", 1130)
+        folder = Path(name) / "camera_by_iso"
+        gen_dataset("+sweep=camera_by_iso", f"out={folder}", "source.limit=1", "source.downscale=2", "n_jobs=1")
+        gen_dataset("report", str(folder))
+        page = folder / "report.html"
+        text = page.read_text(encoding="utf-8")
+        page.write_text(re.sub(r'<a href="[^"]*">page of the dataset</a>\n?', "", text), encoding="utf-8")
+        picture = screenshot(page, 1220, 980, 0.75)
+        shutil.copyfile(page, HERE.parent / "docs" / "_static" / "camera_by_iso.html")
     cv2.imwrite(str(HERE / "sweep.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
 
 
@@ -61,11 +69,7 @@ def main() -> None:
         gen_dataset("report", f"{folder}/ds")
         gen_dataset("dng", f"{folder}/ds", "--keys", CHART, "--to", f"{folder}/dng")
         gen_dataset("figures", f"out={folder}/figures")
-        address = f"file://{folder}/ds/report.html"
-        shot = ("--window-size=1220,2100", f"--screenshot={folder}/page.png", f"--user-data-dir={folder}/profile")
-        subprocess.run([*BROWSER, *shot, address], check=True, capture_output=True)
-        page = cv2.imread(f"{folder}/page.png", cv2.IMREAD_COLOR_RGB)
-        save(cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), "page.png")
+        save(screenshot(folder / "ds" / "report.html", 1220, 2100, 0.5), "page.png")
         frames = [developed(folder / "dng" / f"{CHART}.{frame}.dng") for frame in ("clean", "noisy")]
         save(cv2.resize(np.hstack(frames), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), "dng.png")
         (HERE / "figure6.png").write_bytes((folder / "figures" / "fig6.png").read_bytes())

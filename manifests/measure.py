@@ -182,7 +182,7 @@ CARD = """\
 - Settings: `{settings}`
 - Digests: [`{name}.sha256`](../{name}.sha256); rows: [`{name}.csv`](../{name}.csv)
 
-PSNR in dB / SSIM, means over the pairs; [definitions](../README.md#scores).
+PSNR in dB / SSIM, means over the pairs, computed by [`measure.py`](../measure.py); [definitions](../README.md#scores).
 
 {table}
 """

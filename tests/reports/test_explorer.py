@@ -64,7 +64,7 @@ def row_of_command(command: str, key: str, out: Path) -> dict[str, Any]:
 
 
 CASES = {
-    "scene": (None, 2, ["gains.red=2.05", "camera.weights=[1,2,0,1]"]),
+    "scene": (None, 2, ["source.downscale=4", "gains.red=2.05", "camera.weights=[1,2,0,1]"]),
     "photograph": ("photos", 1, ["body=sony_a7s2", "scene=night", "effects.prnu=on"]),
     "dark": ("photos", 0, ["noise=heteroscedastic", "noise.a=2", "noise.b=9", "sensor.pattern=GBRG"]),
 }
@@ -92,6 +92,14 @@ def test_row_of_a_dataset_opens_with_its_parameters(photos: Path, tmp_path: Path
         assert again["noisy_xxh3"] == shown.row["noisy_xxh3"]
 
 
+@pytest.fixture(scope="module")
+def composition() -> Recomposition:
+    """Settings that have been composed before, as those of a page when a control changes."""
+    composition = Recomposition()
+    composition.config([])
+    return composition
+
+
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -101,18 +109,15 @@ def test_row_of_a_dataset_opens_with_its_parameters(photos: Path, tmp_path: Path
         ["camera.weights=[1,2,3,4]", "split={a: 0.5, b: 0.5}", "+experiment=crvd_like", "source.clips=false"],
     ],
 )
-def test_recomposition_equals_composition(overrides: list[str]) -> None:
-    composition = Recomposition()
-    composition.config([])
-    assert composition.config(overrides) == ug.load_config(overrides)
-    texts = [f"{key}={text}" for key, text in overrides_of(ug.load_config(overrides)).items()]
-    assert overrides_of(ug.load_config(texts)) == overrides_of(ug.load_config(overrides))
+def test_recomposition_equals_composition(overrides: list[str], composition: Recomposition) -> None:
+    composed = ug.load_config(overrides)
+    assert composition.config(overrides) == composed
+    texts = [f"{key}={text}" for key, text in overrides_of(composed).items()]
+    assert overrides_of(ug.load_config(texts)) == overrides_of(composed)
 
 
 @pytest.mark.parametrize("override", ["gains.red=-1", "camera=foo", "gains.foo=1", "sensor.bits=x", "source.limit=0"])
-def test_recomposition_has_the_sentence_of_the_command_line(override: str) -> None:
-    composition = Recomposition()
-    composition.config([])
+def test_recomposition_has_the_sentence_of_the_command_line(override: str, composition: Recomposition) -> None:
     with pytest.raises(ug.ConfigError) as direct:
         ug.load_config([override])
     with pytest.raises(ug.ConfigError, match=re.escape(str(direct.value))):
@@ -202,6 +207,42 @@ def press(browser: Any, label: str, key: str = "") -> None:
         button.click()
 
 
+def saved_frames(browser: Any, form: str, tmp_path: Path) -> Path:
+    """Press the button that saves the pair; return the folder of the frames."""
+    press(browser, f"Save the pair as {form.upper()}")
+    saved, end = tmp_path / "saved" / f"00000000.{form}.zip", time.monotonic() + 60
+    while not saved.is_file() and time.monotonic() < end:
+        time.sleep(0.1)
+    shutil.unpack_archive(saved, tmp_path / form)
+    return tmp_path / form
+
+
+TOOLTIP = """
+const texts = [];
+const search = root => root.querySelectorAll("*").forEach(one => {
+  if (one.classList.contains("bk-tooltip-row-value")) texts.push(one.textContent);
+  if (one.shadowRoot) search(one.shadowRoot);
+});
+search(document);
+return texts;
+"""
+
+
+def tooltip(browser: Any, name: str) -> list[str]:
+    """Move the pointer over a picture; return what it shows of the site and of both frames."""
+    place = "const place = Bokeh.index.find_one(it).el.getBoundingClientRect(); return [place.x, place.y];"
+    model(browser, name, "Bokeh.index.find_one(it).el.scrollIntoView({block: 'center'})")
+    texts, end = [], time.monotonic() + 60
+    while not texts and time.monotonic() < end:
+        x, y = model(browser, name, place)
+        for step in range(2):
+            move = {"type": "mouseMoved", "x": x + 40 + step, "y": y + 30}
+            browser.execute_cdp_cmd("Input.dispatchMouseEvent", move)
+        time.sleep(0.2)
+        texts = browser.execute_script(TOOLTIP)
+    return [texts[0], *texts[2:4]]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1200, 390])
 def test_page_works_in_a_browser_without_network(width: int, address: str, browser: Any, tmp_path: Path) -> None:
@@ -235,13 +276,13 @@ def test_page_works_in_a_browser_without_network(width: int, address: str, brows
     assert browser.execute_async_script("navigator.clipboard.readText().then(arguments[0])") == model(
         browser, "command", "return it.value"
     )
-    press(browser, "Save the pair as NPY")
-    saved = tmp_path / "saved" / "00000000.npy.zip"
-    end = time.monotonic() + 60
-    while not saved.is_file() and time.monotonic() < end:
-        time.sleep(0.1)
-    shutil.unpack_archive(saved, tmp_path / "frames")
-    assert array_xxh3(np.load(tmp_path / "frames" / "00000000.noisy.npy")) == row["noisy_xxh3"]
+    frames = {form: saved_frames(browser, form, tmp_path) for form in ("npy", "dng")}
+    clean, noisy = (np.load(frames["npy"] / f"00000000.{name}.npy") for name in ("clean", "noisy"))
+    assert (array_xxh3(clean), array_xxh3(noisy)) == (row["clean_xxh3"], row["noisy_xxh3"])
+    tifffile = pytest.importorskip("tifffile")
+    assert np.array_equal(tifffile.imread(frames["dng"] / "00000000.noisy.dng"), noisy)
+    column, line, clean_dn, noisy_dn = map(int, re.findall(r"\d+", " ".join(tooltip(browser, "clean"))))
+    assert (clean_dn, noisy_dn) == (clean[line, column], noisy[line, column])
     requests = [entry["message"] for entry in browser.get_log("performance") if "requestWillBeSent" in entry["message"]]
     urls = {url for text in requests for url in re.findall(r'"url":"(https?://[^"]+)"', text)}
     assert urls and all(url.startswith(address) for url in urls), urls

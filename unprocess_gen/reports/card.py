@@ -223,7 +223,7 @@ def _arrays(mlc: Any) -> Any:
     regex = {"key": r"^([^.]+)\.", "array": r"^[^.]+\.(.+)\.npy$"}
     meanings = {
         "key": "key of the sample: source index, and patch if there is one",
-        "array": "clean, noisy, or another array of the pair",
+        "array": "clean, noisy, noisy.l00d01 of level 0 and draw 1, or another array of the sample",
         "content": "NPY file: numpy.load(io.BytesIO(content))",
     }
     fields = []

@@ -24,14 +24,16 @@ from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.targets import noise_law
 from unprocess_gen.pipeline.workspace import REPORT
 from unprocess_gen.reports.dataset_page.page import write_dataset_report
-from unprocess_gen.reports.formatting import byte_size
+from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.report_files import require_libraries, write_files
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.contact_sheet import develop_detail
 from unprocess_gen.simulation.reference.isp import to_light
 
-JPEG_QUALITY = 80
+JPEG_QUALITY = 70
+COLUMNS = 5
+"""Values of the key across the table, if one has as many: they fit a window of 1200 pixels."""
 LEVELS = 64
 CURVE_PX = (120, 48)
 """Width and height of the curve of the noise."""
@@ -61,7 +63,8 @@ def write_sweep_page(folder: Path, jobs: Table, swept: Sequence[str], to: Path |
         check_output_file(to, f"--to {to}", "an HTML page", b"<!doctype html", b"<html")
     cells = {job["folder"]: _cell(folder, job, file.parent) for job in with_bar(jobs, "dataset", len(jobs))}
     highest_dn = max((float(cell.std_dn.max(initial=0)) for cell in cells.values()), default=0.0)
-    across = min(swept, key=lambda key: len({job.get(key, "") for job in jobs}), default="") if len(swept) > 1 else ""
+    counts = {key: len({job.get(key, "") for job in jobs}) for key in swept}
+    across = min(swept, key=lambda key: abs(counts[key] - COLUMNS), default="") if len(swept) > 1 else ""
     down = [key for key in swept if key != across]
     content = render_page(
         "sweep.html",
@@ -106,7 +109,7 @@ def _cell(sweep: Path, job: Mapping[str, str], start: Path) -> SweepCell:
     share = job.get("saturated_share")
     lines = (
         f"saturated {float(share):.3%}" if share else "saturated: not known",
-        f"{job.get('rows') or 0} rows, {job.get('failed') or 0} failed",
+        f"{counted(int(job.get('rows') or 0), 'row')}, {job.get('failed') or 0} failed",
         f"{float(job.get('seconds') or 0):.1f} s, {byte_size(int(job.get('bytes') or 0))}",
     )
     return SweepCell(name, link, pictures, std_dn, lines)

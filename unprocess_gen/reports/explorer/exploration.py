@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.recomposition import Recomposition
 from unprocess_gen.config.schema import Config, SourceConfig
-from unprocess_gen.config.values import refusal
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.types import PACKED, DarkPixels, Pair, Patch, Photograph, Plan, Row, Source, Srgb
@@ -127,8 +127,7 @@ class Exploration:
     def shown(self) -> Shown:
         """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
         config = self.composition.config(self.overrides)
-        if config.source.kind != "srgb":
-            raise refusal("source.kind", config.source.kind, "the page shows photographs; expected srgb; leave it out")
+        require_photographs(config.source, "explore")
         source = _sources(config.source)[self.index]
         sha256, photograph = _loaded(config.source, source, config.output.layout)
         settings = PairSettings.read(config)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,6 +41,18 @@ from unprocess_gen.reports.html_pages import visible
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0072b2", "noisy": "#d55e00"}
+CURVES = {
+    "source_histogram": ("Histogram of the source", "code", "share of the pixels"),
+    "raw_histogram": ("Histogram of the raw frames", "DN", "share of the sites"),
+    "highlight": ("Highlight function (Figure 4)", "intensity i of grey light", "f(i)"),
+    "transfer": ("Photon transfer", "signal above black, DN", "variance of the noise, DN²"),
+}
+"""Titles and axes."""
+MOVES = {
+    "+": (2, 0, 0), "−": (0.5, 0, 0), "←": (1, -0.5, 0), "→": (1, 0.5, 0),
+    "↑": (1, 0, -0.5), "↓": (1, 0, 0.5), "all": (0, 0, 0),
+}  # fmt: skip
+"""Buttons: zoom, and shares of the window by which it moves to the right and down."""
 SMALLEST_PX = 8
 """Fewest sites of a side of the window."""
 STRETCHES = ("common stretch", "own stretch")
@@ -78,15 +89,10 @@ class Page:
         for div in (self._message, self._facts, self._plan):
             div.update(sizing_mode="stretch_width", stylesheets=[TEXTS])
         self._pictures = {name: self._picture(name) for name in views.PICTURES}
-        self._curves = {
-            "source_histogram": _curve("Histogram of the source", "code", "share of the pixels"),
-            "raw_histogram": _curve("Histogram of the raw frames", "DN", "share of the sites", y_axis_type="log"),
-            "highlight": _curve("Highlight function (Figure 4)", "intensity i of grey light", "f(i)"),
-            "transfer": _curve("Photon transfer", "signal above black, DN", "variance of the noise, DN²"),
-        }
-        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in self._curves}
+        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in CURVES}
+        self._curves = {name: self._curve(name) for name in CURVES}
         self._points = ColumnDataSource({"x": [], "y": []})
-        self._draw_curves()
+        self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=COLOURS["clean"])
         self._command = TextInput(name="command", value="", sizing_mode="stretch_width", title="Command of this pair")
         self._stretch = Select(name="stretch", title="raw and developed", options=list(STRETCHES), value=STRETCHES[0])
         self._open = Select(name="open", title="photograph or row", options=list(choices), value=label)
@@ -100,18 +106,9 @@ class Page:
     # -------------------------------------------------------------------------------------------------------- figures
 
     def _picture(self, name: str) -> Any:
-        drawn = figure(
-            name=name,
-            width=300,
-            height=200,
-            sizing_mode="scale_width",
-            x_range=self._x,
-            y_range=self._y,
-            min_border=0,
-            outline_line_color=None,
-            toolbar_location=None,
-            tools=[PanTool(), ResetTool()],
-        )
+        size = {"width": 300, "height": 200, "sizing_mode": "scale_width", "min_border": 0}
+        ranges = {"x_range": self._x, "y_range": self._y, "outline_line_color": None}
+        drawn = figure(name=name, toolbar_location=None, tools=[PanTool(), ResetTool()], **size, **ranges)
         drawn.axis.visible = drawn.grid.visible = False
         wheel = WheelZoomTool()
         drawn.add_tools(wheel)
@@ -119,32 +116,40 @@ class Page:
         place = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
         renderer = drawn.image_rgba(image=name, source=self._pixels, **place)
         tips = [
-            ("site", "column $x{0}, row $y{0}"),
+            ("site", "column $x{%d}, row $y{%d}"),
             ("source", "@r, @g, @b"),
             ("clean", "@clean_dn{0.[0]} DN"),
             ("noisy", "@noisy_dn{0.[0]} DN"),
             ("values", "@note"),
         ]
-        drawn.add_tools(HoverTool(renderers=[renderer], tooltips=tips, point_policy="follow_mouse"))
+        whole = {"$x": "printf", "$y": "printf"}  # other formats round, to the next site
+        drawn.add_tools(HoverTool(renderers=[renderer], tooltips=tips, point_policy="follow_mouse", formatters=whole))
         return drawn
 
-    def _draw_curves(self) -> None:
-        for name, curve in self._curves.items():
-            curve.multi_line("xs", "ys", source=self._lines[name], color="colour", line_width=1.5, legend_field="label")
-            place = "top_right" if "histogram" in name else "top_left"
-            curve.legend.update(location=place, background_fill_alpha=0.6, label_text_font_size="9pt", padding=3)
-            curve.legend.update(spacing=0, margin=3)
-        self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=COLOURS["clean"])
+    def _curve(self, name: str) -> Any:
+        title, x, y = CURVES[name]
+        is_histogram = "histogram" in name
+        size = {"width": 420, "height": 260, "sizing_mode": "stretch_width", "tools": "pan,wheel_zoom,box_zoom,reset"}
+        drawn = figure(name=name, title=title, y_axis_type="log" if name == "raw_histogram" else "linear", **size)
+        drawn.xaxis.axis_label, drawn.yaxis.axis_label = x, y
+        drawn.toolbar.logo, drawn.toolbar.autohide = None, True
+        drawn.multi_line("xs", "ys", source=self._lines[name], color="colour", line_width=1.5, legend_field="label")
+        drawn.legend.update(location="top_right" if is_histogram else "top_left", background_fill_alpha=0.6)
+        drawn.legend.update(label_text_font_size="9pt", padding=3, spacing=0, margin=3)
+        return drawn
 
     # ---------------------------------------------------------------------------------------------------------- state
 
     def refresh(self) -> bool:
         """Compute the pair and draw everything; show the sentence of an error, and return whether there is none."""
         try:
-            shown = self._state.shown()
+            self._draw(self._state.shown())
         except UnprocessGenError as error:
-            self._say(str(error), is_error=True)
+            self._say(str(error))
             return False
+        return True
+
+    def _draw(self, shown: Shown) -> None:
         is_new = self._shown is None or shown.clean.shape != self._shown.clean.shape
         self._shown = shown
         if is_new:
@@ -153,12 +158,10 @@ class Page:
                 drawn.aspect_ratio = width / height
             self._go(views.whole(shown.clean.shape))
         self._draw_view()
-        self._draw_statistics()
+        self._draw_statistics(shown)
         self._command.value = self._state.command
-        found = str(shown.row["clean_xxh3"]), str(shown.row["noisy_xxh3"])
-        differs = self._state.digests not in (None, found)
-        self._say("the pair differs from its row: its source or the settings have changed" if differs else "", differs)
-        return True
+        differs = self._state.digests not in (None, (str(shown.row["clean_xxh3"]), str(shown.row["noisy_xxh3"])))
+        self._say("the pair differs from its row: its source or the settings have changed" if differs else "")
 
     def _window(self) -> tuple[slice, slice]:
         """The sites in view, from even rows and columns."""
@@ -184,9 +187,7 @@ class Page:
             "note": ["of this site" if side == 1 else f"means of {side} × {side} sites; zoom in for single sites"],
         }
 
-    def _draw_statistics(self) -> None:
-        shown = self._shown
-        assert shown is not None
+    def _draw_statistics(self, shown: Shown) -> None:
         transfer = views.photon_transfer(shown)
         curves = {
             "source_histogram": views.source_histogram(shown),
@@ -204,8 +205,8 @@ class Page:
         self._facts.text = _facts(shown, transfer.text)
         self._plan.text = f"<pre>{_text(chr(10).join(shown.lines))}</pre>"
 
-    def _say(self, sentence: str, is_error: bool) -> None:
-        self._message.text = f"<div role='alert'>{_text(sentence)}</div>" if is_error else ""
+    def _say(self, sentence: str) -> None:
+        self._message.text = f"<div role='alert'>{_text(sentence)}</div>" if sentence else ""
 
     # -------------------------------------------------------------------------------------------------------- controls
 
@@ -268,11 +269,7 @@ class Page:
             save.on_click(partial(self._save, form))
             found.append(save)
         self._file.js_on_change("data", CustomJS(args={"file": self._file}, code=SAVE))
-        moves = {
-            "+": (2, 0, 0), "−": (0.5, 0, 0), "←": (1, -0.5, 0), "→": (1, 0.5, 0),
-            "↑": (1, 0, -0.5), "↓": (1, 0, 0.5), "all": (0, 0, 0),
-        }  # fmt: skip
-        for number, (label, move) in enumerate(moves.items()):
+        for number, (label, move) in enumerate(MOVES.items()):
             button = Button(label=label, name=f"move_{number}", width=48)
             button.on_click(lambda move=move: self._move(*move))
             found.append(button)
@@ -312,7 +309,7 @@ class Page:
         try:
             self._state = self._choices[new]()
         except UnprocessGenError as error:
-            self._say(str(error), is_error=True)
+            self._say(str(error))
             return
         self._shown = None
         self._later(self._update, "pair")
@@ -328,20 +325,21 @@ class Page:
             self._later(self._update, "pair")
 
     def _sync(self) -> None:
-        """Set the controls to the values of the pair."""
-        assert self._shown is not None
+        """Set the controls to the values of the pair, in one message to the browser."""
+        shown, document, choices = self._shown, self._document, self._state.composition.choices
+        assert shown is not None and document is not None
         self._syncing = True
-        with _held(self._document):
-            choices, shown = self._state.composition.choices, self._shown
-            for name, control in self._widgets.items():
-                value = shown_value(name, self._state.settings, choices, shown.config, shown.plan)
-                if isinstance(control, Select) and value not in control.options:
-                    control.options = [*control.options, value]
-                if isinstance(value, float) and not control.start <= value <= control.end:
-                    control.update(start=min(value, control.start), end=max(value, control.end))
-                control.value = value
-                control.disabled = name.startswith("camera.weights.") and shown.config.camera.law != "convex"
-            self._part.update(options=list(shown.keys), value=str(shown.row["key"]), disabled=len(shown.keys) == 1)
+        document.hold("combine")
+        for name, control in self._widgets.items():
+            value = shown_value(name, self._state.settings, choices, shown.config, shown.plan)
+            if isinstance(control, Select) and value not in control.options:
+                control.options = [*control.options, value]
+            if isinstance(value, float) and not control.start <= value <= control.end:
+                control.update(start=min(value, control.start), end=max(value, control.end))
+            control.value = value
+            control.disabled = name.startswith("camera.weights.") and shown.config.camera.law != "convex"
+        self._part.update(options=list(shown.keys), value=str(shown.row["key"]), disabled=len(shown.keys) == 1)
+        document.unhold()
         self._syncing = False
 
     def _save(self, form: str) -> None:
@@ -350,21 +348,19 @@ class Page:
         try:
             content = self._shown.archive(form)
         except UnprocessGenError as error:
-            self._say(str(error), is_error=True)
+            self._say(str(error))
             return
         name = f"{self._shown.row['key']}.{form}.zip"
         self._file.data = {"name": [name], "content": [base64.b64encode(content).decode()]}
 
     def html(self) -> str:
         """Return a page of the state, without controls; the error of the settings is raised."""
-        self._shown = None
-        if not self.refresh():
-            self._state.shown()
+        shown = self._state.shown()
+        self._draw(shown)
         command = Div(name="command", text=f"<pre class='command'>{_text(self._state.command)}</pre>")
         command.update(sizing_mode="stretch_width", stylesheets=[TEXTS])
         models = [self._facts, self._plan, command, *self._pictures.values(), *self._curves.values()]
-        title = f"{self._shown.row['source']} as raw frames" if self._shown else ""
-        variables = _variables(live=False)
+        title, variables = f"{shown.row['source']} as raw frames", _variables(live=False)
         return str(file_html(models, INLINE, title=title, template=_template(), template_variables=variables))
 
 
@@ -379,52 +375,26 @@ if (file.data.name.length) {
 """
 
 
-@contextmanager
-def _held(document: Document | None) -> Iterator[None]:
-    """Send all changes of models in one message."""
-    if document is not None:
-        document.hold("combine")
-    yield
-    if document is not None:
-        document.unhold()
-
-
 def _text(text: str) -> str:
     return html.escape(str(visible(text)))
 
 
-def _curve(title: str, x: str, y: str, **options: Any) -> Any:
-    drawn = figure(
-        title=title,
-        width=420,
-        height=260,
-        sizing_mode="stretch_width",
-        tools="pan,wheel_zoom,box_zoom,reset",
-        **options,
-    )
-    drawn.xaxis.axis_label, drawn.yaxis.axis_label = x, y
-    drawn.toolbar.logo, drawn.toolbar.autohide = None, True
-    drawn.name = title
-    return drawn
+SHARES = {
+    "saturated in the clean frame": "saturated",
+    "clean below black": "clean_clipped_low",
+    "clean above white": "clean_clipped_high",
+    "noisy clipped at 0": "noisy_clipped_low",
+    "noisy clipped at the top": "noisy_clipped_high",
+}
+"""Columns that count sites, by what the page calls them."""
 
 
 def _facts(shown: Shown, transfer: str) -> str:
     """Numbers of the pair as an HTML list."""
-    row, sites = shown.row, shown.clean.size
-    shares = {
-        name: f"{int(row[column] or 0) / sites:.3%}"
-        for name, column in {
-            "saturated in the clean frame": "saturated",
-            "clean below black": "clean_clipped_low",
-            "clean above white": "clean_clipped_high",
-            "noisy clipped at 0": "noisy_clipped_low",
-            "noisy clipped at the top": "noisy_clipped_high",
-        }.items()
-    }
-    camera = shown.plan.camera
+    row, sites, camera = shown.row, shown.clean.size, shown.plan.camera
     facts = {
         "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
-        **shares,
+        **{name: f"{int(row[column] or 0) / sites:.3%}" for name, column in SHARES.items()},
         "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
         "noise of the pair": transfer,
         "effects": ", ".join(shown.plan.noise.effects),
@@ -445,11 +415,6 @@ def _variables(live: bool) -> dict[str, Any]:
         "style": (TEMPLATES / "style.css").read_text(encoding="utf-8"),
         "sections": {section: names_of(section) for section in SECTIONS},
         "pictures": views.PICTURES,
-        "curves": [
-            "Histogram of the source",
-            "Histogram of the raw frames",
-            "Highlight function (Figure 4)",
-            "Photon transfer",
-        ],
-        "moves": [f"move_{number}" for number in range(7)],
+        "curves": CURVES,
+        "moves": [f"move_{number}" for number in range(len(MOVES))],
     }
