@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from helpers.commands import RunMain
 
+import unprocess_gen as ug
 from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.types import Photograph, RawParts
@@ -21,7 +23,9 @@ BLACK = {"R": 500, "G": 509, "B": 523}
 WHITE = 16383
 
 
-def dng(pixels: np.ndarray, pattern: str = "RGGB", photometric: int = 32803, **tags: tuple[Any, ...]) -> bytes:
+def dng(
+    pixels: np.ndarray, pattern: str = "RGGB", photometric: int = 32803, compression: int = 1, **tags: tuple[Any, ...]
+) -> bytes:
     """Return a DNG of a mosaic with masked borders: 3 rows above and 5 columns left of the active area."""
     height, width = pixels.shape[:2]
     extra: list[tuple[Any, ...]] = [
@@ -41,7 +45,7 @@ def dng(pixels: np.ndarray, pattern: str = "RGGB", photometric: int = 32803, **t
     extra += tags.values()
     file = io.BytesIO()
     tifffile.imwrite(
-        file, pixels, photometric=photometric, metadata=None, subfiletype=0, byteorder="<",
+        file, pixels, photometric=photometric, metadata=None, subfiletype=0, byteorder="<", compression=compression,
         extratags=sorted((*tag, True) for tag in extra),
     )  # fmt: skip
     return file.getvalue()
@@ -140,6 +144,38 @@ def test_stated_noise_is_averaged_over_the_planes() -> None:
     _, given = read(framed()[1], raw=RawConfig(a_dn=0.5, b_dn2=9.0))
     span = WHITE - BLACK["G"]
     assert given.noise == pytest.approx((0.5 / span, 9 / span**2))
+
+
+@pytest.mark.parametrize("third", [False, True])
+def test_camera_of_a_file_is_used_unedited(third: bool, run_main: RunMain, tmp_path: Path) -> None:
+    tags = {"third": (52531, 10, 9, rationals(*range(1, 10)))} if third else {}
+    (tmp_path / "frame.dng").write_bytes(dng(np.full((43, 53), 900, np.uint16), "GBRG", **tags))
+    for group in ("camera", "sensor"):
+        (tmp_path / "mine" / group).mkdir(parents=True)
+    own = "--to", "mine/camera/phone.yaml", "--sensor", "mine/sensor/phone.yaml"
+    done = run_main("camera", "frame.dng", *own)
+    assert (done.code, "ColorMatrix3, for a third light, is not used" in done.out) == (0, third), done
+    assert "use it with --config-dir mine camera=phone sensor=phone" in done.out
+    config = ug.load_config(["camera=phone", "sensor=phone"], config_dir=tmp_path / "mine")
+    cold = (0.7662, -0.2686, -0.0660, -0.5240, 1.2965, 0.2530, -0.0796, 0.1508, 0.6167)  # white is above 6500 K
+    assert config.camera.xyz2cam == pytest.approx(cold, abs=1e-4)
+    sensor = config.sensor
+    assert (sensor.bits, sensor.black_level_dn, sensor.white_level_dn, sensor.pattern) == (14, 510, WHITE, "GBRG")
+    pair = ug.make_pair(np.full((8, 8, 3), 90, np.uint8), config)
+    assert (pair.row["camera"], pair.row["white_level_dn"]) == ("phone", WHITE)
+
+
+def test_lossy_files_are_named_in_a_warning(run_main: RunMain, tmp_path: Path) -> None:
+    pytest.importorskip("imagecodecs")
+    visible, _ = framed()
+    (tmp_path / "frames").mkdir()
+    stored = np.pad(visible, ((3, 0), (5, 0)))
+    (tmp_path / "frames" / "a.dng").write_bytes(dng(stored, compression=52546))
+    done = run_main("source.kind=raw", "source.root=frames", "noise=none", "n_jobs=1", "out=ds")
+    assert (done.code, "a.dng is compressed with JPEG XL, which removes noise and detail" in done.err) == (0, True), (
+        done
+    )
+    assert np.abs(ug.RawPairs(tmp_path / "ds")[0].clean.astype(int) - visible).mean() < 20
 
 
 REFUSED = {

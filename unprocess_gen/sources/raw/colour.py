@@ -65,6 +65,8 @@ class DngColour:
         AsShotNeutral.
     white_xy : XY or None
         AsShotWhiteXY.
+    has_third : bool
+        Whether there is a ColorMatrix3 (DNG 1.6), which is not used.
     """
 
     matrices: tuple[Matrix, ...]
@@ -73,6 +75,7 @@ class DngColour:
     balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     neutral: Neutral | None = None
     white_xy: XY | None = None
+    has_third: bool = False
 
     def matrix_at(self, white: XY) -> Matrix:
         """Return the matrix from XYZ to the camera at a white point; the first one if only one light is known."""

@@ -182,6 +182,7 @@ def _colour(tags: Mapping[int, tuple[float, ...]]) -> DngColour:
         (red, green, blue),
         None if neutral is None else (neutral[0], neutral[1], neutral[2]),
         None if white is None else (white[0], white[1]),
+        52531 in tags,
     )
 
 

@@ -118,7 +118,8 @@ def _matrix_source(tags: RawMetadata) -> str:
     x, y = white = tags.colour.white()
     stated = "AsShotWhiteXY" if tags.colour.white_xy else "AsShotNeutral" if tags.colour.neutral else "no tag, so D50"
     where = f"the white point x {x:.4f}, y {y:.4f} ({temperature(white):.0f} K; {stated})"
-    return f"{', '.join([*named, *others])} at {where}"
+    third = "; ColorMatrix3, for a third light, is not used" if tags.colour.has_third else ""
+    return f"{', '.join([*named, *others])} at {where}{third}"
 
 
 def _gains_source(tags: RawMetadata, gains: tuple[float, float] | None) -> str:
