@@ -16,7 +16,7 @@ from unprocess_gen.config.option_files import option_summary
 from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.planning.draws import COUNT
+from unprocess_gen.planning.draws import DRAW_COUNT
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.simulation.effects import Physics
 
@@ -65,7 +65,7 @@ def profile_at(noise: NoiseConfig, iso: float) -> Physics | None:
     assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
     sensor = SensorConfig(noise.bits, noise.black_level_dn, noise.white_level_dn)
     config = Config(noise=replace(noise, iso=iso), sensor=sensor)
-    return PhysicalNoise(config).draw([0.5] * COUNT, 0, 0)
+    return PhysicalNoise(config).draw([0.5] * DRAW_COUNT, 0, 0)
 
 
 def by_colour(physics: Physics) -> tuple[float, ...]:

@@ -20,7 +20,7 @@ from PIL import Image
 
 import unprocess_gen as ug
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.dataset.columns import NAMES
+from unprocess_gen.dataset.columns import COLUMN_NAMES
 from unprocess_gen.dataset.manifest import plan_from_row, read_rows
 from unprocess_gen.simulation.pair import make_pair as make_inner_pair
 from unprocess_gen.sources.loader import downscaled
@@ -86,7 +86,7 @@ def test_pair_of_an_array_is_the_pair_of_its_plan(config: ug.Config) -> None:
 
 def test_row_is_a_manifest_row_of_the_pair(config: ug.Config) -> None:
     pair = ug.make_pair(SRGB, config)
-    assert list(pair.row) == list(NAMES)
+    assert list(pair.row) == list(COLUMN_NAMES)
     assert pair.row is pair.row
     assert plan_from_row(pair.row) == pair.plan
     assert (pair.row["clean_xxh3"], pair.row["noisy_xxh3"]) == (array_xxh3(pair.clean), array_xxh3(pair.noisy))

@@ -45,7 +45,7 @@ DECODE_GOAL = 1.2
 def write_scenes(folder: Path, count: int = 16) -> None:
     """Write JPEG files of 2048 x 2304 pixels, each of twelve built-in scenes."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = [name for name in synthetic.NAMES if name not in synthetic.SIZES][:count]
+    names = [name for name in synthetic.SCENES if name not in synthetic.SCENE_SIZES][:count]
     scenes = [synthetic.scene(name) for name in names]
     for number in range(count):
         parts = [scenes[(number + n) % len(scenes)] for n in range(12)]

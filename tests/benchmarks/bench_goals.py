@@ -230,7 +230,7 @@ def table(images: Sequence[Bench], rounds: int, least_ns: int = LEAST_NS) -> str
 
 def synthetic_frame() -> Srgb:
     """A frame of 1024 x 2304 pixels: six synthetic scenes of all kinds."""
-    names = [name for name in synthetic.NAMES if name not in synthetic.SIZES][:6]
+    names = [name for name in synthetic.SCENES if name not in synthetic.SCENE_SIZES][:6]
     scenes = [synthetic.scene(name) for name in names]
     return np.concatenate([np.concatenate(scenes[first : first + 3], axis=1) for first in (0, 3)])
 

@@ -16,7 +16,7 @@ from helpers.datasets import Make, TreeHash, sweep_rows
 from helpers.photographs import fill
 from helpers.processes import WAIT_S
 
-from unprocess_gen.cli.sweep import SHARES, folder_name, named_overrides
+from unprocess_gen.cli.sweep import SHARES, job_folder, named_overrides
 
 PATHS = os.pathsep.join(filter(None, sys.path))
 
@@ -278,8 +278,8 @@ def test_names_omit_keys_that_do_not_decide_data() -> None:
 
 
 def test_names_encode_slashes_and_percent_signs() -> None:
-    assert folder_name(["a=b/c%"]) == "a=b%2Fc%25"
-    assert folder_name([]) == "default"
+    assert job_folder(["a=b/c%"]) == "a=b%2Fc%25"
+    assert job_folder([]) == "default"
 
 
 def test_shortened_name_begins_with_the_swept_keys(run_main: RunMain, source: Path, tmp_path: Path) -> None:

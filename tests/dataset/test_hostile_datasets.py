@@ -17,7 +17,7 @@ from helpers.datasets import Make
 from helpers.photographs import fill
 
 from unprocess_gen import DamageError, RawPairs
-from unprocess_gen.dataset.columns import HEADERS, NAMES
+from unprocess_gen.dataset.columns import COLUMN_NAMES, HEADERS
 from unprocess_gen.dataset.dataset_json import check_dataset_json
 from unprocess_gen.dataset.manifest import (
     MAX_DETAIL,
@@ -276,7 +276,7 @@ def test_dataset_of_0_1_is_read_verified_and_replayed(copy: Path, original: Path
 def test_committed_rows_of_0_1_are_completed(original: Path) -> None:
     (row, *_) = read_rows(original / "manifest.csv")
     assert row_of_values([row[name] for name in HEADERS[0]]) == row
-    assert row_of_values([row[name] for name in NAMES]) == row
+    assert row_of_values([row[name] for name in COLUMN_NAMES]) == row
     with pytest.raises(ValueError, match="a row of 3 values"):
         row_of_values([1, 2, 3])
 

@@ -37,7 +37,7 @@ from unprocess_gen.core.types import (
     SourcePlan,
 )
 from unprocess_gen.dataset import columns
-from unprocess_gen.dataset.columns import COLUMNS, FIRST, NAMES, NO_FRAMES, NO_VIDEO, Range
+from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS, FIRST, NO_FRAMES, NO_VIDEO, Range
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
     JSON_BYTES,
@@ -178,8 +178,8 @@ names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_
 
 
 def test_columns_have_the_order_of_the_contract() -> None:
-    assert [name for name in NAMES if name in CONTRACT] == CONTRACT
-    assert len(set(NAMES)) == len(NAMES)
+    assert [name for name in COLUMN_NAMES if name in CONTRACT] == CONTRACT
+    assert len(set(COLUMN_NAMES)) == len(COLUMN_NAMES)
 
 
 (UNMEASURED,) = (column.empty_if for column in COLUMNS if column.name == "source_noise_dn")
@@ -241,7 +241,7 @@ def test_every_value_of_a_row_has_its_columns_type() -> None:
     assert plan_from_row(row_of(RAW)) == RAW
     for plan in (PLAN, PHYSICAL):
         row = row_of(plan)
-        assert list(row) == list(NAMES)
+        assert list(row) == list(COLUMN_NAMES)
         assert_typed(row)
 
 
@@ -296,9 +296,9 @@ def test_drawn_plans_survive_csv(settings: Callable[..., Any], noise: str, tmp_p
         assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
 
 
-PHYSICAL_NAMES = NAMES[NAMES.index("iso") : NAMES.index("level")]
+PHYSICAL_NAMES = COLUMN_NAMES[COLUMN_NAMES.index("iso") : COLUMN_NAMES.index("level")]
 NUMBERED = ("level", "draw", "frame", "downscale", "dequantize")
-NEEDED = [name for name in NAMES if name in {*CONTRACT[9:39], "sensor_clip", "accuracy"}]
+NEEDED = [name for name in COLUMN_NAMES if name in {*CONTRACT[9:39], "sensor_clip", "accuracy"}]
 NEEDED_PHYSICAL = ["scene", "exposure_ratio", "saturated_as", "noise_law", *PHYSICAL_NAMES, *NUMBERED]
 
 
@@ -361,16 +361,16 @@ def test_unknown_columns_are_left_out(tmp_path: Path) -> None:
     lines = csv_text([row_of()]).splitlines()
     (tmp_path / "m.csv").write_text(f"{lines[0]},later\n{lines[1]},9\n", encoding="utf-8")
     (row,) = read_rows(tmp_path / "m.csv")
-    assert list(row) == list(NAMES)
+    assert list(row) == list(COLUMN_NAMES)
 
 
-HEADER = ",".join(NAMES)
+HEADER = ",".join(COLUMN_NAMES)
 BROKEN = [
     ("", "not a manifest, column key is missing"),
     ("key,source\n", "not a manifest, column source_sha256 is missing"),
     (HEADER.replace("saturated", "satiated") + "\n", "not a manifest, column saturated is missing"),
     (HEADER + "\n00000000,x\n", "not a readable manifest"),
-    (HEADER + "\n" + "x," * len(NAMES) + "x\n", "not a readable manifest"),
+    (HEADER + "\n" + "x," * len(COLUMN_NAMES) + "x\n", "not a readable manifest"),
     (csv_text([row_of()]).replace(",1234,", ",many,"), "not a readable manifest"),
     (csv_text([row_of()]).replace(",2.2,", ',2.2"x",').replace('"a, b.png"', '"a"b'), "not a readable manifest"),
     (csv_text([row_of()])[:-60], "not a readable manifest"),

@@ -18,7 +18,7 @@ from pyarrow import parquet as reader
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset import parquet
-from unprocess_gen.dataset.columns import COLUMNS, NAMES
+from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import verify
 
@@ -57,7 +57,7 @@ def test_parquet_has_the_rows_of_the_manifest(original: Path) -> None:
 
 def test_columns_have_the_types_of_the_table(original: Path) -> None:
     schema = reader.read_schema(original / "manifest.parquet")
-    assert tuple(schema.names) == NAMES
+    assert tuple(schema.names) == COLUMN_NAMES
     types = {int: pyarrow.int64(), float: pyarrow.float64()}
     assert schema.types == [types.get(column.type, pyarrow.string()) for column in COLUMNS]
 

@@ -176,7 +176,7 @@ def doubles() -> str:
         scene, noise, readout = render._records((plan,), shape, 256, origin)
         scratch = allocate_scratch(np.float32 if uses_scene32(plan) else np.float64)
         clean, noisy = np.empty(codes[..., 0].size, clean_dtype), np.empty((1, codes[..., 0].size), dtype)
-        counts = np.zeros((1, render.COUNTS), dtype=np.int64)
+        counts = np.zeros((1, render.COUNT_FIELDS), dtype=np.int64)
         render._render(codes, scene, noise, philox_keys([plan]), origin, readout, scratch, clean, noisy, counts)
         found += [clean, noisy, counts, scratch]
         if isinstance(noise, Electrons):

@@ -23,7 +23,7 @@ from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects import Physics
 from unprocess_gen.simulation.effects.dead_pixels import DeadPixels
-from unprocess_gen.simulation.effects.effect import Part
+from unprocess_gen.simulation.effects.effect import Crop
 from unprocess_gen.simulation.effects.hot_pixels import HotPixels
 from unprocess_gen.simulation.effects.prnu import Prnu
 from unprocess_gen.simulation.pair import make_pair, reference_pair
@@ -134,9 +134,9 @@ def poisson_reach(rate: float) -> float:
     return log / 3 + math.sqrt(log**2 / 9 + 2 * log * rate) + 1
 
 
-def body_part(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> Part:
+def body_part(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> Crop:
     """Return a part of a frame of a body."""
-    return Part(plan_with(), physics, shape, origin)
+    return Crop(plan_with(), physics, shape, origin)
 
 
 def hot_pixel_means(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:

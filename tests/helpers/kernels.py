@@ -25,17 +25,17 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts,
     fill_counts_of_one_rate,
 )
-from unprocess_gen.simulation.kernels.readout import Normalised, _normalise
+from unprocess_gen.simulation.kernels.readout import Unrounded, _normalise
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, pointer_to, pointers_of, store
 from unprocess_gen.simulation.kernels.strips import (
     SIZE,
     STRIP,
+    Buffers,
     Float32,
     Scratch,
-    Workspace,
+    buffers_in,
     locate,
     scratch_of_thread,
-    workspace_in,
 )
 
 _WIDTH = np.uint64(VECTOR_WIDTH)
@@ -115,16 +115,16 @@ def normalised_values(values_dn: Float, black_dn: float, span_dn: float, limits_
     """Return DN as the read-out of float32 frames clips and normalises them."""
     out, padded = np.empty(values_dn.size, dtype=np.float32), np.resize(values_dn, -(-values_dn.size // STRIP) * STRIP)
     limits, planes = np.array([[*limits_dn, np.inf, np.inf]]), np.zeros(4, dtype=np.int64)
-    readout = Normalised(limits, np.zeros((1, 2)), False, black_dn, span_dn, 1.0, False, planes)
+    readout = Unrounded(limits, np.zeros((1, 2)), False, black_dn, span_dn, 1.0, False, planes)
     _fill_normalised(padded, readout, limits_dn, scratch_of_thread(), out)
     return out
 
 
 @kernel
 def _fill_normalised(
-    values_dn: Float, readout: Normalised, limits_dn: tuple[float, float], scratch: Scratch, out: Float32
+    values_dn: Float, readout: Unrounded, limits_dn: tuple[float, float], scratch: Scratch, out: Float32
 ) -> None:
-    buffers, of, values = workspace_in(scratch), pointers_of(readout), pointer_to(values_dn, 0)
+    buffers, of, values = buffers_in(scratch), pointers_of(readout), pointer_to(values_dn, 0)
     strip = locate((0, 0), 0, 0, STRIP)
     for start in range(0, out.size, STRIP):
         _normalise(of, pointer_to(values, start), limits_dn[0], limits_dn[1], strip, buffers.normalised)
@@ -181,7 +181,7 @@ def _fill_exact_counts(words: Words, rates: Float, tables: CountTables, out: Flo
 
 
 @inner
-def _load_words(words: Words, start: int, length: int, buffers: Workspace) -> None:
+def _load_words(words: Words, start: int, length: int, buffers: Buffers) -> None:
     """Load ``length`` words from index ``start``, and repeat the last one to fill complete blocks."""
     for n in range(SIZE):
         buffers.words[n] = words[start + min(n, length - 1)]
@@ -191,7 +191,7 @@ def _load_words(words: Words, start: int, length: int, buffers: Workspace) -> No
 def _fill_approximate(
     words: Words, rates: Float32, tables: CountTables, scratch: Scratch, out: Float32, error: Float32
 ) -> None:
-    buffers, of = workspace_in(scratch), pointers_of(tables)
+    buffers, of = buffers_in(scratch), pointers_of(tables)
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         _load_words(words, start, length, buffers)
@@ -204,7 +204,7 @@ def _fill_approximate(
 
 @kernel
 def _fill_of_one_rate(words: Words, smallest: int, ranks: np.ndarray, scratch: Scratch, out: Float32) -> None:
-    buffers, of = workspace_in(scratch), pointer_to(ranks, 0)
+    buffers, of = buffers_in(scratch), pointer_to(ranks, 0)
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         _load_words(words, start, length, buffers)

@@ -16,7 +16,7 @@ from helpers.photographs import fill
 import unprocess_gen as ug
 from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.planning.mixture import WORDS, drawn_entry, image_config
+from unprocess_gen.planning.mixture import WORD_COUNT, drawn_entry, image_config
 
 FIRST, SECOND = (
     "{weight: 3, camera: sony_a7r, noise: imx385_iso3200}",
@@ -55,9 +55,9 @@ def test_words_are_divided_exactly(weights: tuple[int, ...]) -> None:
     end = 0
     for number, weight in enumerate(weights):
         start, end = end, end + weight
-        first, last = (-((-place * WORDS) // sum(weights)) for place in (start, end))
+        first, last = (-((-place * WORD_COUNT) // sum(weights)) for place in (start, end))
         assert drawn_entry(weights, first) == drawn_entry(weights, last - 1) == number
-        assert abs(Fraction(last - first, WORDS) - Fraction(weight, sum(weights))) <= Fraction(1, WORDS)
+        assert abs(Fraction(last - first, WORD_COUNT) - Fraction(weight, sum(weights))) <= Fraction(1, WORD_COUNT)
 
 
 def test_pairs_of_an_image_share_the_entry_that_its_row_names(mixed: Path) -> None:

@@ -193,7 +193,7 @@ def test_part_ended_at_its_walltime_counts_no_death(
     """Batch systems send SIGTERM at the end of the walltime."""
     half_made.terminate()
     assert half_made.wait(WAIT_S) == 143
-    assert list((tmp_path / "ds" / run_records.DEATHS).iterdir()) == []
+    assert list((tmp_path / "ds" / run_records.DEATHS_FOLDER).iterdir()) == []
     assert run_main("part", "ds", 0, "-q").code == 0
     assert run_main("merge", "ds").code == 0
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -388,8 +388,8 @@ def test_photograph_that_kills_its_part_gets_provisional_rows(
     killer = shutil.copy(photographs / "004.png", tmp_path / "killer.png")
     assert run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
     env = imported_first(tmp_path, POISON) | {"KILLER": str(killer)}
-    codes = [cli("part", "ds", 0, **env).returncode for _ in range(run_records.LIMIT)]
-    assert codes == [-signal.SIGKILL] * run_records.LIMIT
+    codes = [cli("part", "ds", 0, **env).returncode for _ in range(run_records.MAX_DEATHS)]
+    assert codes == [-signal.SIGKILL] * run_records.MAX_DEATHS
     done = cli("part", "ds", 0, **env)
     assert done.returncode == 0, done.stderr
     assert (

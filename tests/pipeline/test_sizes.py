@@ -72,7 +72,7 @@ def test_long_listing_is_estimated_from_a_bounded_sample(
     read_bytes = sizes.read_bytes
     monkeypatch.setattr(sizes, "read_bytes", lambda *given: (read.append(given), read_bytes(*given))[1])
     estimated = estimate(settings, source)
-    assert len(read) == sizes.SAMPLE
+    assert len(read) == sizes.HEADERS_READ
     assert estimated.total == pytest.approx(make(source, tmp_path / "ds").bytes, rel=0.05)
 
 

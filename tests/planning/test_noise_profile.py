@@ -23,8 +23,8 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.random_streams import parameter_uniforms
-from unprocess_gen.planning.draws import COUNT, Draw
-from unprocess_gen.planning.noise_profile import PhysicalNoise, number
+from unprocess_gen.planning.draws import DRAW_COUNT, Draw
+from unprocess_gen.planning.noise_profile import PhysicalNoise, evaluate
 from unprocess_gen.simulation.effects import NUMBERS, Physics
 
 COUNTERS = {draw.name.lower(): int(draw) for draw in Draw}
@@ -77,16 +77,16 @@ def tukey_std(shape: float) -> Any:
 @given(iso=st.floats(1, 1e6), slope=st.floats(1e-6, 10), intercept=st.floats(0, 10))
 def test_per_iso_is_linear_in_iso(iso: float, slope: float, intercept: float) -> None:
     with mpmath.workdps(40):
-        assert close(number(["per_iso", slope], iso=iso), mpmath.mpf(slope) * iso)
+        assert close(evaluate(["per_iso", slope], iso=iso), mpmath.mpf(slope) * iso)
         expected = mpmath.mpf(slope) * iso + intercept
-        assert close(number(["per_iso", slope, intercept], iso=iso), expected)
+        assert close(evaluate(["per_iso", slope, intercept], iso=iso), expected)
 
 
 @given(iso=st.floats(1, 1e6), numbers=st.lists(st.floats(1e-9, 1e3), min_size=1, max_size=3))
 def test_root_is_standard_deviation_of_a_polynomial_variance(iso: float, numbers: list[float]) -> None:
     with mpmath.workdps(40):
         variance = sum(mpmath.mpf(one) * mpmath.mpf(iso) ** power for power, one in enumerate(numbers))
-        assert close(number(["root", *numbers], iso=iso), mpmath.sqrt(variance))
+        assert close(evaluate(["root", *numbers], iso=iso), mpmath.sqrt(variance))
 
 
 uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) * 2.0**-52)
@@ -99,14 +99,14 @@ def test_line_is_linear_in_logarithms_with_normal_scatter(
     with mpmath.workdps(40):
         normal = mpmath.sqrt(2) * mpmath.erfinv(2 * mpmath.mpf(u) - 1)
         expected = mpmath.exp(slope * mpmath.log(gain) + intercept + std * normal)
-        assert close(number(["line", slope, intercept, std], iso=100, gain=gain, uniform=u), expected)
+        assert close(evaluate(["line", slope, intercept, std], iso=100, gain=gain, uniform=u), expected)
 
 
 @given(gain=st.floats(1e-4, 100), shape=st.floats(-0.4, 2).filter(lambda one: abs(one) > 1e-3))
 def test_scale_line_is_line_times_standard_deviation_at_scale_1(gain: float, shape: float) -> None:
     with mpmath.workdps(40):
         expected = mpmath.exp(mpmath.mpf(0.5) * mpmath.log(gain) + mpmath.mpf(0.25)) * tukey_std(shape)
-        assert close(number(["scale_line", 0.5, 0.25, 0], iso=100, gain=gain, shape=shape), expected)
+        assert close(evaluate(["scale_line", 0.5, 0.25, 0], iso=100, gain=gain, shape=shape), expected)
 
 
 def test_rows_of_black_errors_divide_the_range_of_ln_iso(settings: Settings) -> None:
@@ -125,7 +125,7 @@ ISOS = [(100.0, 1.0), (200.0, 1.5), (800.0, 4.0), (6400.0, 20.0)]
 
 @pytest.mark.parametrize(("iso", "value"), ISOS)
 def test_table_by_iso_gives_its_values(iso: float, value: float) -> None:
-    assert number(["by_iso", *itertools.chain(*ISOS)], iso=iso) == value
+    assert evaluate(["by_iso", *itertools.chain(*ISOS)], iso=iso) == value
 
 
 @given(iso=st.floats(200, 800))
@@ -133,7 +133,7 @@ def test_standard_deviation_between_two_isos_is_interpolated_in_logarithms(iso: 
     with mpmath.workdps(40):
         share = mpmath.log(mpmath.mpf(iso) / 200) / mpmath.log(4)
         expected = mpmath.mpf(1.5) * (mpmath.mpf(4) / 1.5) ** share
-        assert close(number(["by_iso", *itertools.chain(*ISOS)], iso=iso), expected)
+        assert close(evaluate(["by_iso", *itertools.chain(*ISOS)], iso=iso), expected)
 
 
 def test_shapes_between_two_isos_are_interpolated_linearly(settings: Settings) -> None:
@@ -216,7 +216,7 @@ def drawn_shapes(config: Config) -> Config:
 
 
 def own_uniforms(image: int) -> dict[str, float]:
-    return dict(zip(NAMES, parameter_uniforms(image, COUNT), strict=True))
+    return dict(zip(NAMES, parameter_uniforms(image, DRAW_COUNT), strict=True))
 
 
 def test_scatter_by_image_differs_between_images_of_one_body(settings: Settings) -> None:

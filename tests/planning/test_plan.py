@@ -25,7 +25,7 @@ from unprocess_gen.core import fixed_point
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Distribution, Facts, Plan
 from unprocess_gen.planning import noise_profile
-from unprocess_gen.planning.draws import COUNT, EFFECT_COUNTERS, Draw
+from unprocess_gen.planning.draws import DRAW_COUNT, EFFECT_COUNTERS, Draw
 from unprocess_gen.planning.plan import TwoNumberLevel, plan_camera, plan_image, plan_pairs
 from unprocess_gen.simulation.effects import NUMBERS
 from unprocess_gen.simulation.reference import colour
@@ -46,7 +46,7 @@ def plan_of(settings: Settings, *overrides: str, sha: str = SHA, occurrence: int
 
 def named(uniform: float = 0.5, **chosen: float) -> list[float]:
     by_counter = {Draw[name.upper()]: value for name, value in chosen.items()}
-    return [by_counter.get(counter, uniform) for counter in range(COUNT)]  # type: ignore[call-overload]
+    return [by_counter.get(counter, uniform) for counter in range(DRAW_COUNT)]  # type: ignore[call-overload]
 
 
 # Distributions --------------------------------------------------------------------------------------------------------
@@ -213,12 +213,12 @@ def test_counters_of_draws_never_change() -> None:
     assert {name: number.counter for name, number in NUMBERS.items() if number.counter >= 0} == {
         "read_shape": 14, "read_std_dn": 15, "row_std_dn": 16, "column_std_dn": 17, "column_temporal_std_dn": 19,
     }  # fmt: skip
-    assert sorted((*Draw, *EFFECT_COUNTERS)) == list(range(COUNT))
+    assert sorted((*Draw, *EFFECT_COUNTERS)) == list(range(DRAW_COUNT))
 
 
 def test_each_parameter_uses_the_uniform_of_its_name(settings: Settings) -> None:
     plan = plan_of(settings, "noise=brooks2019")
-    u = parameter_uniforms(plan.stream_key, COUNT)
+    u = parameter_uniforms(plan.stream_key, DRAW_COUNT)
     assert plan.camera.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u[Draw.RED])
     assert plan.camera.blue_gain == draw(Distribution("uniform", (1.5, 1.9)), u[Draw.BLUE])
     assert plan.camera.inverse_rgb_gain == draw(GAIN, u[Draw.INVERSE_RGB])

@@ -9,20 +9,20 @@ from helpers.commands import RunMain
 from helpers.datasets import Settings
 
 from unprocess_gen.planning.dark_scene import physical_profiles
-from unprocess_gen.planning.sensor_levels import LEVELS, fitting_sensor, sensor_warning
+from unprocess_gen.planning.sensor_levels import LEVEL_NAMES, fitting_sensor, sensor_warning
 
 
 @pytest.mark.parametrize("profile", physical_profiles())
 def test_advice_gives_the_levels_of_the_calibration(profile: str, settings: Settings) -> None:
     config = settings(f"noise={profile}")
-    calibrated = {key: getattr(config.noise, key) for key in LEVELS}
-    is_default = calibrated == {key: getattr(config.sensor, key) for key in LEVELS}
+    calibrated = {key: getattr(config.noise, key) for key in LEVEL_NAMES}
+    is_default = calibrated == {key: getattr(config.sensor, key) for key in LEVEL_NAMES}
     advice = fitting_sensor(calibrated, profile)
     advised = settings(f"noise={profile}", *advice)
 
     assert bool(sensor_warning(config)) != is_default
     assert is_default or f"; {' '.join(advice)} gives the calibrated levels" in sensor_warning(config)
-    assert {key: getattr(advised.sensor, key) for key in LEVELS} == calibrated
+    assert {key: getattr(advised.sensor, key) for key in LEVEL_NAMES} == calibrated
     assert sensor_warning(advised) == ""
 
 

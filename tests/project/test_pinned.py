@@ -12,7 +12,7 @@ from helpers.promise_report import Figure
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.dataset.columns import HEADERS, NAMES
+from unprocess_gen.dataset.columns import COLUMN_NAMES, HEADERS
 from unprocess_gen.dataset.manifest import read_columns, read_rows, write_rows
 from unprocess_gen.pipeline.generate import generate
 
@@ -38,7 +38,7 @@ def test_every_build_has_a_manifest_of_version_0_1() -> None:
 def test_pinned_manifest_without_new_columns_is_that_of_0_1(name: str) -> None:
     stream = io.StringIO(newline="")
     write_rows(stream, read_rows(PINNED / f"{name}.csv"), HEADERS[0])
-    assert read_columns(PINNED / f"{name}.csv") == NAMES
+    assert read_columns(PINNED / f"{name}.csv") == COLUMN_NAMES
     assert sha256(stream.getvalue().encode()) == MANIFEST_OF_0_1[name]
 
 

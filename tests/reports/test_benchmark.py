@@ -460,12 +460,12 @@ def test_accuracy_writes_four_files_and_reports_them(
     )
     written = tmp_path / "new/report"
     written.mkdir(parents=True)
-    for name in report.FILES:
+    for name in report.REPORT_FILES:
         (written / name).write_text("an earlier report")
     done = run_main("accuracy", f"source.root={fill(tmp_path / 'photos', 2)}", "out=new/report")
 
     assert done.code == 0
-    assert sorted(path.name for path in written.iterdir()) == sorted(report.FILES)
+    assert sorted(path.name for path in written.iterdir()) == sorted(report.REPORT_FILES)
     assert all(b"earlier" not in path.read_bytes() for path in written.iterdir())
     assert re.search(r"^tier_electrons +fast ", done.out, re.MULTILINE)
     assert re.search(r"^night .* fast ", done.out, re.MULTILINE)

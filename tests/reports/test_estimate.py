@@ -43,7 +43,7 @@ def test_headers_of_large_files_are_sampled(
     settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photos = fill(tmp_path / "p", 50)
-    monkeypatch.setattr("unprocess_gen.reports.estimate.HEADER_BYTES", 1)
+    monkeypatch.setattr("unprocess_gen.reports.estimate.BYTES_WITH_HEADERS", 1)
     estimate = estimate_run(settings(f"source.root={photos}"), 1, read_all=False)
     assert estimate.headers == 32
     assert estimate.bytes == pytest.approx(estimate_run(settings(f"source.root={photos}"), 1, True).bytes, rel=0.3)

@@ -38,7 +38,7 @@ from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.noise_check import checks
 from unprocess_gen.reports.noise_check.checks import (
     FALSE_ALARM,
-    LISTED,
+    PAIRS_LISTED,
     TESTS,
     Alarm,
     Checker,
@@ -110,7 +110,7 @@ def checked(
 ) -> list[Checked]:
     """Plan and scores of a pair for each fault; ``numbers``: physical numbers of the row."""
     draws = np.random.default_rng(number)
-    picture = synthetic.scene(synthetic.NAMES[number % len(synthetic.NAMES)])
+    picture = synthetic.scene(synthetic.SCENES[number % len(synthetic.SCENES)])
     height, width = (min(side, length) // 2 * 2 for length in picture.shape[:2])
     y, x = (int(draws.integers(0, n - m + 1)) // 2 * 2 for n, m in zip(picture.shape, (height, width), strict=False))
     srgb = KINDS[kind](np.ascontiguousarray(picture[y : y + height, x : x + width]))
@@ -322,7 +322,7 @@ def repetitions(pairs: Iterable[Sample], **numbers: int) -> list[Alarm]:
 
 def test_repeated_draws_and_noise_are_found(settings: Settings) -> None:
     """Draws of a scene are equal byte by byte; frames of different scenes have the same deviates."""
-    scenes = [np.ascontiguousarray(synthetic.scene(name)[:64, :64]) for name in synthetic.NAMES[:3]]
+    scenes = [np.ascontiguousarray(synthetic.scene(name)[:64, :64]) for name in synthetic.SCENES[:3]]
     pairs = [make_pair(srgb, settings()) for srgb in scenes]
     assert repetitions([(pairs[0].clean, pairs[0].noisy, pairs[0].row)] * 2) == []  # patches of a frame at one place
     assert repetitions([(pair.clean, pair.noisy, pair.row) for pair in pairs]) == []
@@ -380,11 +380,11 @@ def test_replaced_noise_of_intact_shards_ends_verify_with_4(make: Make, run_main
 
 
 def test_many_wrong_pairs_are_counted(make: Make, run_main: RunMain, tmp_path: Path) -> None:
-    make(None, tmp_path / "ds", "source.limit=1", f"noise.draws={LISTED + 3}", "source.patch=[random,128,1]")
+    make(None, tmp_path / "ds", "source.limit=1", f"noise.draws={PAIRS_LISTED + 3}", "source.patch=[random,128,1]")
     replace_noisy_frames(tmp_path / "ds", lambda clean, noisy, row: noisy + np.uint16(20))
     done = run_main("verify", "ds", "--noise")
     assert done.code == 4
-    assert sum("noise of 00000000" in line for line in done.err.splitlines()) == LISTED
+    assert sum("noise of 00000000" in line for line in done.err.splitlines()) == PAIRS_LISTED
     assert done.err.splitlines()[-1].endswith("noise of 3 other pairs: wrong too")
 
 

@@ -62,7 +62,7 @@ def test_95_percent_intervals_contain_93_to_97_percent(name: str, settings: Sett
     for overrides in INTERVALS[name]:
         config = settings(*overrides)
         for seed in range(600 // len(INTERVALS[name])):
-            picture = synthetic.scene(synthetic.NAMES[seed % len(synthetic.NAMES)])
+            picture = synthetic.scene(synthetic.SCENES[seed % len(synthetic.SCENES)])
             y, x = np.random.default_rng(seed).integers(0, 64, 2) * 2
             pair = make_pair(np.ascontiguousarray(picture[y : y + 256, x : x + 256]), replace(config, seed=seed))
             fit = fit_pair(pair.clean, pair.noisy, pair.row)

@@ -435,7 +435,7 @@ def test_mean_of_frames_does_not_exceed_full_well() -> None:
         column_std_dn=20.0, fixed_pattern_in_clean=True,
     )  # fmt: skip
     clean = make_pair(flat(5000, *size), plan).clean.astype(np.float64)
-    columns_dn = order.offsets(order.part_of(plan, size), order.effects_of(plan), fixed_only=True)
+    columns_dn = order.offsets(order.crop_of(plan, size), order.effects_of(plan), fixed_only=True)
     full = np.rint(8 * 2000 + BLACK + columns_dn)
     assert (clean <= full).all()
     assert 0.1 < (clean == full).mean() < 0.3

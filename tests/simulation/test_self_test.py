@@ -152,7 +152,7 @@ KERNELS = {
     "fill_word_blocks": "", "fill_values_by_lines": "", "approximate_gaussian": "noise_dn", "_round_and_list": "noisy",
     "exact_gaussian_site": "", "_replace": "noisy",
 }  # fmt: skip
-"""Kernels of the set ``gaussian``, and the member of the workspace that each fills; "" for its last argument or its
+"""Kernels of the set ``gaussian``, and the member of the buffers that each fills; "" for its last argument or its
 return value."""
 
 

@@ -21,7 +21,7 @@ from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.records import Amount, check_record, parse_record
 from unprocess_gen.core.suggestions import did_you_mean
-from unprocess_gen.planning.noise_profile import number
+from unprocess_gen.planning.noise_profile import evaluate
 from unprocess_gen.sources.raw.metadata import read_tags
 
 UNKNOWN_INTERVAL = (-math.inf, math.inf)
@@ -86,7 +86,7 @@ def _of_profile(captures: CaptureSet, profile: str) -> KnownGain:
         assert branch is not None and noise.white_level_dn is not None and noise.black_level_dn is not None
         scale = captures.sensor.span_dn / (noise.white_level_dn - noise.black_level_dn)
         low, high = listed.get(iso, UNKNOWN_INTERVAL)
-        value = number(branch.dn_per_e, iso=iso)
+        value = evaluate(branch.dn_per_e, iso=iso)
         by_iso[iso] = Estimate(value * scale, low * scale, high * scale)
     errors = [(gain.high - gain.low) / 2 / gain.value for gain in by_iso.values()]
     uncertainty = f"{max(errors):.2%} (95 %)" if max(errors) < math.inf else f"that of profile {noise.name}"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from unprocess_gen.pipeline.builds import Build
     from unprocess_gen.pipeline.generate import Summary
 
-SHOWN = 20
+DIFFERENCES_LISTED = 20
 """Differences that are listed; the others are counted."""
 
 
@@ -45,7 +45,7 @@ def build(call: Call) -> int:
     if code := make_build(made, folder, call.values.get("n_jobs", -1)):
         return code
     differences = made.differences(folder)
-    shown = [str(damage) for damage in itertools.islice(differences, SHOWN)]
+    shown = [str(damage) for damage in itertools.islice(differences, DIFFERENCES_LISTED)]
     more = sum(1 for _ in differences)
     for text in [*shown, *([f"and {more} more differences"] if more else [])]:
         report(f"{folder}: {text}", logging.ERROR)

@@ -29,7 +29,7 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
 Verbs:
 """
 
-SETTINGS = """
+SETTINGS_HELP = """
 Settings are key=value, in any order. group=option selects an option, group.key=value changes one
 value. gen-dataset --help GROUP explains the options and keys of a group. Each group is listed with
 its options and, in parentheses, its keys:
@@ -43,7 +43,7 @@ Tab completion: eval "$(gen-dataset completion bash)", or zsh.
 
 """
 
-KEYS = "keys.json"
+KEYS_FILE = "keys.json"
 """File of ``conf/`` with the keys of each group, and the top-level keys, written by ``docs/update_reference.py``.
 
 ``config.schema`` imports NumPy, which is too slow for --help.
@@ -53,10 +53,10 @@ KEYS = "keys.json"
 def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
     """Return the help of ``gen-dataset``."""
     lines = [f"  gen-dataset {verb.name:<11} {verb.summary}" for verb in verbs.values()]
-    described = json.loads((conf / KEYS).read_text(encoding="utf-8"))
+    described = json.loads((conf / KEYS_FILE).read_text(encoding="utf-8"))
     groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(described["groups"], conf)]
     keys = [_hanging(f"  {key:<{INDENT + 6}}", text) for key, text in described["top"].items()]
-    blocks = [INTRODUCTION + "\n".join(lines), SETTINGS + "\n".join(groups), "\nKeys at the top level:", *keys]
+    blocks = [INTRODUCTION + "\n".join(lines), SETTINGS_HELP + "\n".join(groups), "\nKeys at the top level:", *keys]
     shown = [*(flag for flag in HYDRA_FLAGS if flag.key in SHOWN_HYDRA_FLAGS), *STANDARD]
     flags = [
         *((argument.spelled, argument.help) for argument in shown),

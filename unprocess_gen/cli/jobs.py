@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import report_error
 from unprocess_gen.cli.signals import SIGNALS
-from unprocess_gen.cli.sweep import JobRow, folder_name, named_overrides, sweep_out
+from unprocess_gen.cli.sweep import JobRow, job_folder, named_overrides, sweep_out
 from unprocess_gen.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -43,13 +43,13 @@ def run_job(job: SweepJob, task: Task, place: str, composed: Callable[[], DictCo
     from unprocess_gen.config.schema import replaced
 
     named = named_overrides(job.named)
-    folder = folder_name(named, job.swept)
+    folder = job_folder(named, job.swept)
     out, result = None, None
     texts: list[str] = []
     try:
         config = validated_config(composed(), job.overrides)
         out = sweep_out(config.out)
-        if (out / (earlier := folder_name(named))).is_dir():  # version 0.2 shortened names without regard to swept keys
+        if (out / (earlier := job_folder(named))).is_dir():  # version 0.2 shortened names without regard to swept keys
             folder = earlier
         code, result, texts = task(replaced(config, {"out": str(out / folder)}), f"{place} {folder}")
     except Exception as error:

@@ -74,7 +74,7 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
     )
     benchmark = measure.measure_accuracy(config, profiles, command=command)
     benchmark_report.write_benchmark(benchmark, out)
-    return 0, None, [benchmark_report.report_text(benchmark), f"{out}: {', '.join(benchmark_report.FILES)}"]
+    return 0, None, [benchmark_report.report_text(benchmark), f"{out}: {', '.join(benchmark_report.REPORT_FILES)}"]
 
 
 def _tiers() -> dict[str, AccuracyConfig]:

@@ -96,7 +96,7 @@ def _key(override: str) -> str:
     return override.lstrip("+").partition("=")[0]
 
 
-def folder_name(overrides: Sequence[str], swept: Container[str] = ()) -> str:
+def job_folder(overrides: Sequence[str], swept: Container[str] = ()) -> str:
     """Return the name of a job's folder: its overrides, with slashes encoded.
 
     A name longer than `LONGEST_NAME` begins with the overrides of swept keys, is cut, and ends with a digest.

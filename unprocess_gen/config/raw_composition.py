@@ -22,7 +22,7 @@ NOT_APPLIED = {
 OF_FILE = "sensor=source"
 """Override that takes the sensor of raw sources from their files."""
 
-LEVELS = tuple(f"sensor.{name}" for name in ("bits", "black_level_dn", "white_level_dn", "pattern"))
+SENSOR_LEVELS = tuple(f"sensor.{name}" for name in ("bits", "black_level_dn", "white_level_dn", "pattern"))
 
 
 def source_overrides(node: DictConfig, overrides: Sequence[str]) -> list[str]:
@@ -49,7 +49,7 @@ def _raw_overrides(node: Any, given: dict[str, str]) -> Iterator[str]:
     if chosen == default_options()["sensor"] and "sensor" not in given:
         chosen = "source"
         yield OF_FILE
-    for key in LEVELS:
+    for key in SENSOR_LEVELS:
         if key in given and chosen == "source":
             raise ConfigError(f"{given[key]}: {OF_FILE} takes it from each file; choose a sensor, or remove it")
     if "sensor.pattern" in given and OmegaConf.select(node, "source.shrink") == 1:

@@ -265,15 +265,15 @@ def differences(config_yaml: str, other_yaml: str) -> list[str]:
     ]
 
 
-SHOWN = 60
+CHARACTERS_SHOWN = 60
 """Characters of a value in a difference; longer values are cut around the first character that differs."""
 
 
 def _shortened(*values: str) -> Iterator[str]:
     common = sum(1 for _ in itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*values, strict=False)))
-    start = max(0, common - SHOWN // 3) if max(map(len, values)) > SHOWN else 0
+    start = max(0, common - CHARACTERS_SHOWN // 3) if max(map(len, values)) > CHARACTERS_SHOWN else 0
     for value in values:
-        part = value[start : start + SHOWN]
+        part = value[start : start + CHARACTERS_SHOWN]
         yield "…" * (start > 0) + part + "…" * (len(value) > start + len(part))
 
 

@@ -21,7 +21,7 @@ from unprocess_gen.core.errors import ConfigError
 METADATA = "setting"
 """Key of a field's metadata that holds its `Setting`."""
 
-Group = TypeVar("Group", bound=type)
+GroupType = TypeVar("GroupType", bound=type)
 
 
 @dataclass(slots=True)
@@ -65,7 +65,7 @@ def settings_of(group: Any) -> Mapping[str, Setting]:
     return {field.name: field.metadata[METADATA] for field in dataclasses.fields(group) if METADATA in field.metadata}
 
 
-def documented(group: Group) -> Group:
+def documented(group: GroupType) -> GroupType:
     """Take the meanings of a group's keys from its docstring, and add units and allowed values to the docstring.
 
     The section Attributes has the name of each key and, indented, its meaning. Fields that are added to the group have

@@ -14,7 +14,7 @@ from unprocess_gen.core.errors import ConfigError
 if TYPE_CHECKING:
     from unprocess_gen.core.paths import AnyPath
 
-MAX_BYTES = 4 * 2**20
+MAX_YAML_BYTES = 4 * 2**20
 """Largest file that is read. A dataset's ``config.yaml`` has 3 kB, plus the names in ``source.include``."""
 
 MAX_DEPTH = 32
@@ -58,13 +58,13 @@ def read_yaml_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_yaml_text(path: AnyPath) -> str:
-    """Read a regular file of at most `MAX_BYTES` in UTF-8; OSError or ValueError if it is none."""
+    """Read a regular file of at most `MAX_YAML_BYTES` in UTF-8; OSError or ValueError if it is none."""
     if isinstance(path, Path) and not stat.S_ISREG(path.stat().st_mode):
         raise ValueError("expected a regular file")
     with path.open("rb") as file:
-        content = file.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"larger than {MAX_BYTES} bytes; expected a YAML file of settings")
+        content = file.read(MAX_YAML_BYTES + 1)
+    if len(content) > MAX_YAML_BYTES:
+        raise ValueError(f"larger than {MAX_YAML_BYTES} bytes; expected a YAML file of settings")
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:

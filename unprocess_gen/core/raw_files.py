@@ -1,9 +1,9 @@
 """Name the suffixes of files that contain mosaics."""
 
-PICTURES = (".png", ".tif", ".tiff")
+PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 RAW_FILES = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc", ".mef", ".mos"),
     *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
 )
 """Suffixes of files that LibRaw decodes (extra ``raw``)."""
-SUFFIXES = (".npy", *PICTURES, *RAW_FILES)
+SUFFIXES = (".npy", *PICTURE_SUFFIXES, *RAW_FILES)

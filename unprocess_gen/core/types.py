@@ -342,7 +342,7 @@ class CameraPlan:
     red_gain, blue_gain, inverse_rgb_gain : float
         White-balance gains of red and blue, and inverse of the brightness gain.
     highlight, highlight_threshold : str, float
-        Method for highlights (`unprocess.HIGHLIGHTS`), and the intensity from which it acts, in [0, 1).
+        Method for highlights (`unprocess.INVERSE_HIGHLIGHTS`), and the intensity from which it acts, in [0, 1).
     light, cct_k : str, float
         Light from which the gains follow, and its correlated colour temperature; empty and 0 without one.
     """
@@ -680,13 +680,13 @@ class Plan:
         return float(np.float32((value_dn - self.sensor.black_level_dn) / self.sensor.span_dn))
 
 
-PARTS: dict[str, Any] = {
+PLAN_PARTS: dict[str, Any] = {
     "source": SourcePlan, "scene": ScenePlan, "camera": CameraPlan, "isp": IspPlan, "sensor": SensorPlan,
     "noise": NoisePlan, "accuracy": AccuracyPlan, "output": OutputPlan,
 }  # fmt: skip
 """Records of a plan by the names of their fields."""
 
-_PART_OF = {field.name: part for part, record in PARTS.items() for field in fields(record) if field.name != "name"}
+_PART_OF = {field.name: part for part, record in PLAN_PARTS.items() for field in fields(record) if field.name != "name"}
 _PART_OF |= {field.name: "" for field in fields(Plan)}
 """Part of a plan in which each field is; empty for the plan's own fields."""
 

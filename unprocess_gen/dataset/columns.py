@@ -82,7 +82,7 @@ def integers(low: int, high: int) -> Range:
     return Range(low, high, type=int)
 
 
-class Words(tuple[str, ...]):
+class OneOf(tuple[str, ...]):
     """Hold the words that a column allows."""
 
     __slots__ = ()
@@ -123,8 +123,8 @@ class RelativePath:
 
 _PERCENT = re.compile("%([0-9A-F]{2})")
 
-Allowed = Range | Words | Text | RelativePath
-Record = type[Any]
+Allowed = Range | OneOf | Text | RelativePath
+RecordType = type[Any]
 """Dataclass of `core.types`: a plan or a part of it, `Physics`, `Patch`, `Counts` or `Source`."""
 
 
@@ -151,7 +151,7 @@ NO_VIDEO = "the source failed, unless it is a frame of a video"
 
 HEXADECIMAL = Spelling("{:016x}".format, lambda text: int(text, 16))
 LIST = Spelling(";".join, lambda text: tuple(text.split(";")) if text else ())
-SWITCH = Spelling(int, bool)
+FLAG = Spelling(int, bool)
 LEVEL_LIST = Spelling(lambda levels: ";".join(map(repr, levels)), lambda text: tuple(map(float, text.split(";"))))
 GAMMA = Spelling(
     lambda gamma: number_or_text(gamma_text(gamma)), lambda value: value if value == "srgb" else float(value)
@@ -174,7 +174,7 @@ HEX_256 = Text(re.compile(r"([0-9a-f]{64})?"), "64 hexadecimal digits")
 
 
 _LEVEL = r"\d{1,5}(\.\d{1,17})?(e-\d\d)?"
-LEVELS = Text(re.compile(rf"({_LEVEL}(;{_LEVEL}){{3}})?"), "four numbers, separated by ;")
+LEVELS_TEXT = Text(re.compile(rf"({_LEVEL}(;{_LEVEL}){{3}})?"), "four numbers, separated by ;")
 
 _TARGET = f"({'|'.join(TARGETS)}):({'|'.join(DESCRIPTIONS)}):[0-9a-f]{{32}}"
 
@@ -189,7 +189,7 @@ class Column:
         Name in the header of ``manifest.csv`` and in ``KEY.json``.
     meaning : str
         One phrase for users.
-    allowed : Range, Words, Text or RelativePath
+    allowed : Range, OneOf, Text or RelativePath
         Values other than the empty cell, and their type.
     of : type, optional
         Dataclass whose field the column holds.
@@ -210,7 +210,7 @@ class Column:
     name: str
     meaning: str
     allowed: Allowed
-    of: Record | None = None
+    of: RecordType | None = None
     field: str = ""
     spelling: Spelling | None = None
     since: str = FIRST
@@ -278,7 +278,7 @@ def _columns_of_numbers(*names: str) -> Iterator[Column]:
     """Yield the columns of numbers of effects, by the fields of `Physics`."""
     for field_name in names:
         number = NUMBERS[field_name]
-        allowed = Words((*number.words, "none")) if number.words else Range(number.lowest, number.highest)
+        allowed = OneOf((*number.words, "none")) if number.words else Range(number.lowest, number.highest)
         since, empty_if = number.since or FIRST, number.empty_if if number.since else FAILED
         for name, meaning in (number.columns or {field_name: number.meaning}).items():
             yield Column(name, meaning, allowed, Physics, field_name, unit=number.unit, since=since, empty_if=empty_if)
@@ -294,7 +294,7 @@ COLUMNS = (
            empty_if="there is no readable file"),
     Column("status", "ok, failed if the source could not be used, or filtered if source.min_side leaves it out (other "
            "cells are then as for failed)",
-           Words(("ok", "failed", "filtered")), empty_if=""),
+           OneOf(("ok", "failed", "filtered")), empty_if=""),
     Column("reason", "reason of the status", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt"),
            empty_if="the status is ok"),
     Column("width", "width of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
@@ -317,19 +317,19 @@ COLUMNS = (
     Column("red_gain", "forward white-balance gain of red", GAIN, CameraPlan),
     Column("blue_gain", "forward white-balance gain of blue", GAIN, CameraPlan),
     Column("inverse_rgb_gain", "inverse of the brightening gain; all channels are multiplied by it", GAIN, CameraPlan),
-    Column("tone", "inverted tone curve: smoothstep or none", Words(("smoothstep", "none")), IspPlan),
+    Column("tone", "inverted tone curve: smoothstep or none", OneOf(("smoothstep", "none")), IspPlan),
     Column("gamma", "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",), number_or_text), IspPlan,
            spelling=GAMMA),
     Column("highlight", "preservation of highlights: per_channel, gray_mean or none",
-           Words(("per_channel", "gray_mean", "none")), CameraPlan),
+           OneOf(("per_channel", "gray_mean", "none")), CameraPlan),
     Column("highlight_threshold", "linear signal above which highlights are preserved, 1 is white",
            Range(0, math.nextafter(1, 0)), CameraPlan),
     Column("pattern", "CFA pattern of the top-left 2x2 sites, or MONO",
-           Words(("RGGB", "BGGR", "GRBG", "GBRG", "MONO")), SensorPlan),
+           OneOf(("RGGB", "BGGR", "GRBG", "GBRG", "MONO")), SensorPlan),
     Column("bits", "bits per sample of the sensor", integers(1, 16), SensorPlan),
     Column("black_level_dn", "black level", integers(0, 65534), SensorPlan, unit="DN"),
     Column("white_level_dn", "white level (saturation)", integers(1, 65535), SensorPlan, unit="DN"),
-    Column("sensor_clip", "clipping of the noisy frame: sensor, black or none", Words(("sensor", "black", "none")),
+    Column("sensor_clip", "clipping of the noisy frame: sensor, black or none", OneOf(("sensor", "black", "none")),
            NoisePlan),
     Column("noise", "name of the noise profile", ANY_TEXT, NoisePlan, "name"),
     Column("a_dn", "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Range(-1e30, 1e30),
@@ -360,19 +360,19 @@ COLUMNS = (
     Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
     Column("saturated_as", "noisy sites whose clean site is saturated: noisy, pinned to it, or white where the "
            "converter ends",
-           Words(("noisy", "pinned", "white")), NoisePlan, "saturated"),
-    Column("noise_law", "distribution of a two-parameter profile: gaussian or poisson", Words(("gaussian", "poisson")),
+           OneOf(("noisy", "pinned", "white")), NoisePlan, "saturated"),
+    Column("noise_law", "distribution of a two-parameter profile: gaussian or poisson", OneOf(("gaussian", "poisson")),
            NoisePlan, "law"),
     Column("iso", "ISO of a physical profile", Range(0, 1e9), Physics),
     Column("exposure_s", "exposure time", Range(0, 1e7), Physics, unit="seconds"),
     Column("temperature_c", "temperature of the sensor", Range(-300, 1000), Physics, unit="degrees Celsius"),
     *_columns_of_numbers(*RECORDED_NUMBERS[0]),
-    Column("dark_offset", "mean dark current: removed or kept", Words(("removed", "kept", "none")), Physics),
+    Column("dark_offset", "mean dark current: removed or kept", OneOf(("removed", "kept", "none")), Physics),
     *_columns_of_numbers(*RECORDED_NUMBERS[1]),
     Column("sensor_unit", "camera body", ANY_TEXT, Physics),
     Column("body_key", "key of the fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
     Column("fixed_pattern_in_clean", "1 if the clean frame has the fixed patterns too", integers(0, 1), Physics,
-           spelling=SWITCH),
+           spelling=FLAG),
     Column("level", "number of the noise level, from 0", integers(0, 99), NoisePlan),
     Column("draw", "number of the draw at this level, from 0", integers(0, 99), NoisePlan),
     Column("frame", "number of the frame in its clip, from 0", COORDINATE, NoisePlan, empty_if=NO_VIDEO),
@@ -380,18 +380,18 @@ COLUMNS = (
     Column("downscale", "side of the squares of source pixels that were averaged", integers(1, 64), SourcePlan,
            unit="pixels"),
     Column("dequantize", "dequantization of 8-bit codes: off, dither or dither_all",
-           Words(("off", "dither", "dither_all")), SourcePlan),
+           OneOf(("off", "dither", "dither_all")), SourcePlan),
     Column("patch", "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
     Column("patch_y", "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels"),
     Column("patch_x", "first column of the arrays in the full frame; even", COORDINATE, Patch, "x", unit="pixels"),
-    Column("dtype", "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", Words((UINT16, FLOAT32)),
+    Column("dtype", "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", OneOf((UINT16, FLOAT32)),
            OutputPlan),
-    Column("layout", "layout of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), OutputPlan),
+    Column("layout", "layout of the arrays: mosaic, or packed planes", OneOf((MOSAIC, PACKED)), OutputPlan),
     Column("detail", "explanation of the reason, one line", ANY_TEXT, since="0.2", in_json=False,
            empty_if="the status is ok"),
     Column("assumed", "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT,
            NoisePlan, spelling=LIST, since="0.2", empty_if="no effect uses one, or effects.assumed is off"),
-    Column("clean_dtype", "dtype of the clean array, if it is not that of dtype", Words((FLOAT32,)), OutputPlan,
+    Column("clean_dtype", "dtype of the clean array, if it is not that of dtype", OneOf((FLOAT32,)), OutputPlan,
            since="0.2", empty_if="the clean array has the dtype of the noisy one, or the source failed"),
     *_columns_of_numbers(*RECORDED_NUMBERS[2]),
     *(
@@ -439,12 +439,12 @@ COLUMNS = (
            since="0.3", in_json=False, empty_if="there is no mixture, or the source failed"),
     Column("shrink", "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
            integers(1, 4), SourcePlan, since="0.3", empty_if=NO_RAW),
-    Column("raw_pattern", "CFA pattern of the raw file", Words(("RGGB", "BGGR", "GRBG", "GBRG", "XTRANS")), SourcePlan,
+    Column("raw_pattern", "CFA pattern of the raw file", OneOf(("RGGB", "BGGR", "GRBG", "GBRG", "XTRANS")), SourcePlan,
            since="0.3", empty_if=NO_RAW),
     *(
         Column(f"raw_{level}_dn", f"{level} levels of the raw file: R, G of the red rows, G of the blue rows, B, "
                "separated by ;",
-               LEVELS, SourcePlan, spelling=LEVEL_LIST, since="0.3", unit="DN of the file", empty_if=NO_RAW)
+               LEVELS_TEXT, SourcePlan, spelling=LEVEL_LIST, since="0.3", unit="DN of the file", empty_if=NO_RAW)
         for level in ("black", "white")
     ),
     Column("mosaic_xxh3", "XXH3-128 of the mosaic that the raw file was decoded to", HEX_128, SourcePlan, since="0.3",
@@ -461,16 +461,16 @@ COLUMNS = (
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 
-NAMES = tuple(column.name for column in COLUMNS)
+COLUMN_NAMES = tuple(column.name for column in COLUMNS)
 
 HEADERS = tuple(
-    NAMES[: max(place for place, column in enumerate(COLUMNS) if column.since == version) + 1]
+    COLUMN_NAMES[: max(place for place, column in enumerate(COLUMNS) if column.since == version) + 1]
     for version in dict.fromkeys(column.since for column in COLUMNS)
 )
 """The header that each version wrote, oldest version first; new columns are appended, so each begins with the last."""
 
 
-COLUMNS_OF: dict[Record, dict[str, tuple[Column, ...]]] = {}
+COLUMNS_OF: dict[RecordType, dict[str, tuple[Column, ...]]] = {}
 """Columns that hold a record, by field: one for a scalar field, several for a tuple."""
 
 for _column in COLUMNS:

@@ -63,7 +63,7 @@ D65 = 21
 """Value of CalibrationIlluminant1 (EXIF LightSource)."""
 
 
-class ExportSummary(NamedTuple):
+class DngSummary(NamedTuple):
     """Count the files written, those that existed with the same bytes, and noisy ones without NoiseProfile."""
 
     written: int
@@ -83,7 +83,7 @@ class _File(NamedTuple):
         return f"{self.key}.{self.frame}.dng"
 
 
-def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> ExportSummary:
+def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> DngSummary:
     """Write frames of a dataset's pairs as ``to/KEY.FRAME.dng``.
 
     Parameters
@@ -99,7 +99,7 @@ def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> Expor
 
     Returns
     -------
-    ExportSummary
+    DngSummary
         Numbers of files.
 
     Raises
@@ -128,7 +128,7 @@ def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> Expor
     without = sum(
         file.frame == "noisy" and noise_profile(plan_from_row(pairs[file.number].row)) is None for file in files
     )
-    return ExportSummary(len(written), len(present), without)
+    return DngSummary(len(written), len(present), without)
 
 
 def _writable(row: Row) -> Row:

@@ -32,7 +32,7 @@ from unprocess_gen.dataset.manifest import read_rows, without_empty
 from unprocess_gen.dataset.reader import RawPairs, Sample, dataset_folders
 from unprocess_gen.dataset.shards import arrays_of
 
-RECORD, MANIFEST = "export.json", "manifest.csv"
+EXPORT_RECORD, MANIFEST = "export.json", "manifest.csv"
 UNFINISHED = ".unfinished"
 """Folder below ``TO`` for files that are being written."""
 
@@ -55,7 +55,7 @@ class _Unit(NamedTuple):
     rows: dict[int, Row]
 
 
-Read = Callable[[int], Sample]
+ReadSample = Callable[[int], Sample]
 Watch = Callable[[Iterable[_Unit]], Iterable[_Unit]]
 
 
@@ -126,14 +126,14 @@ def _export_dataset(folder: AnyPath, form: str, to: Path, watch: Watch) -> Expor
 def _begin(to: Path, record: Mapping[str, str]) -> None:
     """Record what is exported; ConfigError if the folder has other files, or another export."""
     to.mkdir(parents=True, exist_ok=True)
-    text, path = json.dumps(record) + "\n", to / RECORD
+    text, path = json.dumps(record) + "\n", to / EXPORT_RECORD
     foreign = sorted({entry.name for entry in to.iterdir()} - {UNFINISHED})
     if foreign and not path.is_file():
         raise ConfigError(f"--to {to}: contains {foreign[0]}, but no export; expected an empty folder; choose another")
     (to / UNFINISHED).mkdir(exist_ok=True)
     if not LocalPath(path).create(text.encode(), str(to / UNFINISHED)) and path.read_bytes() != text.encode():
         raise ConfigError(
-            f"--to {to}: contains an export of another dataset or format ({RECORD}); choose another folder"
+            f"--to {to}: contains an export of another dataset or format ({EXPORT_RECORD}); choose another folder"
         )
 
 
@@ -164,11 +164,11 @@ class _Files:
     def __init__(self, suffix: str, encode: Callable[[Array, Row], bytes], library: str = "") -> None:
         self.suffix, self.encode, self.library = suffix, encode, library
 
-    def write(self, unit: _Unit, read: Read, unfinished: Path) -> int:
+    def write(self, unit: _Unit, read: ReadSample, unfinished: Path) -> int:
         """Write the missing files of a unit; return the number of pairs with a new file."""
         return sum(self._write_pair(unit.place, read, number, row, unfinished) for number, row in unit.rows.items())
 
-    def _write_pair(self, place: Path, read: Read, number: int, row: Row, unfinished: Path) -> bool:
+    def _write_pair(self, place: Path, read: ReadSample, number: int, row: Row, unfinished: Path) -> bool:
         files = {name: place / name / f"{row['key']}.{self.suffix}" for name in arrays_of(row)}
         missing = {name: file for name, file in files.items() if not file.exists()}
         if missing:
@@ -203,7 +203,7 @@ class _Hdf5:
 
     library = "h5py"
 
-    def write(self, unit: _Unit, read: Read, unfinished: Path) -> int:
+    def write(self, unit: _Unit, read: ReadSample, unfinished: Path) -> int:
         """Write the file of a unit unless it exists."""
         import h5py
 
@@ -236,7 +236,7 @@ class _Lmdb:
 
     library = "lmdb"
 
-    def write(self, unit: _Unit, read: Read, unfinished: Path) -> int:
+    def write(self, unit: _Unit, read: ReadSample, unfinished: Path) -> int:
         """Write the missing pairs of a unit; return their number."""
         import lmdb
 
@@ -245,7 +245,7 @@ class _Lmdb:
         except lmdb.Error as error:
             raise MachineError(f"{unit.place}: LMDB: {error}") from error
 
-    def _write(self, unit: _Unit, read: Read) -> int:
+    def _write(self, unit: _Unit, read: ReadSample) -> int:
         import lmdb
 
         names = dict.fromkeys(name for row in unit.rows.values() for name in (*arrays_of(row), "row"))

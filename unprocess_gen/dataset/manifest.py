@@ -22,12 +22,12 @@ from typing import Any, BinaryIO, NamedTuple, TextIO, TypeVar
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.types import PARTS, Counts, DarkFramePlan, NoisePlan, Pair, Patch, Plan, Row, Source, Value
-from unprocess_gen.dataset.columns import COLUMNS, COLUMNS_OF, FIRST, HEADERS, NAMES, Column, Record
+from unprocess_gen.core.types import PLAN_PARTS, Counts, DarkFramePlan, NoisePlan, Pair, Patch, Plan, Row, Source, Value
+from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS, COLUMNS_OF, FIRST, HEADERS, Column, RecordType
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.simulation.effects import Physics, dark_variance_dn2
 
-Part = TypeVar("Part")
+RowPart = TypeVar("RowPart")
 
 JSON_BYTES = 5632
 """Bytes of a row's JSON without the name of its source. The longest row takes 3 less, so the next number in JSON must
@@ -171,7 +171,7 @@ def _plan_cells(plan: Plan) -> dict[str, Value]:
     """Return the values of all columns that hold a plan."""
     physics = plan.noise.physics
     cells: dict[str, Value] = {}
-    for record in (plan, plan.noise.dark, *(getattr(plan, part) for part in PARTS)):
+    for record in (plan, plan.noise.dark, *(getattr(plan, part) for part in PLAN_PARTS)):
         cells |= _cells(record)
     if physics is not None:
         return cells | _cells(physics)
@@ -229,7 +229,7 @@ def row_of_values(values: Sequence[Value]) -> Row:
     """
     if len(values) not in map(len, HEADERS):
         raise ValueError(f"a row of {len(values)} values; expected {' or '.join(map(str, map(len, HEADERS)))}")
-    known = dict(zip(NAMES, values, strict=False))
+    known = dict(zip(COLUMN_NAMES, values, strict=False))
     return _completed({column.name: known.get(column.name, column.empty) for column in COLUMNS})
 
 
@@ -261,7 +261,7 @@ def plan_from_row(row: Row) -> Plan:
     try:
         physics = None if row.get("read_law") == "none" else _part(row, Physics)
         noise = NoisePlan(**_fields(row, NoisePlan), physics=physics, dark=_part(row, DarkFramePlan))
-        parts = {name: _part(row, record) for name, record in PARTS.items() if record is not NoisePlan}
+        parts = {name: _part(row, record) for name, record in PLAN_PARTS.items() if record is not NoisePlan}
         plan = Plan(**_fields(row, Plan), **parts, noise=noise)
         _check_plan(plan)
     except ValueError as error:
@@ -293,12 +293,12 @@ def patch_from_row(row: Row) -> Patch:
         raise DamageError(f"row {_key_of(row)}: not a patch ({error})") from error
 
 
-def _part(row: Row, record: type[Part]) -> Part:
+def _part(row: Row, record: type[RowPart]) -> RowPart:
     """Return a record from the columns that hold it."""
     return record(**_fields(row, record))
 
 
-def _fields(row: Row, record: Record) -> dict[str, Any]:
+def _fields(row: Row, record: RecordType) -> dict[str, Any]:
     """Return the fields of a record from the columns that hold it; ValueError names the column.
 
     A field is omitted, and keeps its default, if its columns are newer than the row and thus empty.
@@ -399,7 +399,7 @@ class Manifest(NamedTuple):
     header: tuple[str, ...]
 
 
-def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = NAMES) -> None:
+def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = COLUMN_NAMES) -> None:
     r"""Write rows as CSV: ``\n`` line ends, quotes only if needed, empty cells for None.
 
     Parameters
@@ -433,11 +433,11 @@ def rows_text(rows: Iterable[Row]) -> str:
         One line for each row.
     """
     stream = io.StringIO()
-    _write_lines(stream, rows, NAMES)
+    _write_lines(stream, rows, COLUMN_NAMES)
     return stream.getvalue()
 
 
-def header_text(names: Sequence[str] = NAMES) -> str:
+def header_text(names: Sequence[str] = COLUMN_NAMES) -> str:
     """Return the first line of a manifest.
 
     Parameters
@@ -473,11 +473,11 @@ def current_lines(lines: bytes, columns: int) -> bytes:
     ValueError
         If no version has as many columns.
     """
-    if columns == len(NAMES):
+    if columns == len(COLUMN_NAMES):
         return lines
     if columns not in map(len, HEADERS):
         raise ValueError(f"rows of {columns} columns; expected those of a known version")
-    rows = (_completed(_typed(NAMES[:columns], line)) for line in lines.splitlines(keepends=True))
+    rows = (_completed(_typed(COLUMN_NAMES[:columns], line)) for line in lines.splitlines(keepends=True))
     return rows_text(rows).encode()
 
 

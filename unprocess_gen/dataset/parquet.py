@@ -16,7 +16,7 @@ from unprocess_gen.dataset.manifest import read_columns
 if TYPE_CHECKING:
     import pyarrow
 
-NAME = "manifest.parquet"
+PARQUET_NAME = "manifest.parquet"
 
 BLOCK_BYTES = 2**24
 """Bytes of CSV in a row group, which bound the memory: about 18,000 rows."""

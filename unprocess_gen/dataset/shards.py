@@ -32,8 +32,8 @@ from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.targets import FRAME_TARGETS
 from unprocess_gen.core.types import DESCRIPTIONS, FLOAT32, PACKED, UINT16, Array, Frame, Row
 
-RECORD = 512
-END = b"\0" * (2 * RECORD)
+RECORD_BYTES = 512
+END = b"\0" * (2 * RECORD_BYTES)
 ROW = "json"
 
 PER_PAIR = ("noisy", *FRAME_TARGETS)
@@ -112,7 +112,7 @@ def _tar_header(name: str, size: int) -> bytes:
 
 
 def _padding(size: int) -> int:
-    return -size % RECORD
+    return -size % RECORD_BYTES
 
 
 def image_bytes(
@@ -124,7 +124,7 @@ def image_bytes(
 ) -> int:
     """Return the bytes of one sample in a shard."""
     sizes = [len(form.header) + form.size for form in (clean or array, *[array] * pairs, *targets)]
-    return sum(RECORD + member + _padding(member) for member in (*sizes, json_bytes))
+    return sum(RECORD_BYTES + member + _padding(member) for member in (*sizes, json_bytes))
 
 
 def shard_bytes(pairs: list[int]) -> int:
@@ -240,7 +240,7 @@ def read_index(path: AnyPath) -> dict[str, Member]:
     index: dict[str, Member] = {}
     try:
         with path.open("rb") as stream:
-            while (header := stream.read(RECORD)) != END[:RECORD]:
+            while (header := stream.read(RECORD_BYTES)) != END[:RECORD_BYTES]:
                 info = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
                 if info.size < 0:
                     raise ValueError(f"member {info.name} has {info.size} bytes")
@@ -341,11 +341,11 @@ def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dic
             frames = {}
             for member, digest, array in sample.frames:
                 size, head = array.size, len(array.header)
-                content = _read_at(stream, Member(position + RECORD + head, size))
-                position += RECORD + head + size + _padding(head + size)
+                content = _read_at(stream, Member(position + RECORD_BYTES + head, size))
+                position += RECORD_BYTES + head + size + _padding(head + size)
                 if len(content) == size and xxhash.xxh3_128_hexdigest(content) == digest:
                     frames[member] = np.frombuffer(content, array.description).reshape(array.shape)
-            position += RECORD + len(sample.json) + _padding(len(sample.json))
+            position += RECORD_BYTES + len(sample.json) + _padding(len(sample.json))
             yield frames
 
 

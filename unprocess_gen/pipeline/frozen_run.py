@@ -123,7 +123,7 @@ class FrozenPlan(msgspec.Struct, frozen=True):
         return json.dumps(msgspec.structs.asdict(self), indent=1) + "\n"
 
 
-def freeze(
+def freeze_run(
     workspace: Workspace, run: Run, on_compiling: OnCompiling | None = None, parts: int | None = None
 ) -> FrozenPlan:
     """Record the plan of a run that `Workspace.begin` has begun, or continue the plan that is recorded.

@@ -30,13 +30,13 @@ from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
 from unprocess_gen.core.roots import absolute_root
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
-from unprocess_gen.pipeline.frozen_run import freeze
+from unprocess_gen.pipeline.frozen_run import freeze_run
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.run_records import text_sha256
 from unprocess_gen.pipeline.sizes import check_free_space
-from unprocess_gen.pipeline.tasks import SHOWN, RunContext, ShardReport, ShardTask, StageTimes, Tally
+from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, RunContext, ShardReport, ShardTask, StageTimes, Tally
 from unprocess_gen.pipeline.workspace import Workspace
 from unprocess_gen.sources.clips import ClipSizes
 from unprocess_gen.sources.raw.decode import decoder_versions
@@ -220,7 +220,7 @@ def execute_on_dask(workspace: Workspace, run: Run, todo: list[ShardTask], progr
     out, root = absolute_text(config.out), absolute_root(config.source.place)
     assert out is not None
     with connected(config.executor, effective_jobs(config.n_jobs, len(todo)), workspace.storage) as client:
-        plan = freeze(workspace, run, progress.report_compiling)
+        plan = freeze_run(workspace, run, progress.report_compiling)
         request = ChunkRequest(out, root, text_sha256(plan.text), config.executor.chunk_s / REPORTS)
         on_dask = DaskRun(client, config.executor, request, workspace.records, [task.shard for task in todo])
         made = follow(on_dask.reports(), progress)
@@ -245,9 +245,9 @@ def follow(reports: Iterable[ShardReport], progress: Progress, n_jobs: int = 1) 
         if report.log.self_test and not self_test:
             self_test = report.log.self_test
             progress.warn(f"the self-test failed: {self_test}; continuing because of self_test=go_on")
-        for text in (*clip_sizes.warnings(report.frame_sizes), *report.failures[: SHOWN - shown]):
+        for text in (*clip_sizes.warnings(report.frame_sizes), *report.failures[: FAILURES_SHOWN - shown]):
             progress.warn(text)
-        shown = min(SHOWN, shown + len(report.failures))
+        shown = min(FAILURES_SHOWN, shown + len(report.failures))
         made.rows += report.rows
         made.shards += 1
         made.times.add(report.log.times)

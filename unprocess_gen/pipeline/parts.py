@@ -25,7 +25,7 @@ from unprocess_gen.core.errors import RESUME, ConfigError, MachineError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
-from unprocess_gen.pipeline.frozen_run import FrozenPlan, FrozenRun, freeze, read_plan, recorded_plan
+from unprocess_gen.pipeline.frozen_run import FrozenPlan, FrozenRun, freeze_run, read_plan, recorded_plan
 from unprocess_gen.pipeline.generate import Summary, begin, dataset_json_facts, follow, images_in
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import COMPILING, LOGGER, Progress
@@ -110,7 +110,7 @@ def prepare(config: Config, parts: int) -> Run | None:
                 "another out"
             )
         begin(workspace, run)
-        freeze(workspace, run, partial(LOGGER.info, COMPILING), parts)
+        freeze_run(workspace, run, partial(LOGGER.info, COMPILING), parts)
     return run
 
 

@@ -30,7 +30,7 @@ POLL_S = 0.1
 """Time between two looks at the files by which workers report what they do."""
 BAR_DELAY_S = 2.0
 """Time after which `with_bar` shows a bar."""
-COLUMNS = 80
+BAR_COLUMNS = 80
 """Width of the bar on a terminal that reports none."""
 
 
@@ -64,7 +64,7 @@ class Progress:
             unit=unit,
             file=_Unfailing(),
             disable=not terminal,
-            ncols=shutil.get_terminal_size((COLUMNS, 24)).columns or COLUMNS,
+            ncols=shutil.get_terminal_size((BAR_COLUMNS, 24)).columns or BAR_COLUMNS,
         )
         self._over, self._lock = threading.Event(), threading.Lock()
 

@@ -33,7 +33,7 @@ from unprocess_gen.core.records import parse_json
 from unprocess_gen.core.roots import Root
 from unprocess_gen.core.types import Array, Row
 from unprocess_gen.dataset import parquet
-from unprocess_gen.dataset.columns import HEADERS, NAMES
+from unprocess_gen.dataset.columns import COLUMN_NAMES, HEADERS
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
 from unprocess_gen.dataset.manifest import (
@@ -63,9 +63,9 @@ from unprocess_gen.pipeline.worker import make_image
 from unprocess_gen.pipeline.workspace import add_parquet, dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.planning.mixture import config_of_key, entry_number
 from unprocess_gen.planning.plan import drawn_light
-from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkPlaces, with_dark_places
+from unprocess_gen.sources.dark_frames import NO_PLACES, DarkPlaces, with_dark_places
 
-Facts = dict[str, Any]
+RecordedFacts = dict[str, Any]
 
 AGAIN = "regenerate the dataset with the settings and sources it was made from"
 
@@ -97,7 +97,7 @@ class RepairStep:
         return f"{self.file}: {self.what}"
 
 
-def repair(folder: Path, root: Root | None, dark: DarkPlaces = NO_DARK_FRAMES) -> Iterator[RepairStep]:
+def repair(folder: Path, root: Root | None, dark: DarkPlaces = NO_PLACES) -> Iterator[RepairStep]:
     """Restore every damaged file of a dataset; yield a step for each damaged or foreign file.
 
     ``root`` is the folder of the sources, None for built-in scenes or if no source is needed; ``dark`` has the places
@@ -218,7 +218,7 @@ class _Repair:
     def _write_manifest(self, rows: Iterable[Row]) -> bool:
         """Write rows as the manifest if they give its recorded digest with the header of any version."""
         complete, part = self._temporary / "all.csv", self._temporary / "manifest.csv"
-        _write_csv(complete, rows, NAMES)
+        _write_csv(complete, rows, COLUMN_NAMES)
         for names in HEADERS:
             _write_csv(part, read_rows(complete), names)
             if file_sha256(part) == self._facts["manifest_sha256"]:
@@ -235,7 +235,7 @@ class _Repair:
         for number, entry in enumerate(self._facts["shards"]):
             yield from sorted([*self._rows_inside(entry), *failures[number]], key=lambda row: int(image_key(row)))
 
-    def _rows_inside(self, entry: Facts) -> Iterator[Row]:
+    def _rows_inside(self, entry: RecordedFacts) -> Iterator[Row]:
         """Yield the rows of an intact shard; columns that they lack are in its entry, or follow from the settings."""
         if entry["file"] is None or _digest(self._folder / entry["file"]) != entry["sha256"]:
             return
@@ -326,15 +326,15 @@ class _Repair:
 
     def _restore_parquet(self, config: Config) -> Iterator[RepairStep]:
         """Write ``manifest.parquet`` if it is damaged; its digest depends on the version of pyarrow."""
-        digest, recorded = _digest(self._folder / parquet.NAME), self._facts.get(PARQUET_SHA256)
+        digest, recorded = _digest(self._folder / parquet.PARQUET_NAME), self._facts.get(PARQUET_SHA256)
         if digest and (digest == recorded or (not self._facts and self._is_proved(digest))):
             return
         check_parquet(config.output)
         new = add_parquet(self._storage, self._manifest_file)
-        yield RepairStep(parquet.NAME, "written from manifest.csv")
+        yield RepairStep(parquet.PARQUET_NAME, "written from manifest.csv")
         if self._facts and new[PARQUET_SHA256] != recorded:
             self._storage.write("dataset.json", dataset_text(self._facts | new))
-            yield RepairStep("dataset.json", f"has the SHA-256 of the new {parquet.NAME}")
+            yield RepairStep("dataset.json", f"has the SHA-256 of the new {parquet.PARQUET_NAME}")
 
     def _restore_dataset_json(self, config: Config) -> RepairStep:
         """Restore ``dataset.json`` from the other files: to the same bytes if its facts about the run are readable."""
@@ -344,7 +344,7 @@ class _Repair:
             old = {}
         rows = read_rows(self._manifest_file)
         entries = [self._entry(number, rows, old) for number, rows in shard_rows(self._manifest_file)]
-        digests = {PARQUET_SHA256: file_sha256(self._folder / parquet.NAME)} if config.output.parquet else {}
+        digests = {PARQUET_SHA256: file_sha256(self._folder / parquet.PARQUET_NAME)} if config.output.parquet else {}
         known = dataset_facts(
             self._config_text(), file_sha256(self._manifest_file), entries, digests | Tally.of(rows).facts()
         )
@@ -358,7 +358,7 @@ class _Repair:
         self._storage.write("dataset.json", dataset_text(known | lost | {"source": source}))
         return RepairStep("dataset.json", "rebuilt from the other files; host, time and versions of the run are lost")
 
-    def _entry(self, number: int, rows: Sequence[Row], old: Facts) -> Facts:
+    def _entry(self, number: int, rows: Sequence[Row], old: RecordedFacts) -> RecordedFacts:
         """Describe a shard for ``dataset.json``; the result of its self-test is only in the old file."""
         path = self._folder / "shards" / shard_name(number)
         killer = "provisional" if all(row["reason"] == "worker_died" for row in rows) else None

@@ -38,7 +38,7 @@ from unprocess_gen.dataset.shards import arrays_of, target_names
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
-from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkFolder, DarkPlaces
+from unprocess_gen.sources.dark_frames import NO_PLACES, DarkFolder, DarkPlaces
 from unprocess_gen.sources.listing import place_text
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
@@ -168,7 +168,7 @@ def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
 
 
 def replay(
-    rows: Iterable[Row], root: Root | None, to: Path | None = None, dark: DarkPlaces = NO_DARK_FRAMES
+    rows: Iterable[Row], root: Root | None, to: Path | None = None, dark: DarkPlaces = NO_PLACES
 ) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
@@ -210,7 +210,7 @@ class PairRegenerator:
     rows of one image are consecutive.
     """
 
-    def __init__(self, root: Root | None, dark: DarkPlaces = NO_DARK_FRAMES) -> None:
+    def __init__(self, root: Root | None, dark: DarkPlaces = NO_PLACES) -> None:
         self._root, self._dark = root, dark
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 

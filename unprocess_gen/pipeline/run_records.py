@@ -33,7 +33,7 @@ import msgspec
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.records import Count, Digest, check_record, parse_record
 from unprocess_gen.core.types import Source
-from unprocess_gen.dataset.columns import NAMES
+from unprocess_gen.dataset.columns import COLUMN_NAMES
 from unprocess_gen.dataset.dataset_json import ShardFacts, check_shard
 from unprocess_gen.dataset.manifest import current_lines, row_of_values, rows_text
 from unprocess_gen.dataset.shards import shard_name
@@ -149,7 +149,7 @@ def commit_shard(storage: Storage, result: ShardResult) -> ShardReport:
         "entry": result.entry(),
         "report": [report.images, report.failed, report.rows, report.frame_sizes],
         "tally": Tally.of(result.rows).facts(),
-        "columns": len(NAMES),
+        "columns": len(COLUMN_NAMES),
         "csv_bytes": len(csv.encode()),
     }
     storage.write(record_name(result.shard), json.dumps(facts, separators=(",", ":")) + "\n" + csv)
@@ -253,9 +253,9 @@ class ShardRecords:
 
 # -------------------------------------------------------------------------------------------------------------- deaths
 
-DEATHS = f"{WORK}/deaths"
+DEATHS_FOLDER = f"{WORK}/deaths"
 
-LIMIT = 4
+MAX_DEATHS = 4
 """Deaths at a shard after which it gets provisional rows: as many as Dask allows a task by default."""
 
 
@@ -263,8 +263,8 @@ class Deaths:
     """Hold the deaths at a shard before this attempt."""
 
     def __init__(self, storage: Storage, shard: int) -> None:
-        self._storage, self._prefix = storage, f"{DEATHS}/{shard:05d}-"
-        names = (f"{DEATHS}/{name}" for name in (storage / DEATHS).entries())
+        self._storage, self._prefix = storage, f"{DEATHS_FOLDER}/{shard:05d}-"
+        names = (f"{DEATHS_FOLDER}/{name}" for name in (storage / DEATHS_FOLDER).entries())
         self._names = [name for name in names if name.startswith(self._prefix)]
 
     @property
@@ -303,5 +303,5 @@ class Deaths:
 
 def forget_deaths(storage: Storage) -> None:
     """Remove the files of all shards."""
-    for name in (storage / DEATHS).entries():
-        (storage / f"{DEATHS}/{name}").delete()
+    for name in (storage / DEATHS_FOLDER).entries():
+        (storage / f"{DEATHS_FOLDER}/{name}").delete()

@@ -30,11 +30,11 @@ from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import list_patches
-from unprocess_gen.sources.read_ahead import Read, reading_ahead
+from unprocess_gen.sources.read_ahead import ReadFile, reading_ahead
 from unprocess_gen.sources.reading import read_bytes
 from unprocess_gen.sources.scenes import synthetic
 
-SAMPLE = 32
+HEADERS_READ = 32
 """Sources whose headers are read; the sizes of longer listings are extrapolated."""
 
 SHARD_BYTES = 256_000_000
@@ -94,7 +94,7 @@ def source_bytes(config: Config, name: str, height: int, width: int, bits: int =
     return total
 
 
-def estimate_shards(config: Config, tasks: Sequence[ShardTask], headers: int = SAMPLE) -> SizeEstimate:
+def estimate_shards(config: Config, tasks: Sequence[ShardTask], headers: int = HEADERS_READ) -> SizeEstimate:
     """Estimate the bytes of shards from at most ``headers`` headers of evenly spaced sources.
 
     The estimate is exact if there are no more sources and all of them are pictures that decode.
@@ -148,10 +148,10 @@ def fitting_pairs_per_shard(config: Config, sources: Sequence[Source]) -> int:
     Returns
     -------
     int
-        From the mean size of those sources, among `SAMPLE` of them, that can be read; 1 if a single one takes more. The
-        default if none can be read.
+        From the mean size of those sources, among `HEADERS_READ` of them, that can be read; 1 if a single one takes
+        more. The default if none can be read.
     """
-    sizes = list(filter(None, _sampled_bytes(config, sources, SAMPLE)))
+    sizes = list(filter(None, _sampled_bytes(config, sources, HEADERS_READ)))
     if not sizes:
         return int(OutputConfig().pairs_per_shard)
     return min(max(1, SHARD_BYTES * len(sizes) // sum(sizes)), MAX_PAIRS_PER_SHARD)
@@ -226,10 +226,10 @@ def _sampled_bytes(config: Config, sources: Sequence[Source], count: int) -> lis
     return sizes
 
 
-def _size_in_shard(config: Config, source: Source, read: Read) -> int:
+def _size_in_shard(config: Config, source: Source, read: ReadFile) -> int:
     side, bits = config.source.downscale, 8
     if config.source.place is None:
-        height, width = synthetic.SIZES.get(source.path, synthetic.DEFAULT_SIZE)
+        height, width = synthetic.SCENE_SIZES.get(source.path, synthetic.DEFAULT_SIZE)
     elif source.is_video or config.source.kind == "raw":
         height, width = load_source(config.source, replace(source, frame=0))[1].srgb.shape[:2]
         side = 1

@@ -18,7 +18,7 @@ from unprocess_gen.pipeline.pairs import PairSettings
 
 Item = TypeVar("Item")
 
-SHOWN = 3
+FAILURES_SHOWN = 3
 """Failed sources that a run names; the manifest lists all."""
 
 
@@ -219,8 +219,8 @@ class ShardResult:
             if row["status"] == "ok" and row["clip"] != NO_CLIP and row["patch"] == 0
         }
         failed = [row for row in images if row["status"] == "failed"]
-        details = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in failed[:SHOWN]]
-        failures = () if self.killer else (*details, *self.log.notes[:SHOWN])
+        details = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in failed[:FAILURES_SHOWN]]
+        failures = () if self.killer else (*details, *self.log.notes[:FAILURES_SHOWN])
         counts = len(images), len(failed), len(self.rows)
         return ShardReport(self.shard, *counts, tuple(clips), self.killer, self.log, failures)
 

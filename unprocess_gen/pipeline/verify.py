@@ -154,7 +154,7 @@ def _without_path(error: DamageError) -> str:
 def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
     files = [("config.yaml", "config_sha256"), ("manifest.csv", "manifest_sha256")]
     if PARQUET_SHA256 in facts:
-        files.append((parquet.NAME, PARQUET_SHA256))
+        files.append((parquet.PARQUET_NAME, PARQUET_SHA256))
     for name, field in files:
         try:
             digest = file_sha256(folder / name)

@@ -27,7 +27,7 @@ from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, has_frames, pair_row, row_json
 from unprocess_gen.dataset.shards import PER_PAIR, ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels
-from unprocess_gen.pipeline.run_records import LIMIT, Deaths, commit_shard
+from unprocess_gen.pipeline.run_records import MAX_DEATHS, Deaths, commit_shard
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
@@ -35,7 +35,7 @@ from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
 from unprocess_gen.sources.listing import place_setting
 from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.read_ahead import Read, reading_ahead
+from unprocess_gen.sources.read_ahead import ReadFile, reading_ahead
 from unprocess_gen.sources.reading import read_bytes, source_file
 
 PARENT_POLL_S = 0.5
@@ -52,15 +52,15 @@ Mark = Callable[[Source], object]
 def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
     """Make one shard and commit it; raise MachineError if disk, memory or self-test fail.
 
-    If deaths are counted and `run_records.LIMIT` workers have died at the shard, commit provisional rows.
+    If deaths are counted and `run_records.MAX_DEATHS` workers have died at the shard, commit provisional rows.
     """
     storage = Storage(context.config.out)
     with machine_errors(any_path(context.config.out), RESUME):
         if not context.counts_deaths:
             return commit_shard(storage, make_shard(context, task))
         deaths = Deaths(storage, task.shard)
-        if deaths.count >= LIMIT:
-            report = commit_provisional(context, task, deaths.source(task.sources), LIMIT)
+        if deaths.count >= MAX_DEATHS:
+            report = commit_provisional(context, task, deaths.source(task.sources), MAX_DEATHS)
         else:
             with deaths.marked() as mark:
                 report = commit_shard(storage, make_shard(context, task, mark))
@@ -68,13 +68,13 @@ def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
         return report
 
 
-DEATHS = {2: ("two workers died", "its worker died twice"), 4: ("four workers died", "its worker died four times")}
+DEATH_WORDS = {2: ("two workers died", "its worker died twice"), 4: ("four workers died", "its worker died four times")}
 """Words for the number of workers that a shard ended: for the manifest, and for the progress."""
 
 
 def commit_provisional(context: RunContext, task: ShardTask, source: Source, deaths: int) -> ShardReport:
     """Commit rows with the reason ``worker_died`` for a shard that ended ``deaths`` workers, the last at ``source``."""
-    in_row, in_progress = DEATHS[deaths]
+    in_row, in_progress = DEATH_WORDS[deaths]
     detail = f"{in_row} at {source.name}; its shard is retried by the next run"
     seed = context.config.seed
     rows = tuple(failed_row(lost, None, task.shard, seed, "worker_died", detail) for lost in task.sources)
@@ -121,7 +121,7 @@ def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source:
 
 
 def make_image(
-    context: RunContext, shard: int, source: Source, writer: ShardWriter, log: ShardLog, read: Read = read_bytes
+    context: RunContext, shard: int, source: Source, writer: ShardWriter, log: ShardLog, read: ReadFile = read_bytes
 ) -> list[Row]:
     """Append the samples of one image to a shard, and return its rows; failures and times go to ``log``."""
     config = context.config

@@ -52,11 +52,11 @@ REPORT = "report.html"
 CARD_FILES = ("README.md", "croissant.json")
 """The page and the card of a dataset, files in its folder that are not part of the dataset."""
 
-SHOWN = 3
+DIFFERENCES_SHOWN = 3
 """Differences named in an error; the others are counted."""
 
 
-Digest = Callable[[Source, str | None], str | None]
+PresentDigest = Callable[[Source, str | None], str | None]
 """Function of a source and its known SHA-256 that returns the present SHA-256, None if it is not known."""
 
 
@@ -200,7 +200,7 @@ class Workspace:
             )
 
     def _check_same_sources(
-        self, known: Callable[[], Iterator[Source]], sources: Sequence[Source], digest: Digest
+        self, known: Callable[[], Iterator[Source]], sources: Sequence[Source], digest: PresentDigest
     ) -> None:
         """Raise ConfigError if the sources are not those that are known; name the differences.
 
@@ -254,10 +254,10 @@ class Workspace:
 
 def add_parquet(storage: Storage, manifest: Path) -> dict[str, Any]:
     """Write ``manifest.parquet``; return what ``dataset.json`` holds about it."""
-    path = storage.scratch / parquet.NAME
+    path = storage.scratch / parquet.PARQUET_NAME
     parquet.write_parquet(manifest, path)
     sha256 = file_sha256(path)
-    (storage / parquet.NAME).commit(path)
+    (storage / parquet.PARQUET_NAME).commit(path)
     return {PARQUET_SHA256: sha256}
 
 
@@ -283,7 +283,7 @@ def _first_of_files(sources: Iterable[Source]) -> Iterator[Source]:
     return (next(group) for _, group in itertools.groupby(sources, key=operator.attrgetter("name")))
 
 
-def _change(name: str, file: Source | None, source: Source | None, digest: Digest) -> str:
+def _change(name: str, file: Source | None, source: Source | None, digest: PresentDigest) -> str:
     """Describe how a source differs from the known file of its name; empty if it does not."""
     if file is None or source is None:
         return f"{name} is new" if file is None else f"{name} was deleted"
@@ -292,7 +292,7 @@ def _change(name: str, file: Source | None, source: Source | None, digest: Diges
     return "" if _is_same(file, source, digest) else f"{name} has other bytes than it had"
 
 
-def _is_same(file: Source, source: Source, digest: Digest) -> bool:
+def _is_same(file: Source, source: Source, digest: PresentDigest) -> bool:
     """Check whether a source has the size of the known one, and its digest and ETag if both are known."""
     if source.size_bytes != file.size_bytes or (file.etag and source.etag not in (None, file.etag)):
         return False
@@ -358,5 +358,5 @@ def _shard_number(name: str) -> int:
 
 
 def _first(differing: Sequence[str]) -> str:
-    rest = len(differing) - SHOWN
-    return "; ".join(itertools.islice(differing, SHOWN)) + (f"; and {rest} more" if rest > 0 else "")
+    rest = len(differing) - DIFFERENCES_SHOWN
+    return "; ".join(itertools.islice(differing, DIFFERENCES_SHOWN)) + (f"; and {rest} more" if rest > 0 else "")

@@ -24,7 +24,7 @@ class Draw(IntEnum):
 
 EFFECT_COUNTERS = tuple(number.counter for number in NUMBERS.values() if number.counter >= 0)
 
-COUNT = max(*EFFECT_COUNTERS, *Draw) + 1
+DRAW_COUNT = max(*EFFECT_COUNTERS, *Draw) + 1
 """Draws of an image."""
 
 NOISE_COUNTERS = (Draw.A, Draw.B, Draw.ISO, *EFFECT_COUNTERS)

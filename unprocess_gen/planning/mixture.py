@@ -12,7 +12,7 @@ from unprocess_gen.config.interpretation import entry_config
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.random_streams import mixture_word, stream_key
 
-WORDS = 2**64
+WORD_COUNT = 2**64
 """Number of values of `random_streams.mixture_word`."""
 
 
@@ -39,7 +39,7 @@ def entry_number(config: Config, key: int, epoch: int = 0) -> int:
 def drawn_entry(weights: Sequence[int], word: int) -> int:
     """Return the first entry whose cumulative share exceeds ``word`` / 2^64, in exact arithmetic."""
     total = sum(weights)
-    return next(number for number, end in enumerate(itertools.accumulate(weights)) if word * total < end * WORDS)
+    return next(number for number, end in enumerate(itertools.accumulate(weights)) if word * total < end * WORD_COUNT)
 
 
 @functools.lru_cache

@@ -77,7 +77,7 @@ class PhysicalNoise:
         self, branch: BranchConfig, iso: float, exposure: tuple[float, float], uniform: Callable[[Number], float]
     ) -> dict[str, Any]:
         """Return the numbers of the effects that the profile has; ``exposure`` is the time and the warmth."""
-        gain, shape = number(branch.dn_per_e, iso=iso), 0.0
+        gain, shape = evaluate(branch.dn_per_e, iso=iso), 0.0
         values: dict[str, Any] = {}
         for name, declared in NUMBERS.items():
             value = getattr(branch if declared.in_branch else self.noise, declared.key or name)
@@ -88,7 +88,7 @@ class PhysicalNoise:
             elif declared.kind == SHAPE:
                 value = shape = self._shape(branch, iso, uniform(declared))
             elif declared.kind == DN:
-                value = number(value, iso=iso, gain=gain, uniform=uniform(declared), shape=shape) * self.scale
+                value = evaluate(value, iso=iso, gain=gain, uniform=uniform(declared), shape=shape) * self.scale
             elif declared.kind == SITES:
                 value = tuple(error * self.scale for error in _values_of_sites(value, branch, iso, self.sensor.pattern))
             elif declared.count > 1:
@@ -122,7 +122,7 @@ class PhysicalNoise:
         return draw_parameter(shapes, uniform)
 
 
-def number(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, shape: float = 0.0) -> float:
+def evaluate(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, shape: float = 0.0) -> float:
     """Evaluate a number of a branch: a plain number, or one of `FORMS`; None gives 0.
 
     ``gain`` is K in DN of the profile; ``uniform`` draws the scatter of a line; ``shape`` is the λ of the Tukey-λ

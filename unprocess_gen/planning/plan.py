@@ -21,7 +21,7 @@ from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core import types
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, split_uniform, stream_key
 from unprocess_gen.core.types import DarkFrames, Facts, Plan, SourcePlan
-from unprocess_gen.planning.draws import COUNT, NOISE_COUNTERS, Draw
+from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
     Prediction,
@@ -90,7 +90,7 @@ def drawn_light(config: Config, key: int) -> tuple[str, float]:
     """Draw the light of an image again, and its colour temperature; empty and 0 if the gains follow from no light."""
     if config.source.kind == "raw":
         return "", 0.0
-    camera = _planner(config).draw_camera(parameter_uniforms(key, COUNT))
+    camera = _planner(config).draw_camera(parameter_uniforms(key, DRAW_COUNT))
     return camera.light, camera.cct_k
 
 
@@ -210,7 +210,7 @@ class Planner:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
-        uniforms = parameter_uniforms(key, COUNT, epoch=epoch)
+        uniforms = parameter_uniforms(key, DRAW_COUNT, epoch=epoch)
         scene = types.ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
         source, isp = self._source, self._isp
@@ -230,7 +230,7 @@ class Planner:
         image = Image(seed, key, facts, signals, dark_frames, source)
         for number, level in enumerate(self._levels):
             if number:
-                drawn_again = parameter_uniforms(key, COUNT, number, epoch)
+                drawn_again = parameter_uniforms(key, DRAW_COUNT, number, epoch)
                 for counter in NOISE_COUNTERS:
                     uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)

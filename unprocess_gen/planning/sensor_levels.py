@@ -10,7 +10,7 @@ from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 
-LEVELS = ("bits", "black_level_dn", "white_level_dn")
+LEVEL_NAMES = ("bits", "black_level_dn", "white_level_dn")
 
 
 def sensor_warning(config: Config) -> str:
@@ -18,8 +18,8 @@ def sensor_warning(config: Config) -> str:
 
     The sentence names the option with the profile's bits and the settings that give its levels; else it is empty.
     """
-    calibrated, chosen = ({key: getattr(group, key) for key in LEVELS} for group in (config.noise, config.sensor))
-    default = {key: default_values("sensor")[key] for key in LEVELS}
+    calibrated, chosen = ({key: getattr(group, key) for key in LEVEL_NAMES} for group in (config.noise, config.sensor))
+    default = {key: default_values("sensor")[key] for key in LEVEL_NAMES}
     if not is_physical(config.noise) or chosen != default or calibrated == default:
         return ""
     return (

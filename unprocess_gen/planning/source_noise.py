@@ -18,7 +18,7 @@ from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.simulation.reference.cfa import filters
 from unprocess_gen.simulation.reference.unprocess import camera_light
 
-TILE = 32
+TILE_SIDE = 32
 """Side of a tile, pixels; its green plane has half of it."""
 
 MOST_TILES, SPACING = 8, 96
@@ -33,7 +33,7 @@ DECIMALS = 3
 LAPLACIAN_SCALE = math.sqrt(math.pi / 2) / 6
 """Standard deviation of white noise divided by the mean magnitude of its Laplacian (Immerkær 1996)."""
 
-Integers = NDArray[np.int64]
+IntegerArray = NDArray[np.int64]
 
 
 class TileNoise(NamedTuple):
@@ -94,24 +94,24 @@ def noise_ratio(srgb: Srgb, plan: Plan) -> float | None:
 
 
 def _green_sites(srgb: Srgb, pattern: str) -> Srgb:
-    """Return the pixels at the first green site of each 2x2 tile of the CFA, [N, TILE / 2, TILE / 2, 3]."""
+    """Return the pixels at the first green site of each 2x2 tile of the CFA, [N, TILE_SIDE / 2, TILE_SIDE / 2, 3]."""
     height, width = srgb.shape[:2]
     top, left = divmod(filters(pattern).index("G"), 2)
-    inside = np.arange(0, TILE, 2)
+    inside = np.arange(0, TILE_SIDE, 2)
     rows, columns = _starts(height)[:, None] + (inside + top), _starts(width)[:, None] + (inside + left)
-    tiles: Srgb = srgb[rows[:, None, :, None], columns[None, :, None, :]].reshape(-1, TILE // 2, TILE // 2, 3)
+    tiles: Srgb = srgb[rows[:, None, :, None], columns[None, :, None, :]].reshape(-1, TILE_SIDE // 2, TILE_SIDE // 2, 3)
     return tiles
 
 
 def _starts(length: int) -> NDArray[np.intp]:
     """Return the even places at which tiles begin, evenly spaced; none if no tile fits."""
-    if length < TILE:
+    if length < TILE_SIDE:
         return np.zeros(0, dtype=np.intp)
     count = min(MOST_TILES, max(1, length // SPACING))
-    return np.arange(count) * (length - TILE) // max(count - 1, 1) // 2 * 2
+    return np.arange(count) * (length - TILE_SIDE) // max(count - 1, 1) // 2 * 2
 
 
-def _laplacian_sums(tiles: Integers) -> Integers:
+def _laplacian_sums(tiles: IntegerArray) -> IntegerArray:
     """Return the sum of |L| in each tile; L is the product of the second differences of rows and of columns.
 
     The coefficients of L have the sum of squares 36.

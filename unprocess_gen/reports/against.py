@@ -34,7 +34,7 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.output_paths import check_output_file
-from unprocess_gen.planning.draws import COUNT
+from unprocess_gen.planning.draws import DRAW_COUNT
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.plan import TwoNumberLevel
 from unprocess_gen.reports.formatting import short_number
@@ -42,7 +42,7 @@ from unprocess_gen.reports.noise_check.checks import FALSE_ALARM
 from unprocess_gen.reports.noise_check.scores import Score
 from unprocess_gen.simulation.effects import Physics, profile_keys
 
-EFFECTS = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
+EFFECT_OF_NUMBER = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
 """Effect of each number that is compared, by its name in the list of estimates."""
 AT_TEMPERATURE = ("dark_e_per_s", "hot_pixel_share", "hot_pixel_e_per_s")
 """Numbers that can be compared only if the frames state their temperature."""
@@ -71,7 +71,7 @@ class Comparison(NamedTuple):
         text = f"{place}{name} of the frames is {short_number(number.value, 4)}{unit}"
         text += f" ({short_number(number.low, 4)} to {short_number(number.high, 4)})"
         if self.verdict == LACKS:
-            return f"{text}; the profile lacks it: effect {EFFECTS[name]} is missing in the dataset"
+            return f"{text}; the profile lacks it: effect {EFFECT_OF_NUMBER[name]} is missing in the dataset"
         if self.verdict == UNSEEN:
             return f"{text}; the profile has {short_number(self.profile, 4)}: the camera does not show it"
         side = "above" if self.score.total > 0 else "below"
@@ -138,7 +138,7 @@ def _compared(calibration: Calibration, profile: Profile, known: dict[float, Est
     """Yield the comparison of each estimate."""
     celsius, isos = calibration.body.dark_reference_c, calibration.captures.isos
     variances = [Named("b_dn2", result.iso, None, dark_variance(result), "DN²") for result in calibration.isos]
-    listed = [estimate for estimate in [*estimates(calibration), *variances] if estimate.name in EFFECTS]
+    listed = [estimate for estimate in [*estimates(calibration), *variances] if estimate.name in EFFECT_OF_NUMBER]
     limit, sites = math.log(2 * len(listed) / FALSE_ALARM), site_names(calibration.sensor)
     tukey = {
         (result.iso, place): shape.is_tukey
@@ -202,16 +202,16 @@ class Profile:
         scene = dataclasses.replace(self.config.scene, iso=iso, exposure_s=1.0)
         if celsius is not None:
             scene = dataclasses.replace(scene, temperature_c=celsius)
-        config, middle = dataclasses.replace(self.config, scene=scene), [0.5] * COUNT
+        config, middle = dataclasses.replace(self.config, scene=scene), [0.5] * DRAW_COUNT
         if is_physical(config.noise):
             physics = PhysicalNoise(config).draw(middle, 0, 0)
-            return {name: self._number(name, physics) for name in EFFECTS if name != "b_dn2"}
+            return {name: self._number(name, physics) for name in EFFECT_OF_NUMBER if name != "b_dn2"}
         a, b = TwoNumberLevel(config, 0).two_numbers(middle)
         two: dict[str, float | None] = {"dn_per_e": a, "b_dn2": b, "read_std_dn": None, "read_shape": None}
-        return {name: [two.get(name, 0.0)] * 5 for name in EFFECTS if name != "full_well_e"}
+        return {name: [two.get(name, 0.0)] * 5 for name in EFFECT_OF_NUMBER if name != "full_well_e"}
 
     def _number(self, name: str, physics: Physics) -> list[float | None]:
-        if getattr(self.config.effects, EFFECTS[name]) == "off":
+        if getattr(self.config.effects, EFFECT_OF_NUMBER[name]) == "off":
             return [0.0 if name != "full_well_e" else None] * 5
         if name == "black_error_dn":
             return [sum(physics.black_error_dn) / 4, *physics.black_error_dn]

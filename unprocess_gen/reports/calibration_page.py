@@ -18,7 +18,7 @@ from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.output_paths import check_output_file
-from unprocess_gen.planning.noise_profile import number
+from unprocess_gen.planning.noise_profile import evaluate
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import require_libraries
@@ -91,8 +91,8 @@ def _sensors(calibration: Calibration, name: str) -> PageTable:
         span = noise.white_level_dn - noise.black_level_dn
         for branch in noise.branches:
             for iso in sorted(iso for iso in isos if branch.iso[0] <= iso <= branch.iso[1]):
-                gain = number(branch.dn_per_e, iso=iso)
-                stds = (number(getattr(branch, key), iso=iso, gain=gain) for key in ("read_std_dn", "row_std_dn"))
+                gain = evaluate(branch.dn_per_e, iso=iso)
+                stds = (evaluate(getattr(branch, key), iso=iso, gain=gain) for key in ("read_std_dn", "row_std_dn"))
                 electrons = [short_number(std / gain, 3) for std in stds]
                 lines.append((option, f"{iso:g}", short_number(gain, 3), *electrons, short_number(span / gain, 3)))
     headings = ("sensor", "ISO", "DN per electron", "read noise (e)", "row noise (e)", "electrons at white")
@@ -186,7 +186,7 @@ def _against_iso(calibration: Calibration) -> bytes:
         for branch in iso_branches(calibration.isos):
             form = law([isos[index] for index in branch], [numbers[index] for index in branch])
             grid = np.geomspace(isos[branch[0]], isos[branch[-1]], 50)
-            laws = [number(form, iso=iso) or math.nan for iso in grid.tolist()]
+            laws = [evaluate(form, iso=iso) or math.nan for iso in grid.tolist()]
             axes.plot(grid, laws, linewidth=0.8, color=f"C{place}")
     for axes in (left, right):
         axes.set(xscale="log", yscale="log", xlabel="ISO")

@@ -19,8 +19,8 @@ from unprocess_gen.simulation.reference.unprocess import invert_gains
 WIDE = 0.02
 """Least width of a band that counts, as a fraction of the raw range. Below the highlights no band is as wide."""
 
-CHANNELS = ("R", "G", "B")
-SITES = (0.25, 0.5, 0.25)
+RGB = ("R", "G", "B")
+SITE_SHARES = (0.25, 0.5, 0.25)
 """Fraction of the sites of each channel in a Bayer pattern."""
 
 
@@ -51,7 +51,7 @@ def empty_bands(srgb: Srgb, plan: Plan) -> EmptyBands:
     edges[1:255] |= wide[:-1]
     shares = [edge[srgb[..., channel]].mean() for channel, edge in enumerate(edges.T)]
     red, green, blue = np.where(wide, widths, 0).max(axis=0).tolist()
-    return EmptyBands(float(np.dot(SITES, shares)), (red, green, blue))
+    return EmptyBands(float(np.dot(SITE_SHARES, shares)), (red, green, blue))
 
 
 def highlight_sentence(bands: Sequence[EmptyBands]) -> str:
@@ -60,7 +60,7 @@ def highlight_sentence(bands: Sequence[EmptyBands]) -> str:
     if not share:
         return ""
     widest = np.max([band.widest for band in bands], axis=0)
-    widths = ", ".join(f"{100 * width:.0f} % ({name})" for name, width in zip(CHANNELS, widest, strict=True) if width)
+    widths = ", ".join(f"{100 * width:.0f} % ({name})" for name, width in zip(RGB, widest, strict=True) if width)
     return (
         f"{percentage(share)} of the sites are highlights where 8-bit codes are coarse: neighbouring codes are up to "
         f"{widths} of the raw range apart; source.dequantize=dither_all fills the bands"

@@ -31,7 +31,7 @@ from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
-from unprocess_gen.pipeline.sizes import SAMPLE as SIZE_SAMPLE
+from unprocess_gen.pipeline.sizes import HEADERS_READ as SIZE_SAMPLE
 from unprocess_gen.pipeline.sizes import estimate_shards, source_bytes
 from unprocess_gen.pipeline.targets import noise_law, targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
@@ -52,7 +52,7 @@ LOGGER = logging.getLogger("unprocess_gen")
 SAMPLE = 8
 """Number of sources of which pairs are made, unless all are asked for."""
 
-HEADER_BYTES = 2**31
+BYTES_WITH_HEADERS = 2**31
 """Bytes of the files whose headers are read, at most; of more, evenly spaced ones are read."""
 
 SLOW_TIER = "reference"
@@ -206,11 +206,11 @@ def _sample(sources: Sequence[Source], entries: Sequence[int] | None) -> list[So
 
 
 def _headers_read(config: Config, sources: Sequence[Source]) -> int:
-    """Number of sources whose headers are read: all, as long as their files have `HEADER_BYTES`."""
+    """Number of sources whose headers are read: all, as long as their files have `BYTES_WITH_HEADERS`."""
     if config.source.place is not None and is_remote(config.source.place):
         return SIZE_SAMPLE
     mean_bytes = sum(source.size_bytes or 0 for source in sources) // len(sources)
-    return min(len(sources), max(SIZE_SAMPLE, HEADER_BYTES // max(mean_bytes, 1)))
+    return min(len(sources), max(SIZE_SAMPLE, BYTES_WITH_HEADERS // max(mean_bytes, 1)))
 
 
 def _seconds_per_byte(out: Path) -> float:

@@ -255,13 +255,13 @@ def _assumed_sentence(config: Config, plans: Sequence[Plan]) -> str | None:
     return f"of the variance of a pixel, {black:.0%} at black and {white:.0%} at white rest on assumed numbers"
 
 
-LONGEST_VALUE = 20
+LONGEST_CELL = 20
 """Characters of the longest assumed value that is shown."""
 
 
 def _number_text(noise: NoiseConfig, key: str) -> str:
     text = value_text(getattr(noise.branches[0] if key in BRANCH_FIELDS else noise, key))
-    return text if len(text) <= LONGEST_VALUE else "…"
+    return text if len(text) <= LONGEST_CELL else "…"
 
 
 def _dark_frames_sentence(config: Config, dark_frames: DarkFrames) -> str:

@@ -34,7 +34,7 @@ from unprocess_gen.simulation.reference.isp import to_light
 JPEG_QUALITY = 70
 COLUMNS = 5
 """Values of the key across the table, if one has as many: they fit a window of 1200 pixels."""
-LEVELS = 64
+CURVE_LEVELS = 64
 CURVE_PX = (120, 48)
 """Width and height of the curve of the noise."""
 
@@ -128,13 +128,13 @@ def _pictures(folder: Path) -> tuple[tuple[tuple[str, str], ...], Float]:
     drawn = {"clean raw": raw[0], "noisy raw": raw[1]}
     if min(shape) > 1:
         drawn["noisy, developed"] = develop_detail(frames[1], plan, window)
-    signal_dn = np.linspace(plan.sensor.black_level_dn, plan.sensor.white_level_dn, LEVELS)
+    signal_dn = np.linspace(plan.sensor.black_level_dn, plan.sensor.white_level_dn, CURVE_LEVELS)
     std_dn = noise_std(signal_dn, noise_law(plan)).astype(np.float64)
     return tuple((title, _jpeg(picture)) for title, picture in drawn.items()), std_dn
 
 
 def _jpeg(picture: Any) -> str:
-    _, encoded = cv2.imencode(".jpg", panels.to_codes(picture)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    _, encoded = cv2.imencode(".jpg", panels.byte_codes(picture)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return data_uri(encoded.tobytes(), "jpeg")
 
 

@@ -49,7 +49,7 @@ class BrightPixels(NamedTuple):
     mean_e: float
 
 
-class DeadPixels(NamedTuple):
+class DeadSlot(NamedTuple):
     """Share of the pixels of a body that read ``value_dn``, chosen by words of ``stream``."""
 
     body_key: int
@@ -69,7 +69,7 @@ class Patterns(NamedTuple):
         Factor on the electrons of light; if the clean frame contains the fixed patterns, on its light instead.
     sites_dn : NormalPattern or None
         Offsets by site, DN; the clean frame can contain them.
-    bright, dead : BrightPixels or None, DeadPixels or None
+    bright, dead : BrightPixels or None, DeadSlot or None
         Defects: pixels with additional electrons, and pixels of one value.
     """
 
@@ -77,10 +77,10 @@ class Patterns(NamedTuple):
     electrons: NormalPattern | None = None
     sites_dn: NormalPattern | None = None
     bright: BrightPixels | None = None
-    dead: DeadPixels | None = None
+    dead: DeadSlot | None = None
 
 
-class Words(NamedTuple):
+class SlotWords(NamedTuple):
     """Random words of a frame, or of a body: their key, stream, level, draw and frame."""
 
     key: int
@@ -96,7 +96,7 @@ class LineOffsets(NamedTuple):
     Neighbouring rows have the correlation ``correlation`` (`reference.noise.autoregressive`).
     """
 
-    words: Words
+    words: SlotWords
     std_dn: float
     correlation: float = 0.0
 

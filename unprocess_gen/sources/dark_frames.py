@@ -25,7 +25,7 @@ from unprocess_gen.core.types import DarkFrame, DarkFrames, DarkShading, Raw
 from unprocess_gen.sources import dark_shading, mosaics
 from unprocess_gen.sources.mosaics import Mosaic, mosaic_sha256, read_mosaic
 
-KEY = "noise.dark_frames"
+FRAMES_KEY = "noise.dark_frames"
 
 LEAST_SIDE = 64
 """Least height and width of a dark frame, pixels."""
@@ -129,7 +129,7 @@ class DarkPlaces:
         return dark_folder(self.frames, self.shading)
 
 
-NO_DARK_FRAMES = DarkPlaces()
+NO_PLACES = DarkPlaces()
 """For datasets without dark frames."""
 
 
@@ -196,8 +196,8 @@ def _described(
     counts = np.zeros(2**16, dtype=np.int64)
     blacks: set[float | None] = set()
     for sha256, name in sorted(folder.files.items()):
-        mosaic = read_mosaic(Path(folder.folder) / name, KEY)
-        _check(f"{KEY}={folder.folder}: {name}", mosaic, noise.bits, sensor.pattern)
+        mosaic = read_mosaic(Path(folder.folder) / name, FRAMES_KEY)
+        _check(f"{FRAMES_KEY}={folder.folder}: {name}", mosaic, noise.bits, sensor.pattern)
         blacks.add(mosaic.black_dn)
         pixels = folder.frame(sha256)
         frames.append(DarkFrame(sha256, *pixels.shape))
@@ -219,7 +219,7 @@ def _described(
             raise ConfigError(
                 "noise.dark_shading=remove: the mean of one dark frame is the frame itself; expected several"
             )
-        _, variance_dn2 = dark_shading.differences(folder.shading(folder.sha256), 0.0, folder.frames())
+        _, variance_dn2 = dark_shading.shading_differences(folder.shading(folder.sha256), 0.0, folder.frames())
         shading = DarkShading(folder.sha256)
     elif shading_map is not None:
         derived = None if stated_dn is not None else level
@@ -252,10 +252,10 @@ def _around_map(
     is_above_black = dark_shading.is_above_black(values, black_dn)
     subtracted_dn = black_dn if is_above_black else 0.0
     if is_above_black and level is not None:
-        level_dn, variance_dn2 = dark_shading.differences(values, subtracted_dn, folder.frames(), level)
+        level_dn, variance_dn2 = dark_shading.shading_differences(values, subtracted_dn, folder.frames(), level)
         if subtracted_dn + level_dn > 0:
             return variance_dn2, DarkShading(sha256, subtracted_dn + level_dn, path.name)
-    median_dn, variance_dn2 = dark_shading.differences(values, subtracted_dn, folder.frames())
+    median_dn, variance_dn2 = dark_shading.shading_differences(values, subtracted_dn, folder.frames())
     dark_shading.check_residual(path, median_dn, variance_dn2)
     return variance_dn2, DarkShading(sha256, subtracted_dn, path.name, median_dn)
 
@@ -292,14 +292,14 @@ def _black_level(folder: DarkFolder, stated: set[float | None]) -> float | None:
 def _mapped(path: Path, sha256: str) -> Raw:
     """Return the array of an NPY file, mapped into memory."""
     mosaics.check_sha256(path, "dark frame", sha256)
-    return mosaics.map_mosaic(path, KEY)
+    return mosaics.map_mosaic(path, FRAMES_KEY)
 
 
 @functools.lru_cache(maxsize=DECODED)
 def _decoded(path: Path, sha256: str) -> Raw:
     """Return the pixels of another file."""
     mosaics.check_sha256(path, "dark frame", sha256)
-    return read_mosaic(path, KEY).pixels
+    return read_mosaic(path, FRAMES_KEY).pixels
 
 
 @functools.lru_cache(maxsize=1)

@@ -21,7 +21,7 @@ from unprocess_gen.sources.clips import clip_warnings, number_clips
 from unprocess_gen.sources.image import decode
 from unprocess_gen.sources.listing import Listing, list_file, list_folder, matcher, place_setting
 from unprocess_gen.sources.raw.frames import read_raw_source
-from unprocess_gen.sources.read_ahead import Read
+from unprocess_gen.sources.read_ahead import ReadFile
 from unprocess_gen.sources.scenes import synthetic
 from unprocess_gen.sources.twins import number_twins
 from unprocess_gen.sources.video.decode import Video
@@ -67,7 +67,7 @@ def list_photographs(config: SourceConfig) -> Listing:
 
 
 def load_source(
-    config: SourceConfig, source: Source, layout: str = MOSAIC, read: Read = reading.read_bytes
+    config: SourceConfig, source: Source, layout: str = MOSAIC, read: ReadFile = reading.read_bytes
 ) -> tuple[str, Photograph]:
     """Read, decode and downscale one source; return the SHA-256 of its file, or of a scene's pixels, and the pixels.
 
@@ -117,7 +117,7 @@ def downscaled(srgb: Srgb, side: int) -> Srgb:
     return np.asarray((sums + count) // (np.uint64(2) * count), dtype=np.uint16)
 
 
-def _decoded(config: SourceConfig, source: Source, read: Read) -> tuple[str, Photograph]:
+def _decoded(config: SourceConfig, source: Source, read: ReadFile) -> tuple[str, Photograph]:
     place = config.place
     if place is None:
         try:

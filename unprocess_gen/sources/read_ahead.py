@@ -16,7 +16,7 @@ from unprocess_gen.core.object_store import started_ahead
 from unprocess_gen.core.roots import Root, is_remote
 from unprocess_gen.core.types import Source
 
-Read = Callable[[Root, Source], bytes]
+ReadFile = Callable[[Root, Source], bytes]
 """Function that returns the bytes of a source below a root: `reading.read_bytes`, or one that has read ahead."""
 
 AHEAD = 8
@@ -27,7 +27,7 @@ AHEAD_BYTES = 2**28
 
 
 @contextmanager
-def reading_ahead(root: Root | None, read: Read, sources: Sequence[Source]) -> Iterator[Read]:
+def reading_ahead(root: Root | None, read: ReadFile, sources: Sequence[Source]) -> Iterator[ReadFile]:
     """Read sources of an object store ahead while the body processes them in order; yield a function like ``read``.
 
     A source that is read a second time, or out of order, is read when it is asked for.

@@ -191,7 +191,7 @@ def test_white_stays_exactly_1_for_two_million_gains_below_1(highlight: str) -> 
     white = np.ones((len(k), 1, 3)) if highlight == "gray_mean" else np.ones(len(k))
     gains = np.repeat(k, 3).reshape(-1, 1, 3) if highlight == "gray_mean" else k
     assert (k < 1).all()
-    assert (unprocess.HIGHLIGHTS[highlight](white, gains, 0.9) == 1).all()
+    assert (unprocess.INVERSE_HIGHLIGHTS[highlight](white, gains, 0.9) == 1).all()
 
 
 @pytest.mark.parametrize("threshold", [0.0, 0.5, 0.9, 0.99, 1 - 2.0**-53])

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from unprocess_gen.sources.scenes.synthetic import CLIP_FRAMES, NAMES, PAN, clip_listing, listing, scene
+from unprocess_gen.sources.scenes.synthetic import FRAMES_PER_CLIP, PAN, SCENES, clip_listing, listing, scene
 
 SLOW = pytest.mark.slow
 GOLDEN = {
@@ -31,7 +31,7 @@ GOLDEN = {
 @pytest.fixture(scope="module")
 def pictures() -> dict[str, np.ndarray]:
     """Return every scene by name; tests leave them as they are."""
-    return {name: scene(name) for name in NAMES}
+    return {name: scene(name) for name in SCENES}
 
 
 def sha256(picture: np.ndarray) -> str:
@@ -40,10 +40,10 @@ def sha256(picture: np.ndarray) -> str:
 
 def test_scenes_are_the_golden_ones(pictures: dict[str, np.ndarray]) -> None:
     assert {name: sha256(picture) for name, picture in pictures.items()} == GOLDEN
-    assert len(set(GOLDEN.values())) == len(NAMES)
+    assert len(set(GOLDEN.values())) == len(SCENES)
 
 
-@pytest.mark.parametrize("name", ["colour_chart-1", "gradients-1", *(pytest.param(one, marks=SLOW) for one in NAMES)])
+@pytest.mark.parametrize("name", ["colour_chart-1", "gradients-1", *(pytest.param(one, marks=SLOW) for one in SCENES)])
 def test_changing_a_picture_leaves_the_next_one_as_it_is(name: str) -> None:
     scene(name)[:] = 0
     assert sha256(scene(name)) == GOLDEN[name]
@@ -59,16 +59,16 @@ def test_some_scenes_contain_black_and_blown_white(kind: str, pictures: dict[str
 def test_frames_of_a_clip_are_windows_that_move_over_the_scene() -> None:
     first, third = scene("gradients-1/0000"), scene("gradients-1/0002")
     assert np.array_equal(first[2 * PAN[0] :, 2 * PAN[1] :], third[: -2 * PAN[0], : -2 * PAN[1]])
-    last = scene(f"gradients-1/{CLIP_FRAMES - 1:04}")
+    last = scene(f"gradients-1/{FRAMES_PER_CLIP - 1:04}")
     assert np.array_equal(last, scene("gradients-1")[-last.shape[0] :, -last.shape[1] :])
-    assert clip_listing(CLIP_FRAMES + 1)[-2:] == ("dead_leaves-0/0007", "colour_chart-0/0000")
+    assert clip_listing(FRAMES_PER_CLIP + 1)[-2:] == ("dead_leaves-0/0007", "colour_chart-0/0000")
     for name in ("gradients-1/0008", "gradients-1/1", "gradients-1/"):
         with pytest.raises(ValueError, match="expected 0000 to 0007"):
             scene(name)
 
 
 def test_a_shorter_listing_begins_a_longer_one() -> None:
-    assert listing(None) == NAMES
+    assert listing(None) == SCENES
     for count in (0, 1, 7, 10, 23):
         assert len(listing(count)) == count
         assert listing(40)[:count] == listing(count)
@@ -84,8 +84,8 @@ def test_a_name_that_is_no_scene_is_refused(name: str) -> None:
 @pytest.mark.slow
 def test_scenes_do_not_depend_on_the_vector_units() -> None:
     code = (
-        "import hashlib, sys; from unprocess_gen.sources.scenes.synthetic import NAMES, scene;"
-        "print(*[hashlib.sha256(scene(name).tobytes()).hexdigest()[:16] for name in NAMES])"
+        "import hashlib, sys; from unprocess_gen.sources.scenes.synthetic import SCENES, scene;"
+        "print(*[hashlib.sha256(scene(name).tobytes()).hexdigest()[:16] for name in SCENES])"
     )
     features = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR AVX2 AVX512F FMA3"
     environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": features}

@@ -7,7 +7,7 @@ commit shards themselves, so a chunk that is lost or made twice costs time, but 
 What happens when something fails:
 
 * A worker dies, or sends no sign of life for ``executor.lost_worker_s``: other workers get the shards of its chunks.
-  A shard that ends its workers gets provisional rows after `run_records.LIMIT` deaths, counted below ``.work``.
+  A shard that ends its workers gets provisional rows after `run_records.MAX_DEATHS` deaths, counted below ``.work``.
 * A worker is slow: once no shard waits, idle workers take shards from the end of its chunks.
 * A worker makes other bytes (canary, self-test): it gets no chunk. Without any other worker the run ends.
 * A worker reports a system error: it gets no chunk for `PAUSE_S`. The run ends if this repeats (`TRIES`).

@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CLEAN_ERROR = "clean frame, RMS (DN)"
+CLEAN_ERROR_LABEL = "clean frame, RMS (DN)"
 
 PANELS = {
     "complete tiers, clean and noisy frame": (("tier_noisy", "tier_electrons"), "noisy frame, RMS (σ of its noise)"),
-    "curve": (("curve",), CLEAN_ERROR),
-    "colour": (("colour",), CLEAN_ERROR),
-    "mosaic": (("mosaic",), CLEAN_ERROR),
+    "curve": (("curve",), CLEAN_ERROR_LABEL),
+    "colour": (("colour",), CLEAN_ERROR_LABEL),
+    "mosaic": (("mosaic",), CLEAN_ERROR_LABEL),
     "normal": (("normal",), "normal deviate, RMS (σ)"),
     "shot": (("shot",), "noisy frame, RMS (σ of its noise)"),
     "effects": (("effects",), "noisy frame, RMS (DN)"),
-    "quantise": (("quantise",), CLEAN_ERROR),
+    "quantise": (("quantise",), CLEAN_ERROR_LABEL),
 }
 """Stages and label of the error of each panel, by title; the first panel is twice as wide."""
 

@@ -175,7 +175,7 @@ NORMAL_WORDS = 2**16
 LEAST_NS = 0.01
 """Smallest difference of times, ns per pixel, that is reported; smaller differences are noise."""
 
-DIFFERENCES = {"shot": ("with_shot", "without_shot"), "effects": ("without_shot", "without_effects")}
+STAGE_DIFFERENCES = {"shot": ("with_shot", "without_shot"), "effects": ("without_shot", "without_effects")}
 """Pairs of `session.EDITS` whose difference is the time of a stage."""
 
 
@@ -187,9 +187,9 @@ def has_time(method: Method) -> bool:
 def method_ns(session: BenchmarkSession, method: Method, image: BenchmarkImage) -> float:
     """The time of a method on an image."""
     accuracy = sessions.budget_for(method, session.tiers)
-    if method.stage in DIFFERENCES:
+    if method.stage in STAGE_DIFFERENCES:
         longer, shorter = (
-            pair_ns(session, sessions.PHYSICAL, accuracy, image, edit) for edit in DIFFERENCES[method.stage]
+            pair_ns(session, sessions.PHYSICAL, accuracy, image, edit) for edit in STAGE_DIFFERENCES[method.stage]
         )
         return max(longer - shorter, LEAST_NS)
     if method.readable:

@@ -18,12 +18,12 @@ from unprocess_gen.reports.formatting import percentage, short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import write_files
 
-__all__ = ["FILES", "benchmark_page", "report_text", "write_benchmark"]
+__all__ = ["REPORT_FILES", "benchmark_page", "report_text", "write_benchmark"]
 
-COLUMNS = 120
+LINE_LENGTH = 120
 """Width of printed sentences."""
 
-FILES = ("accuracy.csv", "accuracy_runs.csv", "accuracy.png", "accuracy.html")
+REPORT_FILES = ("accuracy.csv", "accuracy_runs.csv", "accuracy.png", "accuracy.html")
 
 three_digits = partial(short_number, digits=3)
 
@@ -38,10 +38,10 @@ def report_text(report: BenchmarkReport) -> str:
             "complete runs, from files to committed shards: processor time and its shares; errors of the noisy frames",
             text_table(table(RUN_COLUMNS, report.runs)),
             "",
-            textwrap.fill(conclude(report), COLUMNS, break_on_hyphens=False),
+            textwrap.fill(conclude(report), LINE_LENGTH, break_on_hyphens=False),
             "",
             "recommended tiers",
-            *(textwrap.fill(line, COLUMNS, initial_indent="  ", subsequent_indent="    ") for line in advice),
+            *(textwrap.fill(line, LINE_LENGTH, initial_indent="  ", subsequent_indent="    ") for line in advice),
         ]
     )
 
@@ -51,7 +51,7 @@ def write_benchmark(report: BenchmarkReport, out: Path) -> None:
     picture = benchmark_figure(report.rows, report.runs)
     texts = (csv_text(kind, rows) for kind, rows in ((Measurement, report.rows), (RunMeasurement, report.runs)))
     contents = (*(text.encode() for text in texts), picture, benchmark_page(report, picture).encode())
-    write_files(out, dict(zip(FILES, contents, strict=True)))
+    write_files(out, dict(zip(REPORT_FILES, contents, strict=True)))
 
 
 def benchmark_page(report: BenchmarkReport, picture: bytes) -> str:
@@ -127,10 +127,10 @@ def csv_text(kind: type, rows: Sequence[Measurement] | Sequence[RunMeasurement])
     return text.getvalue()
 
 
-Columns = dict[str, tuple[str, Callable[[float | None], str] | None]]
+ColumnFormats = dict[str, tuple[str, Callable[[float | None], str] | None]]
 """Field and number format of each column by its heading; columns of text have no format."""
 
-METHOD_COLUMNS: Columns = {
+METHOD_COLUMNS: ColumnFormats = {
     "stage": ("stage", None),
     "method": ("method", None),
     "tiers": ("tier", None),
@@ -142,7 +142,7 @@ METHOD_COLUMNS: Columns = {
     "of reference": ("ratio_to_reference", percentage),
 }
 
-RUN_COLUMNS: Columns = {
+RUN_COLUMNS: ColumnFormats = {
     "settings": ("setting", None),
     "noise": ("noise", None),
     "tier": ("tier", None),
@@ -159,7 +159,7 @@ RUN_COLUMNS: Columns = {
 }
 
 
-def table(columns: Columns, rows: Sequence[Measurement] | Sequence[RunMeasurement]) -> PageTable:
+def table(columns: ColumnFormats, rows: Sequence[Measurement] | Sequence[RunMeasurement]) -> PageTable:
     """A table of methods and tiers, or of complete runs, grouped by its first column."""
     lines = [
         [getattr(row, field) if text is None else text(getattr(row, field)) for field, text in columns.values()]

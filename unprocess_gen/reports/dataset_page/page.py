@@ -40,7 +40,7 @@ from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.noise_check.checks import Checker
 from unprocess_gen.reports.report_files import require_libraries, write_files
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
-from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkPlaces
+from unprocess_gen.sources.dark_frames import NO_PLACES, DarkPlaces
 from unprocess_gen.sources.names import encode_name
 
 PAIRS_FITTED = 8
@@ -60,7 +60,7 @@ SETTINGS_SHOWN = (
 
 
 def write_dataset_report(
-    folder: AnyPath, to: Path | None = None, source: AnyPath | None = None, dark: DarkPlaces = NO_DARK_FRAMES
+    folder: AnyPath, to: Path | None = None, source: AnyPath | None = None, dark: DarkPlaces = NO_PLACES
 ) -> Path:
     """Write the page of a finished dataset to ``to``, ``report.html`` in a local dataset by default.
 
@@ -87,7 +87,7 @@ def _file_to_write(folder: AnyPath, to: Path | None) -> Path:
     return to
 
 
-def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlaces = NO_DARK_FRAMES) -> str:
+def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlaces = NO_PLACES) -> str:
     """Render the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
     from jinja2 import TemplateError  # optional library, extra "figures"
 

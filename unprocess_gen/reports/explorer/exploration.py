@@ -28,7 +28,7 @@ from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.empty_bands import empty_bands
 from unprocess_gen.reports.estimate import SourceEstimate
 from unprocess_gen.reports.plan_text import noise_lines
-from unprocess_gen.reports.sheets.panels import Mosaic
+from unprocess_gen.reports.sheets.panels import MosaicArray
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.simulation.reference.cfa import unpack
@@ -53,8 +53,8 @@ class Shown:
     plan: Plan
     patch: Patch
     pair: Pair
-    clean: Mosaic
-    noisy: Mosaic
+    clean: MosaicArray
+    noisy: MosaicArray
     saturated: NDArray[np.bool_]
     row: Row
     keys: tuple[str, ...]

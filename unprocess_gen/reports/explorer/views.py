@@ -14,7 +14,7 @@ from unprocess_gen.reports.noise_check.checks import pair_sums
 from unprocess_gen.reports.photon_transfer import fit_sums
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.contact_sheet import develop_detail, stretch
-from unprocess_gen.reports.sheets.panels import Mosaic, Window
+from unprocess_gen.reports.sheets.panels import MosaicArray, Window
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.isp import process, to_light
 
@@ -83,7 +83,7 @@ def _planes(frame: NDArray[Any], side: int) -> Float:
     return np.stack([_means(plane, side // 2) for plane in planes], axis=-1)
 
 
-def _drawn(frame: Mosaic, shown: Shown, window: Window, side: int) -> tuple[Mosaic, Float]:
+def _drawn(frame: MosaicArray, shown: Shown, window: Window, side: int) -> tuple[MosaicArray, Float]:
     """Return a window of a frame in DN, and developed."""
     if side == 1:
         has_all_colours = min(frame.shape) > 1
@@ -107,7 +107,7 @@ def _saturated(mask: NDArray[np.bool_], shape: tuple[int, ...], shown: Shown, si
 
 
 def _words(values: Float) -> NDArray[np.uint32]:
-    codes = panels.to_codes(values)
+    codes = panels.byte_codes(values)
     rgba = np.dstack([codes, np.full(codes.shape[:2], 255, np.uint8)])
     return np.ascontiguousarray(rgba).view(np.uint32)[..., 0]
 

@@ -21,7 +21,7 @@ from unprocess_gen.core.types import DarkPixels, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.reports.noise_check.scores import LEAST_SITES, Score, Scores, repetition_score, scores_of
-from unprocess_gen.reports.noise_check.sums import Sample, Sums
+from unprocess_gen.reports.noise_check.sums import SparseNoise, Sums
 from unprocess_gen.simulation.effects import BY_NAME
 
 FALSE_ALARM = 1e-6
@@ -30,7 +30,7 @@ SHARED_ROUNDING = 0.15
 """Fraction of the rounding error that pairs with other curves or gains share, because most histograms decrease."""
 CURVES = 4096
 """Groups of pairs whose rounding errors are added separately."""
-LISTED = 20
+PAIRS_LISTED = 20
 """Pairs with wrong noise that are listed."""
 
 
@@ -140,7 +140,7 @@ class Checker:
         self._overlaps = overlaps
         self._limit = threshold(len(overlaps))
         self._pool, self.pair_alarms = Pool(), list[Alarm]()
-        self._before: tuple[list[Any], Sample] | None = None
+        self._before: tuple[list[Any], SparseNoise] | None = None
         self.count = self.unchecked = self.wrong_pairs = 0
 
     def add(self, row: Row, sums: Sums | None) -> None:
@@ -157,7 +157,7 @@ class Checker:
         self._pool.add(scores, in_rows if sums.planes[0].noise.row_variance else in_sites, curve_group(sums.plan))
         failed = failed_checks(str(row["key"]), scores, self._limit)
         self.wrong_pairs += bool(failed)
-        self.pair_alarms += failed[:1] if self.wrong_pairs <= LISTED else []
+        self.pair_alarms += failed[:1] if self.wrong_pairs <= PAIRS_LISTED else []
 
     @property
     def alarms(self) -> list[Alarm]:

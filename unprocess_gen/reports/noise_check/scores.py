@@ -14,7 +14,7 @@ import numpy as np
 from unprocess_gen.calibration.frame_sums import NEIGHBOURS, plane_names
 from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, PlaneNoise
-from unprocess_gen.reports.noise_check.sums import LARGEST_SAMPLE, Plane, Sample, Sums
+from unprocess_gen.reports.noise_check.sums import LARGEST_SAMPLE, Plane, SparseNoise, Sums
 
 LEAST_SITES = 64
 """Fewest sites of a pair that is checked."""
@@ -219,7 +219,7 @@ def rounding_variance(mean: Points, least: float) -> float:
 # -------------------------------------------------------------------------------------------------- rows and columns
 
 
-class LineOffsets(NamedTuple):
+class LineCorrelations(NamedTuple):
     """Offsets of rows or columns, or differences of them, with their correlations.
 
     Attributes
@@ -236,20 +236,20 @@ class LineOffsets(NamedTuple):
     squares: float = 1.0
 
 
-def row_offsets(noise: PlaneNoise) -> LineOffsets:
+def row_offsets(noise: PlaneNoise) -> LineCorrelations:
     """Offsets of rows, an autoregressive process of order 1."""
     r = abs(noise.row_correlation)
-    return LineOffsets(noise.row_variance, (1 + r) / (1 - r), (1 + r * r) / (1 - r * r))
+    return LineCorrelations(noise.row_variance, (1 + r) / (1 - r), (1 + r * r) / (1 - r * r))
 
 
-def row_differences(noise: PlaneNoise) -> LineOffsets:
+def row_differences(noise: PlaneNoise) -> LineCorrelations:
     """Differences of rows n and n + 2 of such a process over √2, for the first two rows of groups of four.
 
     At a distance of k rows, the covariance is variance · (rᵏ - (rᵏ⁺² + r^|k-2|) / 2); the sums are geometric series.
     """
     r = abs(noise.row_correlation)
     magnitudes = 1 + r / 2 + r * (1 + r) ** 2 / (2 * (1 + r * r))
-    return LineOffsets(noise.row_variance * (1 - r * r), magnitudes, 1 + r * r / (2 * (1 + r**4)))
+    return LineCorrelations(noise.row_variance * (1 - r * r), magnitudes, 1 + r * r / (2 * (1 + r**4)))
 
 
 def _line_scores(sums: Sums, rounding_dn2: float) -> Scores:
@@ -258,7 +258,7 @@ def _line_scores(sums: Sums, rounding_dn2: float) -> Scores:
     The rounding of a smooth clean frame can move complete lines by up to half a DN. Differences of lines n and n + 2,
     and products of distant parts of a line, are almost free of it, with a third of the information.
     """
-    noise, columns = sums.planes[0].noise, LineOffsets(0.0)
+    noise, columns = sums.planes[0].noise, LineCorrelations(0.0)
     lines = {
         "row means": (sums.rows, 0, row_offsets(noise), rounding_dn2),
         "column means": (sums.columns, 1, columns, rounding_dn2),
@@ -280,7 +280,7 @@ def _differences(lines: Float) -> Float:
     return np.stack(parts).reshape(3, 2, -1, segments)
 
 
-def _quadratic_score(lines: Float, apart: int, offsets: LineOffsets, rounding_dn2: float, sums: Sums) -> Score:
+def _quadratic_score(lines: Float, apart: int, offsets: LineCorrelations, rounding_dn2: float, sums: Sums) -> Score:
     """Score of the variance of line offsets: Σ aᵀMa - E[aᵀMa] for the sums a of the parts of each line.
 
     ``lines`` [3, 2, lines, parts] are the sums a, their weights j, and their variances u. The covariance of a line is
@@ -328,7 +328,7 @@ def _neighbour_score(sums: Sums, name: str, rounding_dn2: float) -> Score:
     return Score(sums.products[name], pairs, pairs, fixed=fixed, step=LARGEST_Z**2, low=-bound, high=bound)
 
 
-def repetition_score(here: Sample, there: Sample) -> Score:
+def repetition_score(here: SparseNoise, there: SparseNoise) -> Score:
     """Score of the correlation of z at the same sites of two pairs; patterns of the body and rounding may cause it."""
     common = np.s_[: min(len(here.z), len(there.z)), : min(here.z.shape[1], there.z.shape[1])]
     product, inverse = here.z[common] * there.z[common], here.inverse[common] * there.inverse[common]

@@ -119,7 +119,7 @@ class Plane:
         return np.asarray(bins)
 
 
-class Sample(NamedTuple):
+class SparseNoise(NamedTuple):
     """Limited z without the means of rows, 1 / std, both in every third row and column; largest share of patterns."""
 
     z: Single
@@ -156,7 +156,7 @@ class Sums:
         Sums of the products of z, without the weighted mean of each row of a plane, for `NEIGHBOURS`.
     bits : ndarray of float64, [2]
         Sites whose noisy value has the last bit, and the last but one; 0 in frames that are not rounded.
-    sample : Sample
+    sample : SparseNoise
         Values that are compared with the values of the next pair.
     """
 
@@ -203,7 +203,7 @@ class Sums:
                 self.bits += [np.count_nonzero((codes & bit != 0) & is_used) for bit in (1, 2)]
         fixed = max(float(plane.expected.fixed.max(initial=0.0)) for plane in self.planes)
         z_sample, inverse = np.concatenate(sample, axis=1)
-        self.sample = Sample(np.clip(z_sample, -LARGEST_SAMPLE, LARGEST_SAMPLE), inverse, fixed)
+        self.sample = SparseNoise(np.clip(z_sample, -LARGEST_SAMPLE, LARGEST_SAMPLE), inverse, fixed)
 
 
 def _segment_starts(length: int) -> list[int]:

@@ -38,7 +38,7 @@ from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs
-from unprocess_gen.reports.sheets.panels import Mosaic, Picture, SheetPanel, Window
+from unprocess_gen.reports.sheets.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import MONO, mosaic
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
@@ -153,7 +153,7 @@ def _views(source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Flo
     return panels.fit_image(source, panel_px) / white, source[window] / white
 
 
-def _frame_panels(name: str, raw: Mosaic, planes: Float, plan: Plan, window: Window) -> list[SheetPanel]:
+def _frame_panels(name: str, raw: MosaicArray, planes: Float, plan: Plan, window: Window) -> list[SheetPanel]:
     """A raw frame with its own and with the common stretch, and developed; ``planes`` are its averages."""
     sensor, overview, detail = plan.sensor, planes.mean(axis=-1), raw[window]
     stretched, ranges = zip(*map(stretch, (overview, detail)), strict=True)
@@ -175,7 +175,7 @@ STRETCHED = (0.1, 99.9)
 """Percentiles of a picture that its own stretch maps to black and white."""
 
 
-def stretch(dn: Mosaic) -> tuple[Float, str]:
+def stretch(dn: MosaicArray) -> tuple[Float, str]:
     """Stretch a frame to [0, 1] between its percentiles `STRETCHED`, which are also given in words."""
     low, high = np.percentile(dn, STRETCHED)
     return np.clip((dn - low) / max(high - low, 1.0), 0, 1), f"{low:.5g} to {high:.5g} DN"
@@ -185,7 +185,7 @@ DEMOSAIC_REACH_PX = 2
 """Distance from which sites influence a demosaicked pixel (`isp.KERNELS`)."""
 
 
-def develop_detail(raw: Mosaic, plan: Plan, window: Window) -> Float:
+def develop_detail(raw: MosaicArray, plan: Plan, window: Window) -> Float:
     """Develop the detail with a border as wide as the demosaicking filter, as if the complete frame were developed."""
     y, x = (max(0, part.start - DEMOSAIC_REACH_PX) for part in window)  # even, as the reach is
     rows, columns = window
@@ -255,7 +255,7 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
         (black, *_), (white, *_) = plan.source.code_levels
         yield "levels", "black 0, white 1", (values * CODE_RANGE - black) / (white - black)
         return
-    values = unprocess.TONES[isp.tone](values, 1 - values)
+    values = unprocess.INVERSE_TONES[isp.tone](values, 1 - values)
     yield "tone curve inverted", isp.tone, values
     values = unprocess.expand_gamma(values, isp.gamma)
     yield "gamma inverted", f"gamma {isp.gamma}", values

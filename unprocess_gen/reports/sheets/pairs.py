@@ -16,7 +16,7 @@ from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.replay import ADVICE, recorded_source, source_of, source_root
-from unprocess_gen.reports.sheets.panels import Mosaic
+from unprocess_gen.reports.sheets.panels import MosaicArray
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
 
@@ -29,8 +29,8 @@ Load = Callable[[SourceConfig, Source], tuple[str, Photograph]]
 class SheetPair(NamedTuple):
     """The frames, row and plan of a pair, and its source pixels or the reason why they are missing."""
 
-    clean: Mosaic
-    noisy: Mosaic
+    clean: MosaicArray
+    noisy: MosaicArray
     row: Row
     plan: Plan
     source: Srgb | None

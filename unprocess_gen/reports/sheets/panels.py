@@ -18,14 +18,14 @@ from unprocess_gen.simulation.reference.cfa import MONO, tile
 
 Picture = NDArray[np.uint8]
 
-Mosaic = Frame | Float
+MosaicArray = Frame | Float
 """A mosaic ``[H, W]`` in DN, integer or not."""
 
 PANEL_PX = (224, 336)
 STRIP_PX = (120, 180)
 """Height and width of the box that a picture is scaled into, on a sheet and on a strip of an overview."""
 
-COLUMNS = 4
+PER_ROW = 4
 MARGIN_PX, LINE_PX = 10, 17
 PAPER, INK, EMPTY = 250, 20, 225
 """Grey levels of the sheet, of text, and of panels without a picture."""
@@ -57,7 +57,7 @@ def detail_window(shape: tuple[int, ...], panel_px: tuple[int, int] = PANEL_PX) 
     return slice(starts[0], ends[0]), slice(starts[1], ends[1])
 
 
-def average_planes(raw: Mosaic, panel_px: tuple[int, int]) -> Float:
+def average_planes(raw: MosaicArray, panel_px: tuple[int, int]) -> Float:
     """Scale the four planes of a mosaic into a panel, ``[H, W]`` to ``[h, w, 4]``; a lone row or column is doubled.
 
     Planes are averaged before anything is developed, which keeps sheets of large frames fast.
@@ -88,7 +88,7 @@ def colour_sites(values: Float, pattern: str) -> Float:
     return image
 
 
-def to_codes(values: Float) -> Picture:
+def byte_codes(values: Float) -> Picture:
     """Convert to 8-bit codes grey or RGB values, clipped to [0, 1], ``[H, W, 3]``."""
     codes = np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
     return np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes
@@ -108,7 +108,7 @@ def fit_image(values: NDArray[Any], panel_px: tuple[int, int]) -> Float:
 
 
 def lay_out(
-    heading: Sequence[str], panels: Sequence[SheetPanel], panel_px: tuple[int, int] = PANEL_PX, columns: int = COLUMNS
+    heading: Sequence[str], panels: Sequence[SheetPanel], panel_px: tuple[int, int] = PANEL_PX, columns: int = PER_ROW
 ) -> Picture:
     """Lay out a sheet: a heading, then rows of panels with title and note, overview, and detail if a panel has one."""
     width = columns * (panel_px[1] + MARGIN_PX) + MARGIN_PX
@@ -138,7 +138,7 @@ def _beside(boxes: Sequence[Picture], width: int) -> Picture:
 def _centred(values: Float | None, panel_px: tuple[int, int]) -> Picture:
     box = _blank(*panel_px, grey=EMPTY)
     if values is not None:
-        picture = to_codes(values)
+        picture = byte_codes(values)
         top, left = ((most - length) // 2 for most, length in zip(panel_px, picture.shape, strict=False))
         box[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
     return box

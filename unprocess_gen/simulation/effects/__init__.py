@@ -10,10 +10,10 @@ import math
 
 from unprocess_gen.core.types import Facts, Plan
 from unprocess_gen.simulation.effects.black_error import BlackError, BlackErrorNumbers
-from unprocess_gen.simulation.effects.column import Column, ColumnNumbers
+from unprocess_gen.simulation.effects.column import ColumnNoise, ColumnNumbers
 from unprocess_gen.simulation.effects.column_temporal import ColumnTemporal, ColumnTemporalNumbers
 from unprocess_gen.simulation.effects.dark_current import DarkCurrent, DarkCurrentNumbers
-from unprocess_gen.simulation.effects.dark_frame import DarkFrame
+from unprocess_gen.simulation.effects.dark_frame import DarkFrameNoise
 from unprocess_gen.simulation.effects.dead_pixels import DeadPixelNumbers, DeadPixels
 from unprocess_gen.simulation.effects.dsnu import Dsnu, DsnuNumbers
 from unprocess_gen.simulation.effects.effect import Effect
@@ -26,14 +26,14 @@ from unprocess_gen.simulation.effects.numbers import Number
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.effects.prnu import Prnu, PrnuNumbers
 from unprocess_gen.simulation.effects.quantise import Quantise
-from unprocess_gen.simulation.effects.read import Read, ReadNumbers
-from unprocess_gen.simulation.effects.row import Row, RowNumbers
+from unprocess_gen.simulation.effects.read import ReadNoise, ReadNumbers
+from unprocess_gen.simulation.effects.row import RowNoise, RowNumbers
 from unprocess_gen.simulation.effects.shot import Shot, ShotNumbers
 
 EFFECTS: tuple[Effect, ...] = (
     *(Heteroscedastic(), LensShading(), Prnu(), Shot(), DarkCurrent(), HotPixels(), FullWell()),  # in electrons
-    *(GainByColour(), Read(), Row(), Column(), ColumnTemporal(), BlackError(), Dsnu(), DeadPixels()),  # in DN
-    *(DarkFrame(), Quantise()),
+    *(GainByColour(), ReadNoise(), RowNoise(), ColumnNoise(), ColumnTemporal()),  # in DN
+    *(BlackError(), Dsnu(), DeadPixels(), DarkFrameNoise(), Quantise()),
 )
 """All effects, in the order in which light meets them."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
-from unprocess_gen.simulation.effects.numbers import LARGEST, SITES, Numbers, number
+from unprocess_gen.simulation.effects.numbers import LARGEST, SITES, EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
 
-class BlackErrorNumbers(Numbers):
+class BlackErrorNumbers(EffectNumbers):
     """Black-level errors of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the 2x2 tile, DN."""
 
     black_error_dn: tuple[float, float, float, float] = number(
@@ -37,9 +37,9 @@ class BlackError(Effect):
     numbers = BlackErrorNumbers
     is_fixed = is_in_dark_frames = True
 
-    def plane_offset_dn(self, part: Part) -> Float:
+    def plane_offset_dn(self, crop: Crop) -> Float:
         """Return the error of each site, [H, W] DN."""
-        return part.by_site(part.physics.black_error_dn)
+        return crop.by_site(crop.physics.black_error_dn)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the largest error as an offset of all pixels."""
@@ -51,5 +51,5 @@ class BlackError(Effect):
 
     def expected(self, site: Site) -> EffectNoise:
         """Error of the black level at this place of the tile."""
-        part = Part(site.plan, site.physics, (2, 2), site.patch.origin)
-        return known_offset(site, float(self.plane_offset_dn(part)[site.place]))
+        crop = Crop(site.plan, site.physics, (2, 2), site.patch.origin)
+        return known_offset(site, float(self.plane_offset_dn(crop)[site.place]))

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
-from unprocess_gen.simulation.effects.numbers import Numbers, number_in_dn
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.slots import LineOffsets, Words
+from unprocess_gen.simulation.slots import LineOffsets, SlotWords
 
 
-class ColumnNumbers(Numbers):
+class ColumnNumbers(EffectNumbers):
     """Standard deviation of column offsets, DN."""
 
     column_std_dn: float = number_in_dn(
@@ -21,7 +21,7 @@ class ColumnNumbers(Numbers):
     )
 
 
-class Column(Effect):
+class ColumnNoise(Effect):
     """Offset of each column."""
 
     name = "column"
@@ -30,10 +30,10 @@ class Column(Effect):
     numbers = ColumnNumbers
     is_fixed = is_in_dark_frames = True
 
-    def column_offset_dn(self, part: Part) -> Float:
+    def column_offset_dn(self, crop: Crop) -> Float:
         """Return the offset of each column, [1, W] DN."""
-        words = part.body_words("column", (1, part.shape[1]), (0, part.origin[1]))
-        return np.asarray(part.physics.column_std_dn * normals(words))
+        words = crop.body_words("column", (1, crop.shape[1]), (0, crop.origin[1]))
+        return np.asarray(crop.physics.column_std_dn * normals(words))
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict independent offsets of columns, the same in all frames."""
@@ -42,10 +42,10 @@ class Column(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the body."""
         physics = plan.physics
-        return {"fixed_columns": LineOffsets(Words(physics.body_key, "column"), physics.column_std_dn)}
+        return {"fixed_columns": LineOffsets(SlotWords(physics.body_key, "column"), physics.column_std_dn)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Offset of each column of the body, which the row determines."""
-        part = Part(site.plan, site.physics, (1, site.shape[1]), (0, site.patch.x))
-        offset_dn = self.column_offset_dn(part)[0, site.place[1] :: 2]
+        crop = Crop(site.plan, site.physics, (1, site.shape[1]), (0, site.patch.x))
+        offset_dn = self.column_offset_dn(crop)[0, site.place[1] :: 2]
         return known_offset(site, offset_dn)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues, slot_words
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import Numbers, number_in_dn
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import LineOffsets
 
 
-class ColumnTemporalNumbers(Numbers):
+class ColumnTemporalNumbers(EffectNumbers):
     """Standard deviation of the temporal column offsets, DN."""
 
     column_temporal_std_dn: float = number_in_dn(
@@ -35,10 +35,10 @@ class ColumnTemporal(Effect):
     since = "0.2"
     is_in_dark_frames = True
 
-    def column_offset_dn(self, part: Part) -> Float:
+    def column_offset_dn(self, crop: Crop) -> Float:
         """Draw the offset of each column, [1, W] DN."""
-        words = part.frame_words("column_temporal", (1, part.shape[1]), (0, part.origin[1]))
-        return np.asarray(part.physics.column_temporal_std_dn * normals(words))
+        words = crop.frame_words("column_temporal", (1, crop.shape[1]), (0, crop.origin[1]))
+        return np.asarray(crop.physics.column_temporal_std_dn * normals(words))
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict independent offsets of columns, new in every frame."""
@@ -51,6 +51,6 @@ class ColumnTemporal(Effect):
 
     def expected(self, site: Site) -> EffectNoise:
         """Offset of each column of the frame, which the row determines."""
-        part = Part(site.plan, site.physics, (1, site.shape[1]), (0, site.patch.x))
-        offset_dn = self.column_offset_dn(part)[0, site.place[1] :: 2]
+        crop = Crop(site.plan, site.physics, (1, site.shape[1]), (0, site.patch.x))
+        offset_dn = self.column_offset_dn(crop)[0, site.place[1] :: 2]
         return EffectNoise(offset_dn=offset_dn)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, known_offset, poisson_noise
-from unprocess_gen.simulation.effects.numbers import Number, Numbers, rate
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, Number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import UniformCounts
@@ -31,7 +31,7 @@ HEAT = {
 """Keys of the profile from which the warmth of the sensor follows."""
 
 
-class DarkCurrentNumbers(Numbers):
+class DarkCurrentNumbers(EffectNumbers):
     """Mean dark signal of the exposure, electrons."""
 
     dark_e: float = rate(
@@ -51,15 +51,15 @@ class DarkCurrent(Effect):
     keys = HEAT
     heat = is_before_well = is_in_dark_frames = masks = True
 
-    def electrons(self, electrons: Float, part: Part) -> Float:
+    def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Add a count to each pixel."""
-        physics = part.physics
-        count = poisson(part.frame_words("dark_current"), np.full(part.shape, physics.dark_e))
+        physics = crop.physics
+        count = poisson(crop.frame_words("dark_current"), np.full(crop.shape, physics.dark_e))
         return electrons + (count - (physics.dark_e if physics.dark_offset == "removed" else 0.0))
 
-    def mean_electrons(self, part: Part) -> float | None:
+    def mean_electrons(self, crop: Crop) -> float | None:
         """Return the mean if the camera keeps it."""
-        return part.physics.dark_e if part.physics.dark_offset == "kept" else None
+        return crop.physics.dark_e if crop.physics.dark_offset == "kept" else None
 
     def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return K² times the mean, DN²."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import DarkPixels, Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
 from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, EffectNoise, Site, uniform
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
@@ -85,7 +85,7 @@ def _runs(start: int, count: int, period: int) -> Iterator[tuple[int, int, int]]
         done += length
 
 
-class DarkFrame(Effect):
+class DarkFrameNoise(Effect):
     """Dark frame in place of the read noise, with dither.
 
     A dark frame has integer values. Without dither, the sum of a constant signal and the frame is rounded at every site
@@ -97,14 +97,14 @@ class DarkFrame(Effect):
     cost_ns = 4.0
     has_switch = False
 
-    def noise_dn(self, part: Part) -> Float:
+    def noise_dn(self, crop: Crop) -> Float:
         """Draw the dither, uniform in ±½ DN of the dark frame."""
-        uniform = by_inverse_cdf(part.frame_words("dark_dither"), quantile_table(DITHER_LAW, DITHER_SHAPE))
-        return dither_std_dn(part.plan) * uniform
+        uniform = by_inverse_cdf(crop.frame_words("dark_dither"), quantile_table(DITHER_LAW, DITHER_SHAPE))
+        return dither_std_dn(crop.plan) * uniform
 
-    def site_offset_dn(self, part: Part) -> NDArray[np.float32]:
+    def site_offset_dn(self, crop: Crop) -> NDArray[np.float32]:
         """Return the dark frame."""
-        return dark_frame_offsets(part.plan, part.dark_pixels, part.shape, part.origin)
+        return dark_frame_offsets(crop.plan, crop.dark_pixels, crop.shape, crop.origin)
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site with the dither, and the offsets by site."""

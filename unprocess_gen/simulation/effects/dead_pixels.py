@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import Defects, EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import Numbers, number
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.sensor import noisy_limits
-from unprocess_gen.simulation.slots import DeadPixels as DeadSlot
+from unprocess_gen.simulation.slots import DeadSlot
 
 if TYPE_CHECKING:
     from unprocess_gen.simulation.effects import Physics
 
 
-class DeadPixelNumbers(Numbers):
+class DeadPixelNumbers(EffectNumbers):
     """Fraction of dead pixels, and the value that they read."""
 
     dead_pixel_share: float = number(0.0, "fraction of dead pixels", high=1.0, highest=1.0)
@@ -45,11 +45,11 @@ class DeadPixels(Effect):
     numbers = DeadPixelNumbers
     is_fixed = has_outliers = True
 
-    def output_dn(self, noisy_dn: Float, part: Part) -> Float:
+    def output_dn(self, noisy_dn: Float, crop: Crop) -> Float:
         """Set dead pixels to their value."""
-        physics = part.physics
-        dead_dn = dead_pixel_dn(physics, part.plan.sensor.black_level_dn)
-        return np.where(is_among(part.body_words("dead_pixels"), physics.dead_pixel_share), dead_dn, noisy_dn)
+        physics = crop.physics
+        dead_dn = dead_pixel_dn(physics, crop.plan.sensor.black_level_dn)
+        return np.where(is_among(crop.body_words("dead_pixels"), physics.dead_pixel_share), dead_dn, noisy_dn)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict pixels that lose their signal."""

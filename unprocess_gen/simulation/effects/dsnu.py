@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
-from unprocess_gen.simulation.effects.numbers import Numbers, number
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import NormalPattern
 
 
-class DsnuNumbers(Numbers):
+class DsnuNumbers(EffectNumbers):
     """Standard deviation of the pixels' offsets, electrons."""
 
     dsnu_std_e: float = number(
@@ -36,10 +36,10 @@ class Dsnu(Effect):
     since = "0.3"
     is_fixed = is_in_dark_frames = True
 
-    def site_offset_dn(self, part: Part) -> Float:
+    def site_offset_dn(self, crop: Crop) -> Float:
         """Return the offset of each pixel, [H, W] DN; values of float32, in which kernels store the pattern."""
-        std_dn = part.physics.dsnu_std_e * part.physics.dn_per_e
-        offset_dn = std_dn * normals(part.body_words("dsnu"))
+        std_dn = crop.physics.dsnu_std_e * crop.physics.dn_per_e
+        offset_dn = std_dn * normals(crop.body_words("dsnu"))
         return offset_dn.astype(np.float32).astype(np.float64)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from unprocess_gen.core.random_streams import Words, words
 from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import Number, Numbers, numbers_of
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, Number, numbers_of
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.slots import Words as SlotWords
+from unprocess_gen.simulation.slots import SlotWords
 
 if TYPE_CHECKING:
     from unprocess_gen.simulation.effects import Physics
@@ -32,8 +32,8 @@ def frame_words(plan: Plan, stream: str, shape: tuple[int, ...], origin: Shape =
 
 
 @dataclass(frozen=True)
-class Part:
-    """Part of a frame that is simulated.
+class Crop:
+    """Crop of a frame that is simulated.
 
     Attributes
     ----------
@@ -57,11 +57,11 @@ class Part:
     relative_gain: Float | float = 1.0
 
     def frame_words(self, stream: str, shape: Shape | None = None, origin: Shape | None = None) -> Words:
-        """Return the random words of a frame, [H, W]; of the part, or of another one."""
+        """Return the random words of a frame, [H, W]; of the crop, or of another one."""
         return frame_words(self.plan, stream, shape or self.shape, self.origin if origin is None else origin)
 
     def body_words(self, stream: str, shape: Shape | None = None, origin: Shape | None = None, draw: int = 0) -> Words:
-        """Return the random words of a fixed pattern of the camera body, [H, W]; of the part, or of another one."""
+        """Return the random words of a fixed pattern of the camera body, [H, W]; of the crop, or of another one."""
         origin = self.origin if origin is None else origin
         return words(self.physics.body_key, stream, shape or self.shape, origin=origin, draw=draw)
 
@@ -117,7 +117,7 @@ class Effect:
     name: ClassVar[str]
     meaning: ClassVar[str]
     cost_ns: ClassVar[float]
-    numbers: ClassVar[type[Numbers]] = Numbers
+    numbers: ClassVar[type[EffectNumbers]] = EffectNumbers
     keys: ClassVar[Mapping[str, Number]] = {}
     heat: ClassVar[bool] = False
     has_switch: ClassVar[bool] = True
@@ -134,39 +134,39 @@ class Effect:
         """Numbers by the names of their fields."""
         return numbers_of(self.numbers)
 
-    def light_factor(self, part: Part) -> Float | None:
+    def light_factor(self, crop: Crop) -> Float | None:
         """Return the factor on the light of the clean frame, [H, W] of float32 values; None if it is 1."""
 
     def plane_gains(self, plan: Plan) -> tuple[float, ...] | None:
         """Return the system gain of the four sites of the 2x2 tile relative to ``dn_per_e``; None if it is 1."""
 
-    def electrons(self, electrons: Float, part: Part) -> Float:
+    def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Return the electrons of each site after the effect, [H, W]."""
         return electrons
 
-    def noise_dn(self, part: Part) -> Float | None:
+    def noise_dn(self, crop: Crop) -> Float | None:
         """Return independent noise of each site, [H, W] DN."""
 
-    def row_offset_dn(self, part: Part) -> Float | float:
+    def row_offset_dn(self, crop: Crop) -> Float | float:
         """Return the offset of each row, [H, 1] DN."""
         return 0.0
 
-    def column_offset_dn(self, part: Part) -> Float | float:
+    def column_offset_dn(self, crop: Crop) -> Float | float:
         """Return the offset of each column, [1, W] DN."""
         return 0.0
 
-    def plane_offset_dn(self, part: Part) -> Float | float:
+    def plane_offset_dn(self, crop: Crop) -> Float | float:
         """Return the offset of the colour plane of each site, [H, W] DN."""
         return 0.0
 
-    def site_offset_dn(self, part: Part) -> Float | NDArray[np.float32] | None:
+    def site_offset_dn(self, crop: Crop) -> Float | NDArray[np.float32] | None:
         """Return other offsets by site, [H, W] DN."""
 
-    def output_dn(self, noisy_dn: Float, part: Part) -> Float:
+    def output_dn(self, noisy_dn: Float, crop: Crop) -> Float:
         """Return the values that the converter sees, [H, W] DN."""
         return noisy_dn
 
-    def mean_electrons(self, part: Part) -> Float | float | None:
+    def mean_electrons(self, crop: Crop) -> Float | float | None:
         """Return the electrons that the effect adds to the average of many frames."""
 
     def slots(self, plan: Plan) -> SlotValues:

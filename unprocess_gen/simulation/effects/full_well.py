@@ -7,16 +7,16 @@ import math
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import Numbers, number
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
 FARTHEST_NORMAL, FARTHEST_HOT = 6.4, 7.7
 """Largest normal deviate in standard deviations, and largest hot-pixel current in means, of a 32-bit uniform."""
 
 
-class FullWellNumbers(Numbers):
+class FullWellNumbers(EffectNumbers):
     """Saturation capacity, electrons."""
 
     full_well_e: float = number(0.0, "saturation capacity", unit="electrons", low=1.0, high=1e9, highest=1e9)
@@ -30,9 +30,9 @@ class FullWell(Effect):
     cost_ns = 0.1
     numbers = FullWellNumbers
 
-    def electrons(self, electrons: Float, part: Part) -> Float:
+    def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Limit the electrons."""
-        return np.minimum(electrons, part.physics.full_well_e / part.relative_gain)
+        return np.minimum(electrons, crop.physics.full_well_e / crop.relative_gain)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the most that any pixel can lose; nothing if the converter ends below the full well."""

@@ -6,14 +6,14 @@ import math
 
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.effect import Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import Numbers, number
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.cfa import tile
 
 COLOURS = ("red", "green", "blue")
 
 
-class GainByColourNumbers(Numbers):
+class GainByColourNumbers(EffectNumbers):
     """System gain of red, green and blue, relative to ``dn_per_e``."""
 
     gain_by_colour: tuple[float, float, float] = number(

@@ -10,16 +10,16 @@ import numpy as np
 
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import Defects, EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import Numbers, number, rate
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import BrightPixels
 
 
-class HotPixelNumbers(Numbers):
+class HotPixelNumbers(EffectNumbers):
     """Fraction of hot pixels, and the mean of their exponentially distributed excess, electrons per exposure."""
 
     hot_pixel_share: float = number(0.0, "fraction of hot pixels", high=1.0, highest=1.0)
@@ -39,15 +39,15 @@ class HotPixels(Effect):
     numbers = HotPixelNumbers
     heat = is_fixed = is_before_well = is_in_dark_frames = has_outliers = True
 
-    def electrons(self, electrons: Float, part: Part) -> Float:
+    def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Add a Poisson count of its mean to each hot pixel."""
-        return electrons + poisson(part.frame_words("hot_pixels"), self.mean_electrons(part))
+        return electrons + poisson(crop.frame_words("hot_pixels"), self.mean_electrons(crop))
 
-    def mean_electrons(self, part: Part) -> Float:
+    def mean_electrons(self, crop: Crop) -> Float:
         """Return the mean excess of each pixel, [H, W] electrons; 0 except for hot pixels."""
-        physics = part.physics
-        hot = is_among(part.body_words("hot_pixels"), physics.hot_pixel_share)
-        step = part.body_words("hot_pixels", draw=1) >> np.uint32(22)
+        physics = crop.physics
+        hot = is_among(crop.body_words("hot_pixels"), physics.hot_pixel_share)
+        step = crop.body_words("hot_pixels", draw=1) >> np.uint32(22)
         return np.where(hot, physics.hot_pixel_e * exponential_levels()[step], 0.0)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
@@ -76,8 +76,8 @@ class HotPixels(Effect):
         y, x = site.defects("hot_pixels", site.physics.hot_pixel_share)
         mean_e = np.zeros(len(y))
         for row in np.unique(y).tolist():
-            part = Part(site.plan, site.physics, (1, width), (top + 2 * row + site.place[0], left))
-            mean_e[y == row] = self.mean_electrons(part)[0, site.place[1] :: 2][x[y == row]]
+            crop = Crop(site.plan, site.physics, (1, width), (top + 2 * row + site.place[0], left))
+            mean_e[y == row] = self.mean_electrons(crop)[0, site.place[1] :: 2][x[y == row]]
         return EffectNoise(defects=Defects(y, x, site.gain_dn * mean_e, replaces=False))
 
 

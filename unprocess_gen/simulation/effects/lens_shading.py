@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, SlotValues
-from unprocess_gen.simulation.effects.numbers import Numbers, number
+from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.slots import RadialFactor
 
@@ -21,7 +21,7 @@ PLACES = 64
 Coefficients = tuple[float, float, float]
 
 
-class LensShadingNumbers(Numbers):
+class LensShadingNumbers(EffectNumbers):
     """Coefficients of r², r⁴ and r⁶ in the relative illumination; r is 1 in the corners."""
 
     lens_shading: tuple[float, float, float] = number(
@@ -99,10 +99,10 @@ class LensShading(Effect):
     since = "0.2"
     in_both_frames = True
 
-    def light_factor(self, part: Part) -> Float:
+    def light_factor(self, crop: Crop) -> Float:
         """Return the relative illumination, [H, W]; values of float32, in which kernels store the pattern."""
-        physics = part.physics
-        return illumination(physics.lens_shading, physics.frame_size, part.shape, part.origin).astype(np.float64)
+        physics = crop.physics
+        return illumination(physics.lens_shading, physics.frame_size, crop.shape, crop.origin).astype(np.float64)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the light that the darkest place loses."""

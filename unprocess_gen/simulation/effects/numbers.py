@@ -97,7 +97,7 @@ class Number:
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 @dataclass(frozen=True, kw_only=True)
-class Numbers:
+class EffectNumbers:
     """Numbers of an effect; a class that derives from it is a frozen dataclass of keyword arguments."""
 
     def __init_subclass__(cls) -> None:

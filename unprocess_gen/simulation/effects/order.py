@@ -15,7 +15,7 @@ import numpy as np
 
 from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects import EFFECTS
-from unprocess_gen.simulation.effects.effect import Effect, Part, Shape
+from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape
 from unprocess_gen.simulation.effects.heteroscedastic import heteroscedastic
 
 
@@ -40,21 +40,21 @@ def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: Dark
     """
     if plan.noise.physics is None:
         return heteroscedastic(clean_dn, plan, origin) if "heteroscedastic" in plan.noise.effects else clean_dn
-    part = part_of(plan, clean_dn.shape, origin, dark_pixels)
-    effects, black_dn, gain = effects_of(plan), plan.sensor.black_level_dn, part.physics.dn_per_e * part.relative_gain
+    crop = crop_of(plan, clean_dn.shape, origin, dark_pixels)
+    effects, black_dn, gain = effects_of(plan), plan.sensor.black_level_dn, crop.physics.dn_per_e * crop.relative_gain
     electrons = (clean_dn - black_dn) / gain
     for effect in effects:
-        electrons = effect.electrons(electrons, part)
+        electrons = effect.electrons(electrons, crop)
     noisy_dn = electrons * gain + black_dn
     for effect in effects:
-        if (noise_dn := effect.noise_dn(part)) is not None:
+        if (noise_dn := effect.noise_dn(crop)) is not None:
             noisy_dn = noisy_dn + noise_dn
-    noisy_dn = noisy_dn + offsets(part, effects)
+    noisy_dn = noisy_dn + offsets(crop, effects)
     for effect in effects:
-        if (offset_dn := effect.site_offset_dn(part)) is not None:
+        if (offset_dn := effect.site_offset_dn(crop)) is not None:
             noisy_dn = noisy_dn + offset_dn
     for effect in effects:
-        noisy_dn = effect.output_dn(noisy_dn, part)
+        noisy_dn = effect.output_dn(noisy_dn, crop)
     return noisy_dn
 
 
@@ -63,8 +63,8 @@ def effects_of(plan: Plan) -> list[Effect]:
     return [effect for effect in EFFECTS if effect.name in plan.noise.effects]
 
 
-def part_of(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0), dark_pixels: DarkPixels | None = None) -> Part:
-    """Return a part of a frame with a physical profile.
+def crop_of(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0), dark_pixels: DarkPixels | None = None) -> Crop:
+    """Return a crop of a frame with a physical profile.
 
     Parameters
     ----------
@@ -79,24 +79,24 @@ def part_of(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0), dark_pix
 
     Returns
     -------
-    Part
+    Crop
         With the gains of its sites.
     """
     physics = plan.physics
-    part = Part(plan, physics, (shape[0], shape[1]), origin, dark_pixels)
+    crop = Crop(plan, physics, (shape[0], shape[1]), origin, dark_pixels)
     for effect in effects_of(plan):
         if (gains := effect.plane_gains(plan)) is not None:
-            return Part(plan, physics, part.shape, origin, dark_pixels, part.by_site(gains))
-    return part
+            return Crop(plan, physics, crop.shape, origin, dark_pixels, crop.by_site(gains))
+    return crop
 
 
-def offsets(part: Part, effects: list[Effect], fixed_only: bool = False) -> Float:
+def offsets(crop: Crop, effects: list[Effect], fixed_only: bool = False) -> Float:
     """Return the sum of the offsets of rows, columns and planes, [H, W] DN.
 
     Parameters
     ----------
-    part : Part
-        Part of the frame.
+    crop : Crop
+        Crop of the frame.
     effects : list of Effect
         Simulated effects; recorded bytes depend on the order of the sums.
     fixed_only : bool
@@ -107,13 +107,13 @@ def offsets(part: Part, effects: list[Effect], fixed_only: bool = False) -> Floa
     ndarray of float64, [H, W]
         DN.
     """
-    height, width = part.shape
+    height, width = crop.shape
     rows, columns, planes = np.zeros((height, 1)), np.zeros((1, width)), np.zeros((1, 1))
     for effect in effects:
         if effect.is_fixed or not fixed_only:
-            rows = rows + effect.row_offset_dn(part)
-            columns = columns + effect.column_offset_dn(part)
-            planes = planes + effect.plane_offset_dn(part)
+            rows = rows + effect.row_offset_dn(crop)
+            columns = columns + effect.column_offset_dn(crop)
+            planes = planes + effect.plane_offset_dn(crop)
     return np.asarray((rows + columns) + planes)
 
 
@@ -136,8 +136,8 @@ def light_factor(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0)) -> 
     """
     if plan.noise.physics is None:
         return None
-    part = part_of(plan, shape, origin)
-    factors = [factor for effect in effects_of(plan) if (factor := effect.light_factor(part)) is not None]
+    crop = crop_of(plan, shape, origin)
+    factors = [factor for effect in effects_of(plan) if (factor := effect.light_factor(crop)) is not None]
     return functools.reduce(mul, factors).astype(np.float32).astype(np.float64) if factors else None
 
 
@@ -160,18 +160,18 @@ def average(clean_dn: Float, plan: Plan, origin: Shape = (0, 0)) -> Float:
     ndarray of float64, [H, W]
         DN, not clipped.
     """
-    part, effects = part_of(plan, clean_dn.shape, origin), effects_of(plan)
-    gain = part.physics.dn_per_e * part.relative_gain
+    crop, effects = crop_of(plan, clean_dn.shape, origin), effects_of(plan)
+    gain = crop.physics.dn_per_e * crop.relative_gain
     for effect in reversed(effects):  # recorded bytes depend on the order of these sums
-        if (mean_e := effect.mean_electrons(part)) is not None:
+        if (mean_e := effect.mean_electrons(crop)) is not None:
             clean_dn = clean_dn + mean_e * gain
     if "full_well" in plan.noise.effects:
-        clean_dn = np.minimum(clean_dn, part.physics.full_well_e * part.physics.dn_per_e + plan.sensor.black_level_dn)
-    clean_dn = clean_dn + offsets(part, effects, fixed_only=True)
+        clean_dn = np.minimum(clean_dn, crop.physics.full_well_e * crop.physics.dn_per_e + plan.sensor.black_level_dn)
+    clean_dn = clean_dn + offsets(crop, effects, fixed_only=True)
     fixed = [effect for effect in effects if effect.is_fixed]
     for effect in fixed:
-        if (offset_dn := effect.site_offset_dn(part)) is not None:
+        if (offset_dn := effect.site_offset_dn(crop)) is not None:
             clean_dn = clean_dn + offset_dn
     for effect in fixed:
-        clean_dn = effect.output_dn(clean_dn, part)
+        clean_dn = effect.output_dn(clean_dn, crop)
     return clean_dn

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, gaussian
-from unprocess_gen.simulation.effects.numbers import Numbers, number
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import NormalPattern
 
 
-class PrnuNumbers(Numbers):
+class PrnuNumbers(EffectNumbers):
     """Standard deviation of the pixels' relative gain."""
 
     prnu_std: float = number(
@@ -30,21 +30,21 @@ class Prnu(Effect):
     numbers = PrnuNumbers
     is_fixed = is_before_well = True
 
-    def response(self, part: Part) -> Float:
+    def response(self, crop: Crop) -> Float:
         """Return the relative gain of each pixel, [H, W]; not negative.
 
         It is rounded to float32, the dtype in which kernels store the pattern for many frames.
         """
-        n = normals(part.body_words("prnu"))
-        return np.maximum(1 + part.physics.prnu_std * n, 0).astype(np.float32).astype(np.float64)
+        n = normals(crop.body_words("prnu"))
+        return np.maximum(1 + crop.physics.prnu_std * n, 0).astype(np.float32).astype(np.float64)
 
-    def light_factor(self, part: Part) -> Float | None:
+    def light_factor(self, crop: Crop) -> Float | None:
         """Return the response if the clean frame contains the fixed patterns."""
-        return self.response(part) if part.physics.fixed_pattern_in_clean else None
+        return self.response(crop) if crop.physics.fixed_pattern_in_clean else None
 
-    def electrons(self, electrons: Float, part: Part) -> Float:
+    def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Multiply the electrons of light by the response."""
-        return electrons if part.physics.fixed_pattern_in_clean else electrons * self.response(part)
+        return electrons if crop.physics.fixed_pattern_in_clean else electrons * self.response(crop)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict a change of the mean of the shot noise.

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian, tukey_noise
-from unprocess_gen.simulation.effects.numbers import SHAPE, Numbers, number, number_in_dn
+from unprocess_gen.simulation.effects.numbers import SHAPE, EffectNumbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 
 
-class ReadNumbers(Numbers):
+class ReadNumbers(EffectNumbers):
     """Distribution of the read noise, shape of Tukey's lambda, and standard deviation, DN."""
 
     read_law: str = number(
@@ -42,7 +42,7 @@ class ReadNumbers(Numbers):
     )
 
 
-class Read(Effect):
+class ReadNoise(Effect):
     """Independent noise of each site, behind the gain."""
 
     name = "read"
@@ -51,11 +51,11 @@ class Read(Effect):
     numbers = ReadNumbers
     masks = True
 
-    def noise_dn(self, part: Part) -> Float:
+    def noise_dn(self, crop: Crop) -> Float:
         """Draw the noise by the inverse distribution function."""
-        physics = part.physics
+        physics = crop.physics
         table = quantile_table(physics.read_law, physics.read_shape)
-        return physics.read_std_dn * by_inverse_cdf(part.frame_words("read"), table)
+        return physics.read_std_dn * by_inverse_cdf(crop.frame_words("read"), table)
 
     def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return the square of the standard deviation, DN²."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, SlotValues, slot_words
+from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
-from unprocess_gen.simulation.effects.numbers import Numbers, number, number_in_dn
+from unprocess_gen.simulation.effects.numbers import EffectNumbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
 from unprocess_gen.simulation.slots import LineOffsets
 
 
-class RowNumbers(Numbers):
+class RowNumbers(EffectNumbers):
     """Standard deviation of row offsets, DN, and correlation of the offsets of neighbouring rows."""
 
     row_std_dn: float = number_in_dn(
@@ -31,7 +31,7 @@ class RowNumbers(Numbers):
     )
 
 
-class Row(Effect):
+class RowNoise(Effect):
     """Offset of each row.
 
     With a correlation r, z(y) = r·z(y - 1) + √(1 - r²)·n(y) for normal deviates n, an autoregressive process of order 1
@@ -45,12 +45,12 @@ class Row(Effect):
     numbers = RowNumbers
     is_in_dark_frames = True
 
-    def row_offset_dn(self, part: Part) -> Float:
+    def row_offset_dn(self, crop: Crop) -> Float:
         """Draw the offset of each row, [H, 1] DN."""
-        physics, (height, _), (top, _) = part.physics, part.shape, part.origin
+        physics, (height, _), (top, _) = crop.physics, crop.shape, crop.origin
         if physics.row_correlation == 0:
-            return np.asarray(physics.row_std_dn * normals(part.frame_words("row", (height, 1), (top, 0))))
-        independent = normals(part.frame_words("row", (top + height, 1), (0, 0)))[:, 0]
+            return np.asarray(physics.row_std_dn * normals(crop.frame_words("row", (height, 1), (top, 0))))
+        independent = normals(crop.frame_words("row", (top + height, 1), (0, 0)))[:, 0]
         return (physics.row_std_dn * autoregressive(independent, physics.row_correlation)[top:])[:, None]
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from unprocess_gen.core.types import NEAR_NORMAL, Float, Plan
-from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, SlotValues, frame_words
+from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues, frame_words
 from unprocess_gen.simulation.effects.expectation import ALWAYS_COUNTED, EffectNoise, Site, poisson_noise
-from unprocess_gen.simulation.effects.numbers import DN, Numbers, number
+from unprocess_gen.simulation.effects.numbers import DN, EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.near_normal import counts_or_normals, near_limits
 from unprocess_gen.simulation.reference.poisson import poisson
 
 
-class ShotNumbers(Numbers):
+class ShotNumbers(EffectNumbers):
     """System gain K, DN per electron."""
 
     dn_per_e: float = number(
@@ -43,9 +43,9 @@ class Shot(Effect):
     numbers = ShotNumbers
     is_before_well = masks = True
 
-    def electrons(self, electrons: Float, part: Part) -> Float:
+    def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Draw a count for each pixel."""
-        return counts(part.plan, electrons, part.origin)
+        return counts(crop.plan, electrons, crop.origin)
 
     def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return K times the signal, DN²."""

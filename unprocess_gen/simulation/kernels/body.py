@@ -22,13 +22,13 @@ from unprocess_gen.simulation.kernels.strips import (
     Float32,
     Scratch,
     SiteMap,
+    buffers_in,
     equal_sites,
     locate,
     padded_width,
     scratch_of_thread,
-    workspace_in,
 )
-from unprocess_gen.simulation.slots import BrightPixels, DeadPixels, NormalPattern, Patterns, RadialFactor
+from unprocess_gen.simulation.slots import BrightPixels, DeadSlot, NormalPattern, Patterns, RadialFactor
 
 SMALL_SITES, SMALL_PATTERNS, LARGE_PATTERNS, LIVE_PATTERNS = 2**16, 384, 5, 8
 """So many patterns of crops of up to this many sites (0.3 MB each) are kept, so many of larger crops, and so many of
@@ -133,17 +133,17 @@ def _fill_normals(
     out: Float32,
 ) -> None:
     """Fill ``out`` with max(mean + std·n, least) for normal deviates n and ``numbers`` std, mean, least."""
-    workspace, target, normal = workspace_in(scratch), simd.pointer_to(out, 0), simd.pointer_to(quadratics, 0)
+    buffers, target, normal = buffers_in(scratch), simd.pointer_to(out, 0), simd.pointer_to(quadratics, 0)
     std, mean, least = numbers
     for y in range(out.shape[0]):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
-            fill_word_blocks(key, strip, stream, workspace.words)
+            fill_word_blocks(key, strip, stream, buffers.words)
             row = simd.pointer_to(target, y * out.shape[1] + x + strip.lead)
-            fill_rows(strip.total, workspace.words, workspace.scratch)
+            fill_rows(strip.total, buffers.words, buffers.scratch)
             for v in range(strip.total // VECTOR_WIDTH):
                 n = np.uint64(v * VECTOR_WIDTH)
-                deviate = exact_values(workspace.words, workspace.scratch, n, normal)
+                deviate = exact_values(buffers.words, buffers.scratch, n, normal)
                 simd.store(row, n, simd.to_float32(simd.maximum(deviate * std + mean, least)))
 
 
@@ -155,11 +155,11 @@ def word_threshold(fraction: float) -> np.uint64:
     return np.uint64(int(fraction * 2**32))
 
 
-def _defect_map(slots: tuple[BrightPixels | None, DeadPixels | None], shape: Shape, origin: Shape) -> SiteMap:
+def _defect_map(slots: tuple[BrightPixels | None, DeadSlot | None], shape: Shape, origin: Shape) -> SiteMap:
     """Return the map of bright defects and of dead pixels; a missing slot has none."""
     either = slots[0] or slots[1]
     assert either is not None
-    bright, dead = (slot or DeadPixels(either.body_key, either.stream, 0.0) for slot in slots)
+    bright, dead = (slot or DeadSlot(either.body_key, either.stream, 0.0) for slot in slots)
     if not bright.share and not dead.share:
         return NO_DEFECTS
     streams = purpose(bright.stream), purpose(bright.stream, draw=1), purpose(dead.stream)
@@ -188,8 +188,8 @@ def _fill_defects(
     out: NDArray[np.uint16],
 ) -> None:
     """Fill ``out`` with the numbers of defects: pixels whose words of two streams are below a threshold."""
-    workspace, target = workspace_in(scratch), simd.pointer_to(out, 0)
-    bright, dead, steps = workspace.words, workspace.site_words, workspace.dark_words
+    buffers, target = buffers_in(scratch), simd.pointer_to(out, 0)
+    bright, dead, steps = buffers.words, buffers.site_words, buffers.dark_words
     for y in range(out.shape[0]):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))

@@ -26,7 +26,7 @@ from unprocess_gen.simulation.kernels import simd
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
-from unprocess_gen.simulation.kernels.strips import SiteMap, Strip, Workspace, count_outside, strip_values
+from unprocess_gen.simulation.kernels.strips import Buffers, SiteMap, Strip, count_outside, strip_values
 from unprocess_gen.simulation.reference.cfa import tile
 
 _0, _8 = np.uint64(0), np.uint64(8)
@@ -220,22 +220,22 @@ def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Any, out: Pointe
 
 
 @inner
-def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
+def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
     """Store eight clean values: unrounded, rounded, their difference, and as uint16."""
     dn = above_black + scene.black_dn
     rounded = (dn + ROUND) - ROUND
     rounded_dn = simd.to_float32(rounded)
-    simd.store(workspace.unrounded_dn, x, dn)
-    simd.store(workspace.rounded_dn, x, rounded_dn)
-    simd.store(workspace.residual_dn, x, simd.to_float32(dn - rounded))
-    simd.store(workspace.clean, x, simd.to_uint32(rounded_dn))
+    simd.store(buffers.unrounded_dn, x, dn)
+    simd.store(buffers.rounded_dn, x, rounded_dn)
+    simd.store(buffers.residual_dn, x, simd.to_float32(dn - rounded))
+    simd.store(buffers.clean, x, simd.to_uint32(rounded_dn))
 
 
 @inner
-def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
+def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
     """Store eight clean values: DN above black, and as uint16."""
-    simd.store(workspace.unrounded_dn, x, above_black)
-    simd.store(workspace.clean, x, simd.to_bits(above_black + ROUND32) + scene.black_dn)
+    simd.store(buffers.unrounded_dn, x, above_black)
+    simd.store(buffers.clean, x, simd.to_bits(above_black + ROUND32) + scene.black_dn)
 
 
 _store_clean = by_class({Scene: _store_clean64, Scene32: _store_clean32})
@@ -262,41 +262,41 @@ _with_response = by_class(
 
 
 @inner
-def fill_clean(scene: Any, codes: Pointer, strip: Strip, workspace: Workspace, counts: Pointer) -> bool:
+def fill_clean(scene: Any, codes: Pointer, strip: Strip, buffers: Buffers, counts: Pointer) -> bool:
     """Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
 
     Return whether any site can be saturated.
     """
-    signal = simd.pointer_to(workspace.signal, strip.first)
+    signal = simd.pointer_to(buffers.signal, strip.first)
     if scene.gray_mean:
         _fill_gray_mean_signal(codes, strip, scene, signal)
     else:
         _fill_signal(codes, strip, scene, signal)
-    has_negative, has_bright = _fill_linear(scene, strip, workspace)
+    has_negative, has_bright = _fill_linear(scene, strip, buffers)
     if has_bright:
-        counts[6] += _recompute_bright(scene, strip, workspace)
-        counts[1] += count_outside(strip, workspace.bright_light, 0.0, scene.clipped)[1]
+        counts[6] += _recompute_bright(scene, strip, buffers)
+        counts[1] += count_outside(strip, buffers.bright_light, 0.0, scene.clipped)[1]
     if has_negative:
-        light = workspace.bright_light if scene.response.steps[1] else workspace.signal
+        light = buffers.bright_light if scene.response.steps[1] else buffers.signal
         counts[0] += count_outside(strip, light, 0.0, np.inf)[0]
     return bool(has_bright)
 
 
 @inner
-def _fill_linear(scene: Any, strip: Strip, workspace: Workspace) -> tuple[bool, bool]:
+def _fill_linear(scene: Any, strip: Strip, buffers: Buffers) -> tuple[bool, bool]:
     """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
     gains, limits = _load_sites(scene.gains, strip), _load_sites(scene.limits, strip)
-    lowest = highest = simd.load(workspace.signal, _0)
+    lowest = highest = simd.load(buffers.signal, _0)
     for n in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(n) * _8
-        signal = simd.load(workspace.signal, x)
+        signal = simd.load(buffers.signal, x)
         lowest, highest = simd.minimum(lowest, signal), simd.maximum(highest, signal)
-        _store_clean(scene, _linear_dn(scene, signal, gains), x, workspace)
+        _store_clean(scene, _linear_dn(scene, signal, gains), x, buffers)
     return simd.has_any_bit(simd.less_than(lowest, 0.0)), simd.has_any_bit(simd.less_than(limits, highest))
 
 
 @inner
-def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> int:
+def _recompute_bright(scene: Any, strip: Strip, buffers: Buffers) -> int:
     """Recompute vectors that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
 
     ``bright_light`` receives their light, and 0 elsewhere. Return how many sites are above ``scene.white``.
@@ -307,19 +307,19 @@ def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> int:
     most = np.inf if scene.exposure == 1.0 else 1.0  # otherwise light above white would reappear
     for n in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(n) * _8
-        signal = simd.load(workspace.signal, x)
+        signal = simd.load(buffers.signal, x)
         if not simd.has_any_bit(simd.less_than(limits, signal)):
-            simd.store(workspace.bright_light, x, signal * 0.0)
+            simd.store(buffers.bright_light, x, signal * 0.0)
             continue
         i = signal * light_per_signal
         m = simd.maximum(i - scene.highlight_threshold, 0.0) / scene.divisor * scene.steepness
         light = i * gains + i * (m * m) * headroom
         if scene.white < np.inf:
-            simd.store(workspace.bright_light, x, light)
+            simd.store(buffers.bright_light, x, light)
             for site in range(n * VECTOR_WIDTH, (n + 1) * VECTOR_WIDTH):
                 if strip.first <= site < strip.after:
-                    above_white += workspace.bright_light[site] > scene.white
+                    above_white += buffers.bright_light[site] > scene.white
         light = _with_response(scene, simd.minimum(light, most) * scene.exposure, x, strip)
-        simd.store(workspace.bright_light, x, light)
-        _store_clean(scene, simd.minimum(simd.maximum(light, 0.0), scene.brightest) * scene.span_dn, x, workspace)
+        simd.store(buffers.bright_light, x, light)
+        _store_clean(scene, simd.minimum(simd.maximum(light, 0.0), scene.brightest) * scene.span_dn, x, buffers)
     return above_white

@@ -24,7 +24,7 @@ from unprocess_gen.simulation.kernels.poisson import MAX_THRESHOLD_RATE, count_t
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH
 from unprocess_gen.simulation.kernels.strips import SiteMap, padded_width
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
-from unprocess_gen.simulation.slots import LineOffsets, SiteNoise, Slots, UniformCounts, Words
+from unprocess_gen.simulation.slots import LineOffsets, SiteNoise, Slots, SlotWords, UniformCounts
 
 FARTHEST_NORMAL = 6.4
 """Bound of the absolute value of a normal deviate of 32 bits."""
@@ -131,7 +131,7 @@ def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
     quantiles = _quantiles(noise.law, noise.shape)
     has_thresholds = uniform.rate_e <= MAX_THRESHOLD_RATE
     fewest, ranks = count_thresholds(uniform.rate_e) if has_thresholds else (0, np.zeros(0, dtype=np.uint32))
-    rows, bright = slots.rows or LineOffsets(Words(0, "row"), 0.0), slots.patterns.bright
+    rows, bright = slots.rows or LineOffsets(SlotWords(0, "row"), 0.0), slots.patterns.bright
     offset_dn = FARTHEST_NORMAL * rows.std_dn
     offset_dn += slots.black_dn + float(np.abs(planes_dn).max())
     most_dark_e = uniform.rate_e + 8 * math.sqrt(uniform.rate_e) + 40 if uniform.rate_e else 0.0
@@ -204,12 +204,12 @@ def _fixed_columns(offsets: LineOffsets | None, columns: int, left: int) -> Floa
 
 
 @functools.lru_cache(maxsize=512)
-def _first_normals(stream: Words, columns: int) -> Float:
+def _first_normals(stream: SlotWords, columns: int) -> Float:
     """Return the normals of the first columns of a body."""
     return _normals(stream, columns, 0)
 
 
-def _normals(stream: Words, columns: int, left: int, rows: int = 1) -> Float:
+def _normals(stream: SlotWords, columns: int, left: int, rows: int = 1) -> Float:
     """Return the normals of a row of columns, or of the first column of some rows."""
     numbers = stream._asdict()
     key, name = numbers.pop("key"), numbers.pop("stream")

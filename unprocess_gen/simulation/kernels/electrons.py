@@ -1,6 +1,6 @@
 """Sample noise effect by effect, in electrons and then in DN: the order of `effects.order.noisy`.
 
-The way of a strip of a noisy frame. Left, the function; right, the buffers of the `Workspace` that it fills::
+The way of a strip of a noisy frame. Left, the function; right, the `Buffers` that it fills::
 
     clean frame of the strip      unrounded_dn, rounded_dn, residual_dn          clean.fill_clean
               |
@@ -50,7 +50,7 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts_of_one_rate,
 )
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer_to
-from unprocess_gen.simulation.kernels.strips import Float32, SiteMap, Strip, Workspace, list_lanes, strip_values
+from unprocess_gen.simulation.kernels.strips import Buffers, Float32, SiteMap, Strip, list_lanes, strip_values
 
 FLOAT32_ERROR_DN = 2.0**-21
 """Error that float32 adds to an approximate DN, relative to the DN and to its summands: eight roundings."""
@@ -65,7 +65,7 @@ _RATE_ERROR32 = np.float32(FLOAT32_RATE)
 class Electrons(NamedTuple):
     """Hold the slots of N frames of one body; P is the number of columns of complete blocks."""
 
-    numbers: Float  # [N, NUMBERS]: see `FrameNumbers`
+    numbers: Float  # [N, NUMBER_COUNT]: see `FrameNumbers`
     site_lines: NDArray[np.uint64]  # [N, 4097]: quantiles of the noise of a site
     site_quadratics: Float  # [N, 4096]
     dn_per_e: Float  # [N, 2, 8]: of eight sites of even and of odd rows
@@ -107,13 +107,13 @@ class FrameNumbers(NamedTuple):
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
 
 
-NUMBERS = len(FrameNumbers._fields)
+NUMBER_COUNT = len(FrameNumbers._fields)
 
 
 @inner
 def load_frame(noise: Electrons, n: int) -> FrameNumbers:
     """Return the numbers of frame ``n`` with their types."""
-    v = pointer_to(noise.numbers, np.uint64(n * NUMBERS))
+    v = pointer_to(noise.numbers, np.uint64(n * NUMBER_COUNT))
     counts_light, has_dark, has_thresholds = v[0] != 0.0, v[1] != 0.0, v[2] != 0.0
     light, dark, defect, site, row = np.uint64(v[3]), np.uint64(v[4]), np.uint64(v[5]), np.uint64(v[6]), np.uint64(v[7])
     return FrameNumbers(
@@ -144,32 +144,32 @@ def _sites_dn(noise: Electrons, n: int, strip: Strip) -> Pointer:
 
 
 @inner
-def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
+def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, buffers: Buffers) -> None:
     """Fill counts of electrons with bounds of their errors, the offset of the row, and the words of all sites."""
     frame = load_frame(noise, n)
-    fill_word_blocks(key, strip, frame.light_stream, workspace.words)
-    fill_word_blocks(key, strip, frame.site_stream, workspace.site_words)
-    _fill_rates(noise, n, strip, workspace)
-    rates, light_e, light_error_e = workspace.rates, workspace.light_e, workspace.light_error_e
+    fill_word_blocks(key, strip, frame.light_stream, buffers.words)
+    fill_word_blocks(key, strip, frame.site_stream, buffers.site_words)
+    _fill_rates(noise, n, strip, buffers)
+    rates, light_e, light_error_e = buffers.rates, buffers.light_e, buffers.light_error_e
     if frame.counts_light:
-        fill_counts(strip.total, workspace.words, rates, noise.tables, workspace, light_e, light_error_e)
+        fill_counts(strip.total, buffers.words, rates, noise.tables, buffers, light_e, light_error_e)
     else:
         for x in range(strip.total):
             light_e[x] = rates[x]
             light_error_e[x] = rates[x] * _RATE_ERROR32
     if frame.has_dark:
-        fill_word_blocks(key, strip, frame.dark_stream, workspace.dark_words)
-        _count_dark(noise, n, frame, strip, workspace)
-    if _fill_defects(noise.body, strip, workspace):
-        fill_word_blocks(key, strip, frame.defect_stream, workspace.defect_words)
-        _count_defects(noise, strip, workspace)
+        fill_word_blocks(key, strip, frame.dark_stream, buffers.dark_words)
+        _count_dark(noise, n, frame, strip, buffers)
+    if _fill_defects(noise.body, strip, buffers):
+        fill_word_blocks(key, strip, frame.defect_stream, buffers.defect_words)
+        _count_defects(noise, strip, buffers)
     row_word = first_word(key, strip.row, frame.row_stream)
     row_dn = frame.row_std_dn * normal.exact_value(row_word, noise.tables.quadratics)
-    workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
+    buffers.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
 
 
 @inner
-def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> None:
+def _fill_rates(noise: Electrons, n: int, strip: Strip, buffers: Buffers) -> None:
     """Fill ``rates`` (float32) with the mean electrons of light.
 
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
@@ -178,59 +178,59 @@ def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) ->
     response = strip_values(noise.body.response, strip)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        light_dn = (simd.load(workspace.rounded_dn, x) - noise.black_dn) + simd.load(workspace.residual_dn, x)
-        simd.store(workspace.rates, x, light_dn * e_per_dn * simd.load(response, x))
+        light_dn = (simd.load(buffers.rounded_dn, x) - noise.black_dn) + simd.load(buffers.residual_dn, x)
+        simd.store(buffers.rates, x, light_dn * e_per_dn * simd.load(response, x))
 
 
 @inner
-def _count_dark(noise: Electrons, n: int, frame: FrameNumbers, strip: Strip, workspace: Workspace) -> None:
+def _count_dark(noise: Electrons, n: int, frame: FrameNumbers, strip: Strip, buffers: Buffers) -> None:
     """Fill ``dark_e`` with the counts of one rate; without thresholds they are counted like light."""
-    words, dark_e = workspace.dark_words, workspace.dark_e
+    words, dark_e = buffers.dark_words, buffers.dark_e
     if frame.has_thresholds:
         ranks = pointer_to(noise.dark_ranks, n * MAX_STEPS)
         fill_counts_of_one_rate(strip.total, words, frame.fewest_dark, ranks, frame.dark_steps, dark_e)
         return
     for x in range(strip.total):
-        workspace.rates[x] = frame.dark_e
-    fill_counts(strip.total, words, workspace.rates, noise.tables, workspace, dark_e, workspace.dark_error_e)
+        buffers.rates[x] = frame.dark_e
+    fill_counts(strip.total, words, buffers.rates, noise.tables, buffers, dark_e, buffers.dark_error_e)
 
 
 @inner
-def _dark_buffers(frame: FrameNumbers, workspace: Workspace) -> tuple[Pointer, Pointer]:
+def _dark_buffers(frame: FrameNumbers, buffers: Buffers) -> tuple[Pointer, Pointer]:
     """Return the counts of one rate and the bounds of their errors; zeros where there are none."""
-    dark_e = workspace.dark_e if frame.has_dark else workspace.zeros
+    dark_e = buffers.dark_e if frame.has_dark else buffers.zeros
     is_certain = frame.has_thresholds or not frame.has_dark
-    return dark_e, workspace.zeros if is_certain else workspace.dark_error_e
+    return dark_e, buffers.zeros if is_certain else buffers.dark_error_e
 
 
 # -------------------------------------------------------------------------------------------------------------- defects
 
 
 @inner
-def _fill_defects(body: Body, strip: Strip, workspace: Workspace) -> bool:
+def _fill_defects(body: Body, strip: Strip, buffers: Buffers) -> bool:
     """Fill ``defects_e`` with the means of bright defects, less than 0 at dead pixels; return whether there are any."""
     if body.defects.steps[1] == 0:  # no strip has filled it
         return False
     numbers, any_number = strip_values(body.defects, strip), np.uint16(0)
     for x in range(strip.total):
-        workspace.defects_e[x] = 0.0
+        buffers.defects_e[x] = 0.0
         any_number |= numbers[x]
     if any_number == 0:
         return False
     for x in range(strip.total):
-        workspace.defects_e[x] = body.means_e[numbers[x]]
+        buffers.defects_e[x] = body.means_e[numbers[x]]
     return True
 
 
 @inner
-def _count_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
+def _count_defects(noise: Electrons, strip: Strip, buffers: Buffers) -> None:
     """Replace the means of bright defects with counts; all defects are uncertain, so that they are computed exactly."""
     for x in range(strip.total):
-        mean_e = workspace.defects_e[x]
+        mean_e = buffers.defects_e[x]
         if mean_e != 0.0:
-            workspace.light_error_e[x] = _INFINITE32
+            buffers.light_error_e[x] = _INFINITE32
             if mean_e > 0.0:
-                workspace.defects_e[x] = exact_count(workspace.defect_words[x], mean_e, noise.tables)
+                buffers.defects_e[x] = exact_count(buffers.defect_words[x], mean_e, noise.tables)
 
 
 # ------------------------------------------------------------------------------------------------------------------ DN
@@ -246,99 +246,99 @@ def _sum_dn(
 
 
 @inner
-def approximate_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+def approximate_electrons(noise: Electrons, n: int, strip: Strip, buffers: Buffers) -> Pointer:
     """Fill ``noise_dn`` with the DN of all sites but defects, in float32, and bounds of the errors; return the base."""
     frame, f = load_frame(noise, n), np.float32
     lines = pointer_to(noise.site_lines, n * 4097)
-    normal.fill_values_by_lines(strip.total, workspace.site_words, lines, workspace.lines, workspace.noise_dn)
+    normal.fill_values_by_lines(strip.total, buffers.site_words, lines, buffers.lines, buffers.noise_dn)
     first_site = np.uint64(_first_site(n, strip))
     per_e = simd.to_float32(simd.load(noise.dn_per_e, first_site))
     full_e = simd.to_float32(simd.load(noise.full_well_e, first_site))
-    std, margin, row_dn, removed_e = f(frame.site_std_dn), f(frame.error_dn), f(workspace.row_dn[0]), f(frame.removed_e)
+    std, margin, row_dn, removed_e = f(frame.site_std_dn), f(frame.error_dn), f(buffers.row_dn[0]), f(frame.removed_e)
     base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + _first_column(strip))
-    site_dn, (dark_e, dark_error_e) = _sites_dn(noise, n, strip), _dark_buffers(frame, workspace)
+    site_dn, (dark_e, dark_error_e) = _sites_dn(noise, n, strip), _dark_buffers(frame, buffers)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        electrons = simd.load(workspace.light_e, x) + (simd.load(dark_e, x) - removed_e)
+        electrons = simd.load(buffers.light_e, x) + (simd.load(dark_e, x) - removed_e)
         # the base is the sum of black level, column and plane
-        noise_dn, base_dn = simd.load(workspace.noise_dn, x) * std, simd.load(base, x)
+        noise_dn, base_dn = simd.load(buffers.noise_dn, x) * std, simd.load(base, x)
         dn = _sum_dn(electrons, full_e, per_e, base_dn, noise_dn, row_dn, simd.load(site_dn, x))
-        error_e = simd.load(workspace.light_error_e, x) + simd.load(dark_error_e, x)
-        simd.store(workspace.noise_dn, x, dn)
-        simd.store(workspace.error_dn, x, simd.absolute(dn) * FLOAT32_ERROR_DN + (error_e * per_e + margin))
-    return workspace.zeros
+        error_e = simd.load(buffers.light_error_e, x) + simd.load(dark_error_e, x)
+        simd.store(buffers.noise_dn, x, dn)
+        simd.store(buffers.error_dn, x, simd.absolute(dn) * FLOAT32_ERROR_DN + (error_e * per_e + margin))
+    return buffers.zeros
 
 
 @inner
-def exact_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> None:
+def exact_electrons(noise: Electrons, n: int, strip: Strip, buffers: Buffers) -> None:
     """Fill ``exact_dn`` with the DN of all sites: of certain counts in vectors, then of the others one by one."""
     frame, quadratics = load_frame(noise, n), pointer_to(noise.site_quadratics, n * 4096)
-    normal.fill_rows(strip.total, workspace.site_words, workspace.scratch)
-    first_site, row_dn = np.uint64(_first_site(n, strip)), workspace.row_dn[0]
+    normal.fill_rows(strip.total, buffers.site_words, buffers.scratch)
+    first_site, row_dn = np.uint64(_first_site(n, strip)), buffers.row_dn[0]
     per_e, full_e = simd.load(noise.dn_per_e, first_site), simd.load(noise.full_well_e, first_site)
     plane_dn = simd.load(noise.planes_dn, first_site)
     columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + _first_column(strip))
-    sites_dn, (dark_e, dark_error_e) = _sites_dn(noise, n, strip), _dark_buffers(frame, workspace)
+    sites_dn, (dark_e, dark_error_e) = _sites_dn(noise, n, strip), _dark_buffers(frame, buffers)
     listed = 0
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         dark = simd.to_float64(simd.load(dark_e, x)) - frame.removed_e
-        electrons = simd.to_float64(simd.load(workspace.light_e, x)) + dark
-        deviate = normal.exact_values(workspace.site_words, workspace.scratch, x, quadratics)
+        electrons = simd.to_float64(simd.load(buffers.light_e, x)) + dark
+        deviate = normal.exact_values(buffers.site_words, buffers.scratch, x, quadratics)
         noise_dn, offset_dn = deviate * frame.site_std_dn, (simd.load(columns_dn, x) + row_dn) + plane_dn
         site_dn = simd.to_float64(simd.load(sites_dn, x))
         dn = _sum_dn(electrons, full_e, per_e, noise.black_dn, noise_dn, offset_dn, site_dn)
-        simd.store(workspace.exact_dn, x, dn)
-        error_e = simd.load(workspace.light_error_e, x) + simd.load(dark_error_e, x)
-        listed = list_lanes(simd.less_than(_ZERO32, error_e), x, listed, workspace)
+        simd.store(buffers.exact_dn, x, dn)
+        error_e = simd.load(buffers.light_error_e, x) + simd.load(dark_error_e, x)
+        listed = list_lanes(simd.less_than(_ZERO32, error_e), x, listed, buffers)
     for m in range(listed):
-        site = np.int64(workspace.uncertain[m])
-        workspace.exact_dn[site] = exact_electrons_site(noise, n, site, strip, workspace)
+        site = np.int64(buffers.uncertain[m])
+        buffers.exact_dn[site] = exact_electrons_site(noise, n, site, strip, buffers)
 
 
 @inner
-def exact_electrons_site(noise: Electrons, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
+def exact_electrons_site(noise: Electrons, n: int, x: int, strip: Strip, buffers: Buffers) -> float:
     """Return the noisy DN of one site."""
-    if workspace.defects_e[x] < 0.0:
+    if buffers.defects_e[x] < 0.0:
         return float(noise.dead_dn)
     frame, site = load_frame(noise, n), _first_site(n, strip) + (x & 1)
     dn_per_e, full_e = noise.dn_per_e[site], noise.full_well_e[site]
-    electrons = _exact_light(noise, frame, dn_per_e, x, strip, workspace)
+    electrons = _exact_light(noise, frame, dn_per_e, x, strip, buffers)
     if frame.has_dark:
-        electrons = electrons + (_exact_dark(noise, frame, x, workspace) - frame.removed_e)
-    electrons = electrons + workspace.defects_e[x]
-    value = normal.exact_value(workspace.site_words[x], pointer_to(noise.site_quadratics, n * 4096))
+        electrons = electrons + (_exact_dark(noise, frame, x, buffers) - frame.removed_e)
+    electrons = electrons + buffers.defects_e[x]
+    value = normal.exact_value(buffers.site_words[x], pointer_to(noise.site_quadratics, n * 4096))
     column_dn = noise.columns_dn[n * noise.padded_width + _first_column(strip) + x]
-    offset_dn = (column_dn + workspace.row_dn[0]) + noise.planes_dn[site]
+    offset_dn = (column_dn + buffers.row_dn[0]) + noise.planes_dn[site]
     site_dn = np.float64(_sites_dn(noise, n, strip)[x])
     return float(_sum_dn(electrons, full_e, dn_per_e, noise.black_dn, frame.site_std_dn * value, offset_dn, site_dn))
 
 
 @inner
 def _exact_light(
-    noise: Electrons, frame: FrameNumbers, dn_per_e: float, x: int, strip: Strip, workspace: Workspace
+    noise: Electrons, frame: FrameNumbers, dn_per_e: float, x: int, strip: Strip, buffers: Buffers
 ) -> float:
     """Return the electrons of light of one site: a count, or the mean."""
-    if workspace.light_error_e[x] == _ZERO32:
-        return float(workspace.light_e[x])
+    if buffers.light_error_e[x] == _ZERO32:
+        return float(buffers.light_e[x])
     response = np.float64(strip_values(noise.body.response, strip)[x])
-    rate = (workspace.unrounded_dn[x] - noise.black_dn) / dn_per_e * response
-    return float(exact_count(workspace.words[x], rate, noise.tables) if frame.counts_light else rate)
+    rate = (buffers.unrounded_dn[x] - noise.black_dn) / dn_per_e * response
+    return float(exact_count(buffers.words[x], rate, noise.tables) if frame.counts_light else rate)
 
 
 @inner
-def _exact_dark(noise: Electrons, frame: FrameNumbers, x: int, workspace: Workspace) -> float:
+def _exact_dark(noise: Electrons, frame: FrameNumbers, x: int, buffers: Buffers) -> float:
     """Return the count of one rate of one site."""
-    if frame.has_thresholds or workspace.dark_error_e[x] == _ZERO32:
-        return float(workspace.dark_e[x])
-    return float(exact_count(workspace.dark_words[x], frame.dark_e, noise.tables))
+    if frame.has_thresholds or buffers.dark_error_e[x] == _ZERO32:
+        return float(buffers.dark_e[x])
+    return float(exact_count(buffers.dark_words[x], frame.dark_e, noise.tables))
 
 
 @inner
-def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
+def average_electrons(noise: Electrons, strip: Strip, buffers: Buffers) -> None:
     """Add the fixed patterns to the unrounded clean frame, as `effects.order.average`."""
-    frame, clean_dn, defects_e = load_frame(noise, np.int64(0)), workspace.unrounded_dn, workspace.defects_e
-    _fill_defects(noise.body, strip, workspace)
+    frame, clean_dn, defects_e = load_frame(noise, np.int64(0)), buffers.unrounded_dn, buffers.defects_e
+    _fill_defects(noise.body, strip, buffers)
     kept_e, sites_dn = frame.dark_e - frame.removed_e, strip_values(noise.body.sites_dn, strip)
     for x in range(strip.total):
         site = _first_site(np.int64(0), strip) + (x & 1)

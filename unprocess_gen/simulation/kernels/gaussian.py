@@ -22,7 +22,7 @@ from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer
-from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Strip, Workspace
+from unprocess_gen.simulation.kernels.strips import SIZE, Buffers, Float32, Strip
 from unprocess_gen.simulation.plan_slots import NORMAL_STREAM
 
 NORMAL_PURPOSE = np.uint64(purpose(NORMAL_STREAM))
@@ -74,61 +74,61 @@ def gaussian_noise32(plans: tuple[Plan, ...]) -> Gaussian32:
 
 
 @inner
-def draw_gaussian(noise: Gaussian | Gaussian32, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
+def draw_gaussian(noise: Gaussian | Gaussian32, n: int, key: PhiloxKey, strip: Strip, buffers: Buffers) -> None:
     """Fill ``words``."""
-    fill_word_blocks(key, strip, NORMAL_PURPOSE, workspace.words)
+    fill_word_blocks(key, strip, NORMAL_PURPOSE, buffers.words)
 
 
 @inner
-def approximate_gaussian(noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+def approximate_gaussian(noise: Gaussian, n: int, strip: Strip, buffers: Buffers) -> Pointer:
     """Fill ``noise_dn`` with the noise on the rounded clean frame, in float32, and ``error_dn`` with its bounds."""
-    normal.fill_values_by_lines(strip.total, workspace.words, noise.lines, workspace.lines, workspace.normals)
+    normal.fill_values_by_lines(strip.total, buffers.words, noise.lines, buffers.lines, buffers.normals)
     a, b = np.float32(noise.line[2 * n]), np.float32(noise.line[2 * n + 1])
     cancellation = np.float32(abs(b) * CANCELLATION_FRACTION if simd.minimum(a, b) < 0.0 else 0.0)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        residual = simd.load(workspace.residual_dn, x)
-        variance = ((simd.load(workspace.rounded_dn, x) - noise.black_dn) + residual) * a + b
+        residual = simd.load(buffers.residual_dn, x)
+        variance = ((simd.load(buffers.rounded_dn, x) - noise.black_dn) + residual) * a + b
         std = simd.square_root(simd.maximum(variance, 0.0))
-        simd.store(workspace.noise_dn, x, residual + std * simd.load(workspace.normals, x))
+        simd.store(buffers.noise_dn, x, residual + std * simd.load(buffers.normals, x))
         cancelled = simd.less_than(simd.absolute(variance), cancellation) & _ONE_BITS
         error_dn = simd.maximum(std * noise.error + RESIDUAL_ERROR_DN, simd.from_bits(cancelled))
-        simd.store(workspace.error_dn, x, error_dn)
-    return workspace.rounded_dn
+        simd.store(buffers.error_dn, x, error_dn)
+    return buffers.rounded_dn
 
 
 @inner
-def exact_gaussian_site(noise: Gaussian, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
+def exact_gaussian_site(noise: Gaussian, n: int, x: int, strip: Strip, buffers: Buffers) -> float:
     """Return the noisy DN of one site, in the reference's order of operations."""
-    a, b, clean_dn = noise.line[2 * n], noise.line[2 * n + 1], workspace.unrounded_dn[x]
+    a, b, clean_dn = noise.line[2 * n], noise.line[2 * n + 1], buffers.unrounded_dn[x]
     std = np.sqrt(simd.maximum(a * (clean_dn - noise.black_dn) + b, 0.0))
-    return float(clean_dn + std * normal.exact_value(workspace.words[x], noise.quadratics))
+    return float(clean_dn + std * normal.exact_value(buffers.words[x], noise.quadratics))
 
 
 @inner
-def exact_gaussian(noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> None:
+def exact_gaussian(noise: Gaussian, n: int, strip: Strip, buffers: Buffers) -> None:
     """Fill ``exact_dn`` with the noisy DN of all sites."""
-    normal.fill_rows(strip.total, workspace.words, workspace.scratch)
+    normal.fill_rows(strip.total, buffers.words, buffers.scratch)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        clean_dn = simd.load(workspace.unrounded_dn, x)
+        clean_dn = simd.load(buffers.unrounded_dn, x)
         std = simd.square_root(simd.maximum((clean_dn - noise.black_dn) * a + b, 0.0))
-        deviate = normal.exact_values(workspace.words, workspace.scratch, x, noise.quadratics)
-        simd.store(workspace.exact_dn, x, clean_dn + std * deviate)
+        deviate = normal.exact_values(buffers.words, buffers.scratch, x, noise.quadratics)
+        simd.store(buffers.exact_dn, x, clean_dn + std * deviate)
 
 
 @inner
-def approximate_gaussian32(noise: Gaussian32, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+def approximate_gaussian32(noise: Gaussian32, n: int, strip: Strip, buffers: Buffers) -> Pointer:
     """Fill ``noise_dn`` with clean and noise above black, in float32; no site needs more."""
-    normal.fill_coarse_depths(strip.total, workspace.words, workspace.depths)
+    normal.fill_coarse_depths(strip.total, buffers.words, buffers.depths)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        clean_dn = simd.load(workspace.unrounded_dn, x)
+        clean_dn = simd.load(buffers.unrounded_dn, x)
         std = simd.square_root(simd.maximum(clean_dn * a + b, 0.0))
         deviate = normal.apply_signs(
-            std * normal.coarse_normal(simd.load(workspace.depths, x)), simd.load(workspace.words, x)
+            std * normal.coarse_normal(simd.load(buffers.depths, x)), simd.load(buffers.words, x)
         )
-        simd.store(workspace.noise_dn, x, clean_dn + deviate)
+        simd.store(buffers.noise_dn, x, clean_dn + deviate)
     return noise.black_dn

@@ -26,7 +26,7 @@ from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.rounding import ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
-from unprocess_gen.simulation.kernels.strips import Workspace
+from unprocess_gen.simulation.kernels.strips import Buffers
 from unprocess_gen.simulation.reference import poisson as reference
 from unprocess_gen.simulation.reference.poisson import LIMIT, ORDER, RATE_CELLS, TAIL_CELLS, poisson_tables
 
@@ -130,7 +130,7 @@ _INFINITE_BITS32, _EVERY_BIT, _23, _0F = np.uint32(0x7F800000), np.uint32(0xFFFF
 
 @inner
 def fill_counts(
-    count: int, words: Pointer, rates: Pointer, tables: CountTables, workspace: Workspace, out: Pointer, error: Pointer
+    count: int, words: Pointer, rates: Pointer, tables: CountTables, buffers: Buffers, out: Pointer, error: Pointer
 ) -> None:
     """Fill ``out`` (float32) with the Poisson counts of ``words``; ``count`` is a multiple of `VECTOR_WIDTH`.
 
@@ -140,20 +140,18 @@ def fill_counts(
     has_normals = False
     for start in range(0, count, BLOCK):
         first, vectors = np.uint64(start), min(BLOCK, count - start) // VECTOR_WIDTH
-        has_low, has_high, highest_low = _range_of_block(first, vectors, rates, workspace)
+        has_low, has_high, highest_low = _range_of_block(first, vectors, rates, buffers)
         if has_low:
             _count_low_rates(first, vectors, highest_low, words, rates, out, error)
         if has_high:
             if not has_normals:
-                normal.fill_values_by_lines(count, words, tables.lines, workspace.lines, workspace.normals)
+                normal.fill_values_by_lines(count, words, tables.lines, buffers.lines, buffers.normals)
                 has_normals = True
-            _count_high_rates(first, vectors, has_low, rates, workspace.normals, out, error)
+            _count_high_rates(first, vectors, has_low, rates, buffers.normals, out, error)
 
 
 @inner
-def _range_of_block(
-    first: np.uint64, vectors: int, rates: Pointer, workspace: Workspace
-) -> tuple[bool, bool, np.float32]:
+def _range_of_block(first: np.uint64, vectors: int, rates: Pointer, buffers: Buffers) -> tuple[bool, bool, np.float32]:
     """Compare the rates of a block with `LOW_RATE`: any below it, any not below it, and the highest one below it."""
     any_low = any_high = simd.uint32_zeros()
     low = simd.from_bits(any_low)
@@ -162,10 +160,10 @@ def _range_of_block(
         is_low = simd.less_than(rate, LOW_RATE)
         any_low, any_high = any_low | is_low, any_high | (is_low ^ _EVERY_BIT)
         low = simd.maximum(simd.from_bits(is_low & simd.to_bits(rate)), low)
-    simd.store(workspace.highest, 0, low)
+    simd.store(buffers.highest, 0, low)
     highest = _0F
     for lane in range(VECTOR_WIDTH):
-        highest = simd.maximum(workspace.highest[lane], highest)
+        highest = simd.maximum(buffers.highest[lane], highest)
     return simd.has_any_bit(any_low), simd.has_any_bit(any_high), highest
 
 

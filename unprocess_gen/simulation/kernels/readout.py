@@ -2,7 +2,7 @@
 
 The way of a strip through the read-out, once its noise is drawn (`draw_noise`)::
 
-    Integers, FloatClean: noisy frames of uint16        Normalised: noisy frames of float32
+    Rounded, FloatClean: noisy frames of uint16         Unrounded: noisy frames of float32
       _approximate    noise_dn, error_dn (float32)        _fill_exact    exact_dn (float64)
       _round_and_list                                     pinned sites get the level of white
           rounded = rint(noise_dn)                        _normalise
@@ -18,7 +18,7 @@ The base is what the noise is added to, integers in DN: the rounded clean frame 
 float32 form, and 0 for counts of electrons, whose ``noise_dn`` is the DN itself.
 
 The clean frame is read out once, after all noisy frames (`write_clean`): its values are rounded already, or normalised
-for `Normalised` and `FloatClean`; with fixed patterns they are rounded here, after `average_patterns`.
+for `Unrounded` and `FloatClean`; with fixed patterns they are rounded here, after `average_patterns`.
 
 Two records select the compiled code by their class (`jit.by_class`): the read-out, one of the three above, and the
 noise: `Gaussian`, `Gaussian32` or `Electrons`. Each function below that is made by `by_class` states its arguments.
@@ -40,7 +40,7 @@ from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer_to
-from unprocess_gen.simulation.kernels.strips import Strip, Workspace, count_outside, list_lanes
+from unprocess_gen.simulation.kernels.strips import Buffers, Strip, count_outside, list_lanes
 from unprocess_gen.simulation.reference.cfa import plane_sites
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
@@ -60,11 +60,11 @@ class ReadOut(NamedTuple):
     planes: NDArray[np.int64]  # [4]: first element of the plane of each site of the tile
 
 
-class Integers(ReadOut):
+class Rounded(ReadOut):
     """Read out frames of uint16."""
 
 
-class Normalised(ReadOut):
+class Unrounded(ReadOut):
     """Read out frames of float32."""
 
 
@@ -91,7 +91,7 @@ class Output(NamedTuple):
 
 CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE, LIGHT_HIGH = range(7)
 """Places of the members of `Counts` in the counts of a frame."""
-COUNTS = 7
+COUNT_FIELDS = 7
 
 
 @functools.lru_cache(maxsize=1024)
@@ -107,7 +107,7 @@ def readout_of(
     ]
     packed = first.output.layout == PACKED
     planes = np.argsort([2 * y + x for y, x in plane_sites(first.sensor.pattern, origin)])
-    kind = Normalised if first.output.normalised else FloatClean if first.output.clean_normalised else Integers
+    kind = Unrounded if first.output.normalised else FloatClean if first.output.clean_normalised else Rounded
     return kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
         variance_lines=gaussian.variance_lines(plans, np.float32 if counts_from_black else np.float64),
@@ -143,7 +143,7 @@ def load_limits(readout: Any, n: int) -> Limits:
 draw_noise = by_class(
     {Gaussian: gaussian.draw_gaussian, Gaussian32: gaussian.draw_gaussian, Electrons: electrons.count_electrons}
 )
-"""Fill the random words and counts of a strip of frame n; arguments: noise, n, key, strip, workspace."""
+"""Fill the random words and counts of a strip of frame n; arguments: noise, n, key, strip, buffers."""
 _approximate = by_class(
     {
         Gaussian: gaussian.approximate_gaussian,
@@ -151,50 +151,50 @@ _approximate = by_class(
         Electrons: electrons.approximate_electrons,
     }
 )
-"""Fill ``noise_dn`` and ``error_dn``; return the base, integers in DN; arguments: noise, n, strip, workspace."""
+"""Fill ``noise_dn`` and ``error_dn``; return the base, integers in DN; arguments: noise, n, strip, buffers."""
 _exact_site = by_class(
     {
         Gaussian: gaussian.exact_gaussian_site,
-        Gaussian32: lambda noise, n, x, strip, workspace: 0.0,  # it lists no site
+        Gaussian32: lambda noise, n, x, strip, buffers: 0.0,  # it lists no site
         Electrons: electrons.exact_electrons_site,
     }
 )
-"""Return the exact DN of a site; arguments: noise, n, x, strip, workspace."""
+"""Return the exact DN of a site; arguments: noise, n, x, strip, buffers."""
 _has_errors = by_class({Gaussian: lambda noise: True, Gaussian32: lambda noise: False, Electrons: lambda noise: True})
 """True if ``error_dn`` has bounds, so that sites can be uncertain; argument: noise."""
 _fill_exact = by_class({Gaussian: gaussian.exact_gaussian, Electrons: electrons.exact_electrons})
-"""Fill ``exact_dn`` with the DN of all sites; arguments: noise, n, strip, workspace."""
+"""Fill ``exact_dn`` with the DN of all sites; arguments: noise, n, strip, buffers."""
 average_patterns = by_class(
     {
-        Gaussian: lambda noise, strip, workspace: None,
-        Gaussian32: lambda noise, strip, workspace: None,
+        Gaussian: lambda noise, strip, buffers: None,
+        Gaussian32: lambda noise, strip, buffers: None,
         Electrons: electrons.average_electrons,
     }
 )
-"""Replace the unrounded clean frame of a strip with the average of many frames; arguments: noise, strip, workspace."""
+"""Replace the unrounded clean frame of a strip with the average of many frames; arguments: noise, strip, buffers."""
 
 
 # ------------------------------------------------------------------------------------------------------------- integers
 
 
 @inner
-def _read_integers(readout: Any, noise: Any, n: int, output: Output, strip: Strip, workspace: Workspace) -> None:
+def _read_integers(readout: Any, noise: Any, n: int, output: Output, strip: Strip, buffers: Buffers) -> None:
     limits = load_limits(readout, n)
     low, high = np.float32(limits.low), np.float32(limits.high)
-    base = _approximate(noise, n, strip, workspace)
-    listed, has_clipped = _round_and_list(noise, base, low, high, strip, workspace)
+    base = _approximate(noise, n, strip, buffers)
+    listed, has_clipped = _round_and_list(noise, base, low, high, strip, buffers)
     for m in range(listed):
-        site = np.int64(workspace.uncertain[m])  # as below: Numba compiles a function for each type of index
-        dn = np.float32((_exact_site(noise, n, site, strip, workspace) + ROUND) - ROUND)
-        has_clipped = _replace(site, dn, low, high, workspace) or has_clipped
+        site = np.int64(buffers.uncertain[m])  # as below: Numba compiles a function for each type of index
+        dn = np.float32((_exact_site(noise, n, site, strip, buffers) + ROUND) - ROUND)
+        has_clipped = _replace(site, dn, low, high, buffers) or has_clipped
     if output.may_saturate and limits.pinned_from < np.inf:
         dn = np.float32((limits.pinned_dn + ROUND) - ROUND)
         for x in range(strip.first, strip.after):
-            if workspace.unrounded_dn[x] >= limits.pinned_from:
-                has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
+            if buffers.unrounded_dn[x] >= limits.pinned_from:
+                has_clipped = _replace(x, dn, low, high, buffers) or has_clipped
     if has_clipped:
-        _count_clipped(output, strip, workspace.noisy_dn, low, high)
-    _write(readout, strip, workspace.noisy, output.sites)
+        _count_clipped(output, strip, buffers.noisy_dn, low, high)
+    _write(readout, strip, buffers.noisy, output.sites)
 
 
 @inner
@@ -206,7 +206,7 @@ def _count_clipped(output: Output, strip: Strip, values_dn: Pointer, low: Any, h
 
 @inner
 def _round_and_list(
-    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
+    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, buffers: Buffers
 ) -> tuple[int, bool]:
     """Round half to even, clip and cast to uint16; list sites whose error bound reaches a rounding boundary.
 
@@ -215,35 +215,35 @@ def _round_and_list(
     listed, clipped_bits = 0, simd.uint32_zeros()
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        noise_dn = simd.load(workspace.noise_dn, x)
+        noise_dn = simd.load(buffers.noise_dn, x)
         rounded = (noise_dn + ROUND32) - ROUND32
         dn = simd.load(base, x) + rounded
         clipped = simd.minimum(simd.maximum(dn, low), high)
-        simd.store(workspace.noisy_dn, x, dn)
-        simd.store(workspace.noisy, x, simd.to_uint32(clipped))
+        simd.store(buffers.noisy_dn, x, dn)
+        simd.store(buffers.noisy, x, simd.to_uint32(clipped))
         clipped_bits = clipped_bits | (simd.to_bits(clipped) ^ simd.to_bits(dn))
         if _has_errors(noise):
             to_boundary = 0.5 - simd.absolute(noise_dn - rounded)
-            uncertain = simd.less_than(to_boundary, simd.load(workspace.error_dn, x))
-            listed = list_lanes(uncertain, x, listed, workspace)
+            uncertain = simd.less_than(to_boundary, simd.load(buffers.error_dn, x))
+            listed = list_lanes(uncertain, x, listed, buffers)
     return listed, simd.has_any_bit(clipped_bits)
 
 
 @inner
-def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace) -> bool:
+def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, buffers: Buffers) -> bool:
     """Replace a noisy value with a rounded DN; return whether it is clipped."""
-    workspace.noisy_dn[x] = dn
-    workspace.noisy[x] = np.uint16(np.int64(simd.minimum(simd.maximum(dn, low), high)))
+    buffers.noisy_dn[x] = dn
+    buffers.noisy[x] = np.uint16(np.int64(simd.minimum(simd.maximum(dn, low), high)))
     return bool(dn < low or dn > high)
 
 
 @inner
-def _write_integers(readout: Integers, output: Output, strip: Strip, workspace: Workspace) -> None:
-    clean = workspace.clean
+def _write_integers(readout: Rounded, output: Output, strip: Strip, buffers: Buffers) -> None:
+    clean = buffers.clean
     if readout.averaged:
         limits = load_limits(readout, np.int64(0))
         for x in range(strip.total):
-            dn = (workspace.unrounded_dn[x] + ROUND) - ROUND
+            dn = (buffers.unrounded_dn[x] + ROUND) - ROUND
             clean[x] = np.uint16(np.int32(simd.minimum(simd.maximum(dn, limits.low), limits.high)))
     if output.may_saturate:
         output.counts[SATURATED] += _count_equal(strip, clean, np.uint16(readout.white))
@@ -262,15 +262,13 @@ def _count_equal(strip: Strip, values: Pointer, value: Any) -> int:
 
 
 @inner
-def _read_normalised(
-    readout: Normalised, noise: Any, n: int, output: Output, strip: Strip, workspace: Workspace
-) -> None:
-    limits, noisy_dn = load_limits(readout, n), workspace.exact_dn
-    _fill_exact(noise, n, strip, workspace)
-    noisy = output.sites if _is_direct(readout, strip) else workspace.normalised
+def _read_normalised(readout: Unrounded, noise: Any, n: int, output: Output, strip: Strip, buffers: Buffers) -> None:
+    limits, noisy_dn = load_limits(readout, n), buffers.exact_dn
+    _fill_exact(noise, n, strip, buffers)
+    noisy = output.sites if _is_direct(readout, strip) else buffers.normalised
     if output.may_saturate and limits.pinned_from < np.inf:
         for x in range(strip.total):
-            noisy_dn[x] = limits.pinned_dn if workspace.unrounded_dn[x] >= limits.pinned_from else noisy_dn[x]
+            noisy_dn[x] = limits.pinned_dn if buffers.unrounded_dn[x] >= limits.pinned_from else noisy_dn[x]
     if _normalise(readout, noisy_dn, limits.low, limits.high, strip, noisy):
         _count_clipped(output, strip, noisy_dn, limits.low, limits.high)
     if not _is_direct(readout, strip):
@@ -300,13 +298,13 @@ def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip:
 
 
 @inner
-def _write_normalised(readout: Any, output: Output, strip: Strip, workspace: Workspace) -> None:
-    clean = output.sites if _is_direct(readout, strip) else workspace.normalised
+def _write_normalised(readout: Any, output: Output, strip: Strip, buffers: Buffers) -> None:
+    clean = output.sites if _is_direct(readout, strip) else buffers.normalised
     low, high = readout.black_dn, readout.black_dn + readout.span_dn
     if readout.averaged:
         limits = load_limits(readout, np.int64(0))
         low, high = limits.low, limits.high
-    _normalise(readout, workspace.unrounded_dn, low, high, strip, clean)
+    _normalise(readout, buffers.unrounded_dn, low, high, strip, clean)
     if output.may_saturate:
         output.counts[SATURATED] += _count_equal(strip, clean, np.float32(readout.white))
     if not _is_direct(readout, strip):
@@ -331,20 +329,20 @@ def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
 
 
 @inner
-def count_zero_variance(readout: Any, n: int, output: Output, strip: Strip, workspace: Workspace) -> None:
+def count_zero_variance(readout: Any, n: int, output: Output, strip: Strip, buffers: Buffers) -> None:
     """Count sites with a·(clean - black) + b <= 0."""
     a, b = readout.variance_lines[2 * n], readout.variance_lines[2 * n + 1]
     if simd.minimum(a, b) <= 0.0:
         count = 0
         for x in range(strip.first, strip.after):
-            count += a * (workspace.unrounded_dn[x] - readout.black_dn) + b <= 0.0
+            count += a * (buffers.unrounded_dn[x] - readout.black_dn) + b <= 0.0
         output.counts[ZERO_VARIANCE] += count
 
 
-read_noisy = by_class({Integers: _read_integers, Normalised: _read_normalised, FloatClean: _read_integers})
+read_noisy = by_class({Rounded: _read_integers, Unrounded: _read_normalised, FloatClean: _read_integers})
 """Read out a strip of noisy frame n, and count its clipped sites.
 
-Arguments: read-out, noise, n, output, strip, workspace.
+Arguments: read-out, noise, n, output, strip, buffers.
 """
-write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised, FloatClean: _write_normalised})
-"""Read out the clean frame of a strip; arguments: read-out, output, strip, workspace."""
+write_clean = by_class({Rounded: _write_integers, Unrounded: _write_normalised, FloatClean: _write_normalised})
+"""Read out the clean frame of a strip; arguments: read-out, output, strip, buffers."""

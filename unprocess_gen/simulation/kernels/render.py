@@ -23,7 +23,7 @@ from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
-    COUNTS,
+    COUNT_FIELDS,
     Output,
     ReadOut,
     average_patterns,
@@ -34,7 +34,7 @@ from unprocess_gen.simulation.kernels.readout import (
     write_clean,
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
-from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, locate, scratch_of_thread, workspace_in
+from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, buffers_in, locate, scratch_of_thread
 from unprocess_gen.simulation.plan_slots import fixed_patterns, slots_in_epoch
 
 
@@ -110,7 +110,7 @@ def _fill_frames(
     frame_shape = (4, shape[0] // 2, shape[1] // 2) if first.output.layout == PACKED else shape
     clean = np.empty(frame_shape, dtype=np.float32 if first.output.clean_normalised else np.uint16)
     noisy = np.empty((count, *frame_shape), dtype=np.float32 if first.output.normalised else np.uint16)
-    counts = np.zeros((max(count, 1), COUNTS), dtype=np.int64)
+    counts = np.zeros((max(count, 1), COUNT_FIELDS), dtype=np.int64)
     codes_per_channel = 256 if srgb.itemsize == 1 else 65536
     scene, noise, readout = _records(tuple(plans), shape, codes_per_channel, origin, dark_pixels, epoch)
     scratch = scratch_of_thread(np.float32 if uses_scene32(first) else np.float64)
@@ -182,7 +182,7 @@ def _render(
     """Fill the frames and counts of all pairs, strip by strip."""
     height, width = srgb.shape[:2]
     light, sampler, frames = pointers_of(scene), pointers_of(noise), pointers_of(readout)
-    buffers = workspace_in(scratch)
+    buffers = buffers_in(scratch)
     codes, clean_sites, noisy_sites = pointer_to(srgb, 0), pointer_to(clean, 0), pointer_to(noisy, 0)
     key_words, all_counts, sites = pointer_to(keys, 0), pointer_to(counts, 0), clean.size
     for y in range(height):
@@ -193,7 +193,7 @@ def _render(
             may_saturate = fill_clean(light, source, strip, buffers, all_counts)
             for n in range(noisy.shape[0]):
                 output = Output(
-                    pointer_to(noisy_sites, n * sites + first), pointer_to(all_counts, COUNTS * n), may_saturate
+                    pointer_to(noisy_sites, n * sites + first), pointer_to(all_counts, COUNT_FIELDS * n), may_saturate
                 )
                 draw_noise(sampler, n, load_key(key_words, n), strip, buffers)
                 read_noisy(frames, sampler, n, output, strip, buffers)

@@ -30,7 +30,7 @@ CACHE_LINE = 64
 
 Float32 = NDArray[np.float32]
 Indices = NDArray[np.uint32]
-Lines = NDArray[np.uint64]
+CacheLines = NDArray[np.uint64]
 
 _8 = np.uint64(8)
 _MASK_BITS = np.arange(2**VECTOR_WIDTH)[:, None] >> np.arange(VECTOR_WIDTH) & 1
@@ -91,7 +91,7 @@ def strip_values(site_map: SiteMap, strip: Strip) -> Pointer:
     return simd.pointer_to(site_map.values, strip.y * row + strip.x * column + strip.lead)
 
 
-class Workspace(NamedTuple):
+class Buffers(NamedTuple):
     """Point to the scratch memory of one strip. The first four are float64, or float32 for the tier ``fast``."""
 
     signal: Any  # before white balance and highlights
@@ -121,14 +121,14 @@ class Workspace(NamedTuple):
     defect_words: Indices
     scratch: Indices
     uncertain: Indices  # sites to recompute exactly
-    lines: Lines  # scratch of look-ups
+    lines: CacheLines  # scratch of look-ups
     clean: Raw
     noisy: Raw
     lanes_by_mask: Indices  # for each mask of eight lanes: its set lanes first
     count_by_mask: Indices  # for each mask: number of set lanes
 
 
-_DTYPES = {Float: np.float64, Float32: np.float32, Indices: np.uint32, Lines: np.uint64, Raw: np.uint16}
+_DTYPES = {Float: np.float64, Float32: np.float32, Indices: np.uint32, CacheLines: np.uint64, Raw: np.uint16}
 _LENGTHS = {"lanes_by_mask": _LANES_BY_MASK.size}
 """Lengths of the buffers that are not `SIZE`."""
 
@@ -140,7 +140,7 @@ def _places(dtype: np.dtype[Any]) -> dict[str, tuple[np.dtype[Any], int]]:
     A block lies before each buffer, because random words may begin at negative indices.
     """
     places, end = {}, 0
-    for name, annotation in get_type_hints(Workspace).items():
+    for name, annotation in get_type_hints(Buffers).items():
         buffer_dtype = np.dtype(_DTYPES.get(annotation, dtype))
         places[name] = buffer_dtype, end + BLOCK * buffer_dtype.itemsize
         end += (BLOCK + _LENGTHS.get(name, SIZE)) * buffer_dtype.itemsize
@@ -148,7 +148,7 @@ def _places(dtype: np.dtype[Any]) -> dict[str, tuple[np.dtype[Any], int]]:
 
 
 Scratch = NDArray[Any]
-"""Scratch memory of a `Workspace`, one array of the dtype of the clean frame: Numba takes 0.2 µs to read each array.
+"""Scratch memory of `Buffers`, one array of the dtype of the clean frame: Numba takes 0.2 µs to read each array.
 
 Python allocates it, since compiling the allocation takes half a second.
 """
@@ -178,14 +178,14 @@ def allocate_scratch(dtype: Any = np.float64) -> Scratch:
     memory = np.zeros(size + CACHE_LINE, dtype=np.uint8)
     start = -memory.ctypes.data % CACHE_LINE
     scratch: Scratch = memory[start : start + size].view(dtype)
-    workspace = workspace_in(scratch)
-    workspace.lanes_by_mask[: _LANES_BY_MASK.size] = _LANES_BY_MASK
-    workspace.count_by_mask[: _COUNT_BY_MASK.size] = _COUNT_BY_MASK
+    buffers = buffers_in(scratch)
+    buffers.lanes_by_mask[: _LANES_BY_MASK.size] = _LANES_BY_MASK
+    buffers.count_by_mask[: _COUNT_BY_MASK.size] = _COUNT_BY_MASK
     return scratch
 
 
-@simd.buffers_at("Workspace", _places)
-def workspace_in(scratch: Scratch) -> Workspace:
+@simd.buffers_at("Buffers", _places)
+def buffers_in(scratch: Scratch) -> Buffers:
     """Return pointers to the buffers of strips.
 
     Random words fill complete blocks, from index -`Strip.lead` on. All other stages begin at index 0, the first vector
@@ -193,7 +193,7 @@ def workspace_in(scratch: Scratch) -> Workspace:
     """
     memory = scratch.view(np.uint8)
     # a view ends with a further block, which negative indices reach in uncompiled kernels
-    return Workspace(
+    return Buffers(
         *(
             memory[start : start + (_LENGTHS.get(name, SIZE) + BLOCK) * dtype.itemsize].view(dtype)
             for name, (dtype, start) in _places(scratch.dtype).items()
@@ -202,15 +202,15 @@ def workspace_in(scratch: Scratch) -> Workspace:
 
 
 @inner
-def list_lanes(lanes: Vector, x: np.uint64, count: int, workspace: Workspace) -> int:
+def list_lanes(lanes: Vector, x: np.uint64, count: int, buffers: Buffers) -> int:
     """Append the indices of set lanes (`simd.less_than`) of the vector at ``x`` to ``uncertain``; return the length.
 
     Every call writes all eight lanes, and the next one overwrites the others: a branch would be mispredicted about
     every second time.
     """
     mask = simd.movemask(lanes)
-    simd.store(workspace.uncertain, count, simd.load(workspace.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
-    length: int = count + workspace.count_by_mask[mask]
+    simd.store(buffers.uncertain, count, simd.load(buffers.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
+    length: int = count + buffers.count_by_mask[mask]
     return length
 
 

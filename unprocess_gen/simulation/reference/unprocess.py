@@ -130,7 +130,7 @@ def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:
     srgb : ndarray of uint8 or uint16
         Codes, any shape.
     tone : str
-        Key of `TONES`.
+        Key of `INVERSE_TONES`.
     gamma : float or str
         Exponent, or ``"srgb"``.
 
@@ -140,7 +140,7 @@ def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:
         Linear light in [0, 1], same shape.
     """
     white = np.float64(np.iinfo(srgb.dtype).max)
-    return expand_gamma(TONES[tone](srgb / white, (white - srgb) / white), gamma)
+    return expand_gamma(INVERSE_TONES[tone](srgb / white, (white - srgb) / white), gamma)
 
 
 def inverse_smoothstep(x: Float, rest: Float) -> Float:
@@ -173,7 +173,7 @@ def no_tone(x: Float, rest: Float) -> Float:
     return x
 
 
-TONES = {"smoothstep": inverse_smoothstep, "none": no_tone}
+INVERSE_TONES = {"smoothstep": inverse_smoothstep, "none": no_tone}
 
 
 def expand_gamma(v: Float, gamma: float | str) -> Float:
@@ -217,7 +217,7 @@ def invert_gains(
     inverse_gains : tuple of three floats
         Factors of the red, green and blue channels.
     highlight : str
-        Key of `HIGHLIGHTS`: the method for highlights of channels with an inverse gain below 1.
+        Key of `INVERSE_HIGHLIGHTS`: the method for highlights of channels with an inverse gain below 1.
     threshold : float
         Intensity above which it acts, in [0, 1).
 
@@ -226,7 +226,7 @@ def invert_gains(
     ndarray of float64
         Light before the gains, same shape.
     """
-    invert = HIGHLIGHTS[highlight]
+    invert = INVERSE_HIGHLIGHTS[highlight]
     return invert(camera_rgb, np.array(inverse_gains), threshold)
 
 
@@ -265,7 +265,7 @@ def invert_gains_none(i: Float, k: Float, threshold: float) -> Float:
     return i * k
 
 
-HIGHLIGHTS = {
+INVERSE_HIGHLIGHTS = {
     "per_channel": invert_gains_per_channel,
     "gray_mean": invert_gains_gray_mean,
     "none": invert_gains_none,

@@ -19,7 +19,7 @@ from unprocess_gen.config.raw_validation import by_plane
 from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.raw_files import PICTURES, RAW_FILES
+from unprocess_gen.core.raw_files import PICTURE_SUFFIXES, RAW_FILES
 from unprocess_gen.core.types import CameraPlan, IspPlan, Levels, Photograph, RawParts, SensorPlan, SourcePlan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites
@@ -85,7 +85,7 @@ def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
     if raw.pattern is None or raw.black_dn is None or raw.white_dn is None:
         needed = "source.raw.pattern, source.raw.black_dn and source.raw.white_dn"
         raise SourceError("unsupported", f"a {suffix[1:].upper()} file states no levels and no pattern; give {needed}")
-    pixels = _picture(config, content) if suffix in PICTURES else _npy(content)
+    pixels = _picture(config, content) if suffix in PICTURE_SUFFIXES else _npy(content)
     if pixels.dtype != np.uint16 or pixels.ndim != 2 or not pixels.size:
         found = f"{pixels.dtype} {list(pixels.shape)}"
         raise SourceError("unsupported", f"contains {found}; expected a mosaic [H, W] of uint16")

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 Codes = tuple[int, int, int]
 
-KINDS = ("dead_leaves", "colour_chart", "gradients", "night_lamps", "highlights")
+SCENE_KINDS = ("dead_leaves", "colour_chart", "gradients", "night_lamps", "highlights")
 
 DEFAULT_COUNT = 10
 
@@ -35,10 +35,10 @@ DEFAULT_COUNT = 10
 def listing(limit: int | None) -> tuple[str, ...]:
     """Return the names of the first ``limit`` scenes (None: ten); kinds alternate."""
     count = DEFAULT_COUNT if limit is None else limit
-    return tuple(f"{KINDS[i % len(KINDS)]}-{i // len(KINDS)}" for i in range(count))
+    return tuple(f"{SCENE_KINDS[i % len(SCENE_KINDS)]}-{i // len(SCENE_KINDS)}" for i in range(count))
 
 
-CLIP_FRAMES = 8
+FRAMES_PER_CLIP = 8
 """Frames of a scene that is a clip."""
 
 PAN = (2, 4)
@@ -47,15 +47,15 @@ PAN = (2, 4)
 
 def clip_listing(limit: int | None) -> tuple[str, ...]:
     """Return the names of the first ``limit`` frames (None: all of ten clips), ``<kind>-<number>/<frame>``."""
-    clips = listing(None if limit is None else -(-limit // CLIP_FRAMES))
-    return tuple(f"{clip}/{frame:04}" for clip in clips for frame in range(CLIP_FRAMES))[:limit]
+    clips = listing(None if limit is None else -(-limit // FRAMES_PER_CLIP))
+    return tuple(f"{clip}/{frame:04}" for clip in clips for frame in range(FRAMES_PER_CLIP))[:limit]
 
 
-NAMES = listing(None)
+SCENES = listing(None)
 
 DEFAULT_SIZE = (512, 768)
 
-SIZES = {
+SCENE_SIZES = {
     "dead_leaves-1": (481, 641),
     "gradients-1": (427, 639),
     "night_lamps-1": (767, 511),
@@ -71,12 +71,12 @@ def scene(name: str) -> NDArray[np.uint8]:
     clip, slash, frame = name.partition("/")
     if not slash:
         return _draw(name)
-    if frame not in map("{:04}".format, range(CLIP_FRAMES)):
-        raise ValueError(f"frame {frame!r} of a synthetic scene: expected 0000 to {CLIP_FRAMES - 1:04}")
+    if frame not in map("{:04}".format, range(FRAMES_PER_CLIP)):
+        raise ValueError(f"frame {frame!r} of a synthetic scene: expected 0000 to {FRAMES_PER_CLIP - 1:04}")
     pixels = _drawn(clip)
     first = (int(frame) * step for step in PAN)
     rows, columns = (
-        slice(start, start + side - (CLIP_FRAMES - 1) * step)
+        slice(start, start + side - (FRAMES_PER_CLIP - 1) * step)
         for start, side, step in zip(first, pixels.shape, PAN, strict=False)
     )
     return np.ascontiguousarray(pixels[rows, columns])
@@ -91,16 +91,16 @@ def _drawn(name: str) -> NDArray[np.uint8]:
 def _draw(name: str) -> NDArray[np.uint8]:
     kind = _kind(name)
     draws = _Draws(name)
-    height, width = SIZES.get(name, DEFAULT_SIZE)
+    height, width = SCENE_SIZES.get(name, DEFAULT_SIZE)
     return _encode(PAINTERS[kind](draws, height, width), draws)
 
 
 def _kind(name: str) -> str:
     """Return the kind in a name; a number has one spelling only, so that a picture has one name."""
     match = re.fullmatch(r"(.*)-(?:0|[1-9][0-9]*)", name)
-    if match is None or match[1] not in KINDS:
+    if match is None or match[1] not in SCENE_KINDS:
         raise ValueError(
-            f"synthetic scene {name!r}: expected <kind>-<number>, the kind one of {', '.join(KINDS)} "
+            f"synthetic scene {name!r}: expected <kind>-<number>, the kind one of {', '.join(SCENE_KINDS)} "
             "and the number 0 or more without leading zeros"
         )
     return match[1]
@@ -400,11 +400,11 @@ def _gradients(draws: _Draws, height: int, width: int) -> Float:
     canvas = np.zeros((3, height, width))
     ramps_top = height * 13 // 16
     gap = 6
-    for i, which in enumerate(draws.order(len(PANELS))):
+    for i, which in enumerate(draws.order(len(HIGHLIGHT_PANELS))):
         row, column = divmod(i, 3)
         top, bottom = gap + row * ramps_top // 2, (row + 1) * ramps_top // 2
         left, right = gap + column * (width - gap) // 3, (column + 1) * (width - gap) // 3
-        shown = _unit(PANELS[which](draws, bottom - top, right - left))
+        shown = _unit(HIGHLIGHT_PANELS[which](draws, bottom - top, right - left))
         canvas[:, top:bottom, left:right] = shown * shown
     for i, (low, high) in enumerate(RAMPS):
         top, bottom = (ramps_top + gap + (height - ramps_top - gap) * (i + k) // len(RAMPS) for k in (0, 1))
@@ -482,7 +482,7 @@ def _pools(draws: _Draws, height: int, width: int) -> Float:
     return shown
 
 
-PANELS: tuple[Callable[[_Draws, int, int], Float], ...] = (_corners, _halo, _spectrum, _dusk, _silk, _pools)
+HIGHLIGHT_PANELS: tuple[Callable[[_Draws, int, int], Float], ...] = (_corners, _halo, _spectrum, _dusk, _silk, _pools)
 
 
 # Night: a wet street under lamps, most of it dark, its sources brighter than white.
@@ -690,5 +690,5 @@ def _shade(
 Painter = Callable[[_Draws, int, int], Float]
 
 PAINTERS: dict[str, Painter] = dict(
-    zip(KINDS, (_dead_leaves, _colour_chart, _gradients, _night_lamps, _highlights), strict=True)
+    zip(SCENE_KINDS, (_dead_leaves, _colour_chart, _gradients, _night_lamps, _highlights), strict=True)
 )
