@@ -130,7 +130,8 @@ class Page:
         title, x, y = CURVES[name]
         is_histogram = "histogram" in name
         size = {"width": 420, "height": 260, "sizing_mode": "stretch_width", "tools": "pan,wheel_zoom,box_zoom,reset"}
-        drawn = figure(name=name, title=title, y_axis_type="log" if name == "raw_histogram" else "linear", **size)
+        scale = {"y_axis_type": "log", "y_range": (1e-6, 1)} if name == "raw_histogram" else {}
+        drawn = figure(name=name, title=title, **size, **scale)
         drawn.xaxis.axis_label, drawn.yaxis.axis_label = x, y
         drawn.toolbar.logo, drawn.toolbar.autohide = None, True
         drawn.multi_line("xs", "ys", source=self._lines[name], color="colour", line_width=1.5, legend_field="label")

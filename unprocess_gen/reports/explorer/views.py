@@ -131,16 +131,18 @@ def source_histogram(shown: Shown) -> Lines:
 
 
 def raw_histogram(shown: Shown) -> Lines:
-    """Return the shares of DN in both frames."""
+    """Return the shares of DN in both frames, over those of the clean frame and all but 0.2 % of the noisy one."""
     top = 2**shown.plan.sensor.bits
-    step = max(1, top // BINS)
-    found = {}
+    counts = {}
     for name, frame in (("clean", shown.clean), ("noisy", shown.noisy)):
         dn = frame if frame.dtype == np.uint16 else np.clip(np.rint(frame), 0, top - 1).astype(np.uint16)
-        counts = np.bincount(dn.ravel(), minlength=top)
-        counts = np.add.reduceat(counts, np.arange(0, len(counts), step))
-        found[name] = np.arange(len(counts)) * step, counts / dn.size
-    return found
+        counts[name] = np.bincount(dn.ravel(), minlength=top)
+    used, sums = np.flatnonzero(counts["clean"]), np.cumsum(counts["noisy"]) / shown.noisy.size
+    low, high = min(used[0], np.searchsorted(sums, 0.001)), max(used[-1], np.searchsorted(sums, 0.999))
+    starts = np.arange(low, high + 1, 1 + (high - low) // BINS)
+    return {
+        name: (starts, np.add.reduceat(count[: high + 1], starts) / shown.clean.size) for name, count in counts.items()
+    }
 
 
 def highlight_curves(shown: Shown) -> Lines:
