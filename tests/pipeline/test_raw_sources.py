@@ -150,7 +150,7 @@ def dataset(tmp_path: Path) -> Path:
 def test_datasets_of_raw_sources_are_complete(dataset: Path, tmp_path: Path) -> None:
     assert not ug.verify(dataset) and not any(result.complaint for result in ug.replay(dataset))
     assert json.loads((dataset / "dataset.json").read_text())["versions"]["libraw"]
-    pairs, live = ug.RawPairs(dataset), ug.LivePairs(dataset)
+    pairs, live = ug.RawPairs(dataset), ug.LivePairs(dataset, cache="memory")
     assert len(pairs) == 4
     assert (live[0].noisy == pairs[0].noisy).all() and (live[1, 0].clean == pairs[0].clean).all()
     redrawn = ug.LivePairs(dataset, redraw="all")[1, 0]

@@ -208,5 +208,6 @@ class PlannedPairs:
 
 def _cache_name(source: Source, sha256: str, prepared: SourcePlan) -> str:
     if prepared.is_raw:
-        return f"{prepared.mosaic_xxh3}-{prepared.shrink}-{array_xxh3(np.array(prepared.code_levels))}"
+        means = prepared.raw_pattern, *prepared.raw_black_dn, *prepared.raw_white_dn
+        return "-".join(map(str, (prepared.mosaic_xxh3, prepared.shrink, *(means if prepared.shrink > 1 else ()))))
     return f"{sha256}-{source.frame}-{prepared.downscale}"
