@@ -12,7 +12,7 @@ import pytest
 from helpers.captures import Camera, record
 
 from unprocess_gen.calibration.calibrate import calibrate
-from unprocess_gen.calibration.profile import Named, estimates, site_names
+from unprocess_gen.calibration.profile import NamedNumber, estimates, site_names
 
 ISOS = {
     "imx385": (1600, 6400, 25600),
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.slow
 class Compared(NamedTuple):
     """An estimate, its true value, and the read noise at its ISO."""
 
-    estimate: Named
+    estimate: NamedNumber
     true: float
     read_dn: float
 

@@ -94,8 +94,8 @@ def without_dark_current(result: IsoResult, body: BodyResult) -> IsoResult:
 
 def _in_electrons(number: Estimate, gain: Estimate) -> Estimate:
     """Return a number in DN in electrons; its interval contains the error of the gain."""
-    value, of_gain = number.value / gain.value, (gain.high - gain.low) / 2 / gain.value
-    below, above = (math.hypot(end / number.value - 1, of_gain) * value for end in (number.low, number.high))
+    value, gain_error = number.value / gain.value, (gain.high - gain.low) / 2 / gain.value
+    below, above = (math.hypot(end / number.value - 1, gain_error) * value for end in (number.low, number.high))
     return Estimate(value, value - below, value + above)
 
 
@@ -203,7 +203,7 @@ def _dead(results: Sequence[IsoResult], black_dn: float) -> tuple[Estimate | Non
     bright = [flat for result in results for flat in usable(result.flats) if flat.is_bright]
     if not bright:
         return None, None
-    flat = max(bright, key=lambda one: one.signal_dn / math.sqrt(float(one.measured.variance.mean())))
+    flat = max(bright, key=lambda flat: flat.signal_dn / math.sqrt(float(flat.measured.variance.mean())))
     share = share_estimate(len(flat.dead_dn), 4 * flat.measured.sites)
     if not len(flat.dead_dn) or not black_dn:
         return share, None

@@ -23,7 +23,7 @@ from unprocess_gen.calibration.profile import (
     measured_yaml,
     unknown_numbers,
 )
-from unprocess_gen.calibration.stated_noise import STATED, StatedNoise, stated_estimates, stated_yaml
+from unprocess_gen.calibration.stated_noise import TAG_PRECISION, StatedNoise, stated_estimates, stated_yaml
 from unprocess_gen.config.limits import NAME
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
@@ -75,9 +75,9 @@ def measure_all(captures: CaptureSet, quick: bool, watch: Watch, known: KnownGai
     results = [measure_iso(captures, iso, quick, watch, gains.get(iso)) for iso in captures.isos]
     body = measure_body(results, captures.sensor.black_dn)
     results = [without_dark_current(result, body) for result in results]
-    found = Calibration(captures, results, body, [], known)
-    notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(found)]
-    return replace(found, notes=_merged(notes))
+    calibration = Calibration(captures, results, body, [], known)
+    notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(calibration)]
+    return replace(calibration, notes=_merged(notes))
 
 
 def _merged(notes: Iterable[str]) -> list[str]:
@@ -90,14 +90,14 @@ def _merged(notes: Iterable[str]) -> list[str]:
     return [note + (f" (and {count - 1} more like it)" if count > 1 else "") for note, count in seen.values()]
 
 
-def write_profile(found: Calibration, to: Path, two_parameter: bool = False) -> None:
+def write_profile(calibration: Calibration, to: Path, two_parameter: bool = False) -> None:
     """Write the profile and, with the suffix .json, the list of all estimates."""
-    _write(to, measured_yaml(found, to.stem, two_parameter), estimates_json(estimates(found)))
+    _write(to, measured_yaml(calibration, to.stem, two_parameter), estimates_json(estimates(calibration)))
 
 
 def write_stated_profile(stated: StatedNoise, to: Path) -> None:
     """Write the profile of NoiseProfile tags and, with the suffix .json, the list of all estimates."""
-    _write(to, stated_yaml(stated, to.stem), estimates_json(stated_estimates(stated), STATED.digits))
+    _write(to, stated_yaml(stated, to.stem), estimates_json(stated_estimates(stated), TAG_PRECISION.digits))
 
 
 def _write(to: Path, profile: str, listed: str) -> None:
@@ -106,10 +106,10 @@ def _write(to: Path, profile: str, listed: str) -> None:
             path.write_text(text, encoding="utf-8")
 
 
-def keep_darks(found: Calibration, folder: Path) -> list[Path]:
+def keep_darks(calibration: Calibration, folder: Path) -> list[Path]:
     """Write the darks from which read noise was measured as NPY, a folder for each ISO, for ``noise.dark_frames``."""
     folders = []
-    for result in found.isos:
+    for result in calibration.isos:
         place = folder / f"iso{result.iso:g}"
         with machine_errors(place):
             place.mkdir(parents=True, exist_ok=True)

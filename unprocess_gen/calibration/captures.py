@@ -25,15 +25,15 @@ from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES
 from unprocess_gen.sources.mosaics import even_sides, read_mosaic
 from unprocess_gen.sources.raw.metadata import read_metadata
 
-LIST, EMVA = "captures.csv", "EMVA1288_Data.txt"
+TABLE, EMVA = "captures.csv", "EMVA1288_Data.txt"
 REQUIRED = ("file", "kind", "iso")
 OPTIONAL = ("exposure_s", "level", "temperature_c", "black_level_dn", "white_level_dn", "bits", "pattern")
-KINDS = {"dark": ("dark", "bias"), "flat": ("flat",)}
+KIND_NAMES = {"dark": ("dark", "bias"), "flat": ("flat",)}
 """Kinds of frames, and the words by which names state them."""
 EMVA_ISO = 100.0
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
 LEAST_SIDE = 32
-CLOSE = 0.05
+SAME_EXPOSURE = 0.05
 """Relative difference of ISO and exposure from metadata, which cameras round."""
 APART = 0.03
 """Relative difference of signals from which flats without a stated level are of different levels."""
@@ -71,9 +71,9 @@ class Capture:
         """
         mosaic = read_mosaic(self.path, "calibrate", numbers=True).pixels
         if mosaic.dtype not in (np.uint16, np.uint8) or min(mosaic.shape) < LEAST_SIDE:
-            found = f"is {mosaic.dtype} {list(mosaic.shape)}"
+            actual = f"is {mosaic.dtype} {list(mosaic.shape)}"
             raise ConfigError(
-                f"calibrate: {self.path}: {found}; expected a mosaic of uint16 with sides of {LEAST_SIDE} or more"
+                f"calibrate: {self.path}: {actual}; expected a mosaic of uint16 with sides of {LEAST_SIDE} or more"
             )
         return even_sides(mosaic).astype(np.uint16, copy=False)
 
@@ -104,9 +104,9 @@ class CaptureSet(NamedTuple):
 
     def groups(self, kind: str, iso: float) -> Iterator[list[Capture]]:
         """Yield the frames of each exposure and level of one ISO."""
-        chosen = sorted((one for one in self.captures if (one.kind, one.iso) == (kind, iso)), key=lambda one: one.group)
-        for _, frames in groupby(chosen, key=lambda one: one.group):
-            yield list(frames)
+        frames = [frame for frame in self.captures if (frame.kind, frame.iso) == (kind, iso)]
+        for _, group in groupby(sorted(frames, key=lambda frame: frame.group), key=lambda frame: frame.group):
+            yield list(group)
 
     @property
     def isos(self) -> list[float]:
@@ -122,7 +122,7 @@ def read_captures(folder: Path, kind: str | None = None, default: Sensor | None 
     if not folder.is_dir():
         raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of raw frames, darks and flats")
     try:
-        if (folder / LIST).is_file():
+        if (folder / TABLE).is_file():
             captures = list(_from_list(folder))
         elif (folder / EMVA).is_file():
             captures = list(_from_emva(folder))
@@ -155,7 +155,7 @@ def _check_twins(captures: Iterable[Capture], digests: Iterable[str]) -> None:
 
 def _from_list(folder: Path) -> Iterator[Capture]:
     """Yield the frames that ``captures.csv`` lists."""
-    path = folder / LIST
+    path = folder / TABLE
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
@@ -180,8 +180,8 @@ def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
     if not file.is_file() or file.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{place}: file={row['file']}: no such frame; expected a file as {', '.join(SUFFIXES)}")
     kind, pattern = row["kind"].strip().lower(), row.get("pattern", "").strip().upper()
-    if kind not in KINDS:
-        raise ConfigError(f"{place}: kind={row['kind']}: expected {' or '.join(KINDS)}")
+    if kind not in KIND_NAMES:
+        raise ConfigError(f"{place}: kind={row['kind']}: expected {' or '.join(KIND_NAMES)}")
     if pattern and pattern not in PATTERNS:
         raise ConfigError(f"{place}: pattern={pattern}: expected one of {', '.join(PATTERNS)}")
     given: dict[str, Any] = {
@@ -190,7 +190,7 @@ def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
     given |= {"pattern": pattern or None, "level": row.get("level", "").strip()}
     stated = _metadata(file) if file.suffix.lower() in RAW_FILES else {}
     for name in ("iso", "exposure_s"):
-        if given.get(name) and stated.get(name) and not math.isclose(given[name], stated[name], rel_tol=CLOSE):
+        if given.get(name) and stated.get(name) and not math.isclose(given[name], stated[name], rel_tol=SAME_EXPOSURE):
             problem = f"the metadata of {file.name} state {stated[name]:g}; expected frames that are listed as recorded"
             raise ConfigError(f"{place}: {name}={given[name]:g}: {problem}")
     facts = stated | {name: value for name, value in given.items() if value is not None}
@@ -236,17 +236,17 @@ def _from_names(folder: Path, default: str | None = None) -> Iterator[Capture]:
     for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
         if file.suffix.lower() not in RAW_FILES:
             raise ConfigError(
-                f"calibrate: {file}: states no ISO; expected raw files, or {LIST} in {folder} with the columns "
+                f"calibrate: {file}: states no ISO; expected raw files, or {TABLE} in {folder} with the columns "
                 f"{','.join((*REQUIRED, 'exposure_s', 'level'))}"
             )
         name = str(file.relative_to(folder)).lower()
-        kinds = [kind for kind, words in KINDS.items() if any(word in name for word in words)]
+        kinds = [kind for kind, words in KIND_NAMES.items() if any(word in name for word in words)]
         kinds = [default] if default and not kinds else kinds
         facts = _metadata(file)
         if len(kinds) != 1 or "iso" not in facts:
             problem = "its name has neither dark nor flat" if not kinds else "its name has dark and flat"
             problem = "it states no ISO" if len(kinds) == 1 else problem
-            raise ConfigError(f"calibrate: {file}: {problem}; expected {LIST} in {folder}, with a line for each frame")
+            raise ConfigError(f"calibrate: {file}: {problem}; expected {TABLE} in {folder}, with a line for each frame")
         yield Capture(file, kinds[0], **facts)
 
 

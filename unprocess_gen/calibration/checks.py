@@ -13,7 +13,7 @@ from unprocess_gen.calibration.frame_sums import Measured
 from unprocess_gen.core.errors import ConfigError
 
 
-class Limit(NamedTuple):
+class StatisticLimit(NamedTuple):
     """Limits of a statistic: from which value frames are doubtful, and refused; what it means, and what is expected."""
 
     doubtful: float
@@ -23,49 +23,49 @@ class Limit(NamedTuple):
 
 
 LIMITS = {
-    "light in darks": Limit(
+    "light in darks": StatisticLimit(
         math.inf,
         0.05,
         "the mean is {value:.1%} of white away from black",
         "frames without light; correct kind, or black_level_dn in captures.csv",
     ),
-    "clipped black": Limit(
+    "clipped black": StatisticLimit(
         math.inf,
         0.005,
         "{value:.1%} of the values are the lowest that occurs: black is clipped, and a part of the noise is missing",
         "raw frames with an offset",
     ),
-    "frames differ": Limit(
+    "frames differ": StatisticLimit(
         math.inf,
         1.2,
         "the variances of the frames differ by a factor of {value:.2f}",
         "frames of one ISO and exposure; remove those of another",
     ),
-    "missing codes": Limit(
+    "missing codes": StatisticLimit(
         0.02,
         0.25,
         "{value:.0%} of the values within the noise never occur: the camera scales its values",
         "values of the converter, not scaled ones, or ones of fewer bits",
     ),
-    "neighbours": Limit(
+    "neighbours": StatisticLimit(
         0.025,  # real sensors reach 0.03 (EMVA 1288 reference set 001)
         0.08,
         "the noise of neighbouring sites has a correlation of {value:.3f}; a profile has none",
         "raw frames without noise reduction or sharpening; switch off long-exposure and high-ISO noise reduction",
     ),
-    "flicker": Limit(
+    "flicker": StatisticLimit(
         0.005,
         0.02,
         "the mean differs by {value:.1%} between the frames",
         "one exposure in steady light; correct level and exposure_s, or use a lamp that does not flicker",
     ),
-    "bands": Limit(
+    "bands": StatisticLimit(
         0.002,
         0.01,
         "rows change by {value:.2%} from frame to frame: the lamp flickers",
         "steady light, or exposures of many periods of the mains",
     ),
-    "vignetting": Limit(
+    "vignetting": StatisticLimit(
         0.2,
         0.5,
         "the darkest sixteenth of the frame has {value:.0%} less light than the brightest",
@@ -104,7 +104,7 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
         "clipped black": clipped_share(dark),
         "frames differ": float(variances.max() / max(variances.min(), 1e-9)) - noise,
     }
-    _check(frames, values | _of_pixels(dark), notes)
+    _check(frames, values | _pixel_statistics(dark), notes)
 
 
 def is_clipped(dark: Measured) -> bool:
@@ -122,7 +122,7 @@ def clipped_share(dark: Measured) -> float:
     return float(max(shares))
 
 
-def _of_pixels(measured: Measured) -> dict[str, float]:
+def _pixel_statistics(measured: Measured) -> dict[str, float]:
     """Return the share of missing values, and the largest correlation of neighbours beyond its own noise."""
     noise = 6 / math.sqrt(4 * measured.sites) + 1 / min(measured.shape)
     correlation = max(map(abs, measured.correlation.values()))
@@ -157,4 +157,4 @@ def check_flat(frames: Sequence[Capture], sensor: Sensor, flat: Measured, dark: 
         "bands": math.sqrt(max(flat.row[0] - dark.row[0] - 5 * flat.row[1], 0.0)) / signal,
         "vignetting": 1 - darkest / brightest if brightest > 0 else 0.0,
     }
-    _check(frames, values | _of_pixels(flat), notes)
+    _check(frames, values | _pixel_statistics(flat), notes)

@@ -167,9 +167,9 @@ class FrameSums:
         planes = [_plane(mean_frame[y::2, x::2], variances[y::2, x::2], count) for y, x in TILE]
         mean_dn, total, total_error, patterns, good = (np.array(values) for values in zip(*planes, strict=True))
         drift = means.var(axis=0, ddof=1)
-        of_rows = rows.var(axis=0, ddof=1).mean(axis=1)
-        variance = (total - of_rows) * width / (width - 1)
-        error = np.hypot(total_error, of_rows * math.sqrt(2 / (height * (count - 1))))
+        row_variance = rows.var(axis=0, ddof=1).mean(axis=1)
+        variance = (total - row_variance) * width / (width - 1)
+        error = np.hypot(total_error, row_variance * math.sqrt(2 / (height * (count - 1))))
         noise = variance / width
         row, correlation = _line_offsets(own[0], 2, float(noise.mean()) / 2)
         column, _ = _line_offsets(own[1], 1, float(variance.mean()) / height / 2)

@@ -58,8 +58,8 @@ def root_estimate(variance: float, error: float) -> Estimate:
 
 def combined(estimates: Sequence[Estimate]) -> Estimate:
     """Return the mean of independent estimates, weighted by their errors."""
-    weights = np.array([1 / max(one.error, 1e-300) ** 2 for one in estimates])
-    values = np.array([one.value for one in estimates])
+    weights = np.array([1 / max(number.error, 1e-300) ** 2 for number in estimates])
+    values = np.array([number.value for number in estimates])
     mean = float(weights @ values / weights.sum())
     excess = float(weights @ (values - mean) ** 2) / max(len(values) - 1, 1)
     return estimate(mean, math.sqrt(max(excess, 1.0) if excess > 4 else 1.0) / math.sqrt(float(weights.sum())))
@@ -115,7 +115,7 @@ class Fit:
     degrees: int
 
 
-def fit(points: Transfer, with_q: bool) -> Fit | None:
+def fit_curve(points: Transfer, with_q: bool) -> Fit | None:
     """Fit K, and q if wanted, by generalised least squares; None for too few points."""
     design = np.stack([points.signal, points.signal**2])[: 1 + with_q].T
     degrees = len(points.signal) - design.shape[1]
@@ -148,9 +148,9 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> Gain:
         ranges.pop()
     by_kind = {}
     for share, with_q in itertools.product(ranges, (False, True)):
-        fits = [fit(curve.upto(share * span_dn), with_q) for curve in curves]
-        if all(one is not None for one in fits):
-            by_kind[share, with_q] = [one for one in fits if one is not None]
+        fits = [fit_curve(curve.upto(share * span_dn), with_q) for curve in curves]
+        if all(fit is not None for fit in fits):
+            by_kind[share, with_q] = [fit for fit in fits if fit is not None]
     base = by_kind[ranges[-1], False]
     means = {kind: _mean(fits) for kind, fits in by_kind.items()}
     value, error = means[ranges[-1], False]
@@ -158,7 +158,7 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> Gain:
         (other - value, math.sqrt(max(own**2 - error**2, 0.0))) for kind, (other, own) in means.items() if own > error
     ]
     is_systematic = any(abs(difference) > SIGNIFICANT * spread for difference, spread in differences)
-    is_systematic |= _chi2(base) > 1 + SIGNIFICANT * math.sqrt(2 / max(sum(one.degrees for one in base), 1))
+    is_systematic |= _chi2(base) > 1 + SIGNIFICANT * math.sqrt(2 / max(sum(fit.degrees for fit in base), 1))
     low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
     chosen = base
     if is_systematic:
@@ -172,39 +172,39 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> Gain:
         low, high = low - UNSEEN * value, high + UNSEEN * value
     sensor = Estimate(value, low, high)
     planes = [
-        Estimate(one.gain, one.gain - (value - low) * one.error / error, one.gain + (high - value) * one.error / error)
+        Estimate(fit.gain, fit.gain - (value - low) * fit.error / error, fit.gain + (high - value) * fit.error / error)
         if not is_systematic and len(by_kind) > 1
-        else Estimate(one.gain, *_widened(one, value, low, high))
-        for one in chosen
+        else Estimate(fit.gain, *_widened(fit, value, low, high))
+        for fit in chosen
     ]
-    q, chi2 = float(np.mean([one.q for one in chosen])), _chi2(chosen)
+    q, chi2 = float(np.mean([fit.q for fit in chosen])), _chi2(chosen)
     return Gain(sensor, planes, q, chi2, is_systematic, _have_colours(chosen))
 
 
 def _mean(fits: Sequence[Fit]) -> tuple[float, float]:
     """Return the mean gain of the planes, weighted by their errors, and its standard error."""
-    weights = np.array([1 / one.error**2 for one in fits])
-    return float(weights @ [one.gain for one in fits] / weights.sum()), float(weights.sum() ** -0.5)
+    weights = np.array([1 / fit.error**2 for fit in fits])
+    return float(weights @ [fit.gain for fit in fits] / weights.sum()), float(weights.sum() ** -0.5)
 
 
 def _chi2(fits: Sequence[Fit]) -> float:
     """Return χ² over its degrees of freedom."""
-    return sum(one.chi2 for one in fits) / max(sum(one.degrees for one in fits), 1)
+    return sum(fit.chi2 for fit in fits) / max(sum(fit.degrees for fit in fits), 1)
 
 
-def _widened(one: Fit, value: float, low: float, high: float) -> tuple[float, float]:
+def _widened(fit: Fit, value: float, low: float, high: float) -> tuple[float, float]:
     """Return the interval of a plane: its statistical error, and the relative interval of the sensor."""
     return (
-        one.gain - math.hypot(NORMAL_95 * one.error, (value - low) / value * one.gain),
-        one.gain + math.hypot(NORMAL_95 * one.error, (high - value) / value * one.gain),
+        fit.gain - math.hypot(NORMAL_95 * fit.error, (value - low) / value * fit.gain),
+        fit.gain + math.hypot(NORMAL_95 * fit.error, (high - value) / value * fit.gain),
     )
 
 
 def _have_colours(fits: Sequence[Fit]) -> bool:
     """Return whether the gains of planes differ by more than their errors, and by more than 0.3 %."""
     value, _ = _mean(fits)
-    far = [abs(one.gain - value) for one in fits]
-    return any(distance > max(4 * one.error, 0.003 * value) for distance, one in zip(far, fits, strict=True))
+    far = [abs(fit.gain - value) for fit in fits]
+    return any(distance > max(4 * fit.error, 0.003 * value) for distance, fit in zip(far, fits, strict=True))
 
 
 def emva_gain(curve: Transfer) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from unprocess_gen.calibration.gain import NORMAL_95, SIGNIFICANT, Estimate
 
-SWITCH = 0.85
+MODE_RATIO = 0.85
 """Largest ratio of read noise to that of the same gain mode, from which it belongs to another mode."""
 CLOSE = 1e-3
 """Relative residual up to which a law is good enough, whatever the standard errors."""
@@ -43,7 +43,7 @@ def modes(isos: Sequence[float], reads: Sequence[Estimate]) -> list[list[int]]:
             slope = (last - reads[mode[-2]].value ** 2) / (isos[mode[-1]] - isos[mode[-2]])
         least = math.sqrt(max(last + max(slope, 0.0) * (isos[place] - isos[mode[-1]]), 0.0))
         read = reads[place]
-        margin = SWITCH if len(mode) > 1 else 1.0
+        margin = MODE_RATIO if len(mode) > 1 else 1.0
         if read.value + SIGNIFICANT * math.hypot(read.error, reads[mode[-1]].error) < margin * least:
             result.append([place])
         else:
@@ -57,12 +57,12 @@ def joined_branches(
     """Return the places of the ISOs of each branch: a mode whose gains are on one line, or else pairs of neighbours."""
 
     def is_line(chosen: Sequence[int]) -> bool:
-        return gain_law([isos[one] for one in chosen], [gains[one] for one in chosen], precision) is not None
+        return gain_law([isos[place] for place in chosen], [gains[place] for place in chosen], precision) is not None
 
     result: list[list[int]] = []
     for mode in places:
         pairs = [mode] if is_line(mode) else [[*pair] for pair in itertools.pairwise(mode) if is_line(pair)]
-        result += sorted([*pairs, *([one] for one in mode if not any(one in pair for pair in pairs))])
+        result += sorted([*pairs, *([place] for place in mode if not any(place in pair for pair in pairs))])
     return result
 
 
@@ -138,8 +138,8 @@ def _fitted(
     design = np.array([[float(iso) ** power for power in powers] for iso in isos])
     weights = 1 / np.maximum(errors, 1e-9 * max(values))
     scale = design.max(axis=0)
-    found, _ = nnls(design / scale * weights[:, None], np.array(values) * weights)
-    coefficients = found / scale
+    solution, _ = nnls(design / scale * weights[:, None], np.array(values) * weights)
+    coefficients = solution / scale
     residual = np.abs(design @ coefficients - values)
     allowed = np.maximum(SIGNIFICANT * np.array(errors), close * np.array(values))
     return coefficients.tolist() if np.all(residual <= allowed) else None

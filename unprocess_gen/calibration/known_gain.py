@@ -34,11 +34,11 @@ def known_gain(captures: CaptureSet, profile: str | None, stated: str | None) ->
     if profile is not None and stated is not None:
         raise ConfigError(f"--gain {profile}, --dn-per-e {stated}: both state the gain; expected one of them")
     if profile is not None:
-        return _of_profile(captures, profile)
-    return _of_user(captures, stated) if stated is not None else _of_tags(captures)
+        return _profile_gain(captures, profile)
+    return _user_gain(captures, stated) if stated is not None else _tag_gain(captures)
 
 
-def _of_user(captures: CaptureSet, stated: str) -> KnownGain:
+def _user_gain(captures: CaptureSet, stated: str) -> KnownGain:
     """Read gains such as ``0.1@100,0.4@400``."""
     gains = {}
     for text in stated.split(","):
@@ -55,7 +55,7 @@ def _of_user(captures: CaptureSet, stated: str) -> KnownGain:
     return KnownGain("gain stated by --dn-per-e, not measured", "not known", by_iso)
 
 
-def _of_tags(captures: CaptureSet) -> KnownGain:
+def _tag_gain(captures: CaptureSet) -> KnownGain:
     """Read the gain of green from the NoiseProfile tags of the darks."""
     by_iso = {}
     for capture in captures.captures:
@@ -70,7 +70,7 @@ def _of_tags(captures: CaptureSet) -> KnownGain:
     return KnownGain("gain from the NoiseProfile tags of the darks, not measured", "the tags state none", by_iso)
 
 
-def _of_profile(captures: CaptureSet, profile: str) -> KnownGain:
+def _profile_gain(captures: CaptureSet, profile: str) -> KnownGain:
     """Evaluate the gain of a physical noise profile, in DN of the sensor; its list of estimates has intervals."""
     noise, listed = _read_profile(profile)
     if not is_physical(noise):
@@ -131,7 +131,7 @@ def _intervals(path: Path) -> dict[float, tuple[float, float]]:
         problem = f"is not a list of estimates ({error_in_one_line(error)})"
         raise ConfigError(f"--gain: {path}: {problem}; calibrate again, or delete the list") from error
     return {
-        one.iso: (one.low, one.high)
-        for one in listed
-        if one.site is None and one.iso is not None and one.low is not None and one.high is not None
+        entry.iso: (entry.low, entry.high)
+        for entry in listed
+        if entry.site is None and entry.iso is not None and entry.low is not None and entry.high is not None
     }

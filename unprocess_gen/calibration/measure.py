@@ -33,7 +33,7 @@ from unprocess_gen.calibration.gain import (
     fit_gain,
     root_estimate,
 )
-from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms, joined
+from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms, joined_histogram
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
 
@@ -163,7 +163,7 @@ def measure_iso(
         prnu_squares=_prnu_squares(usable(flats), darks, watch) if flats else [],
         full_well_dn=_full_well(flats, sensor, gain) if flats else None,
         notes=notes,
-        **_of_darks(darks[reference], sensor, shapes),
+        **_dark_estimates(darks[reference], sensor, shapes),
     )
 
 
@@ -268,10 +268,10 @@ def _levels(captures: CaptureSet, iso: float, notes: list[str]) -> Iterable[list
         if frames[0].level or len(frames) <= LEAST_FRAMES:
             groups.append(frames)
             continue
-        black_dn = captures.sensor.black_dn
-        signals = {frame.path: float(frame.pixels().mean()) - black_dn for frame in frames}
+        signals = {frame.path: float(frame.pixels().mean()) - captures.sensor.black_dn for frame in frames}
         named = with_measured_levels(frames, signals)
-        groups += [[one for one in named if one.level == level] for level in sorted({one.level for one in named})]
+        levels = sorted({frame.level for frame in named})
+        groups += [[frame for frame in named if frame.level == level] for level in levels]
     for frames in groups:
         if len(frames) < LEAST_FRAMES:
             notes.append(f"{checks.place(frames)}: one frame shows no noise, and is left out")
@@ -305,7 +305,7 @@ def _shapes(dark: Dark, watch: Watch) -> tuple[list[Shape], Histogram]:
     """Fit the distribution of the read noise: that of all planes, then that of each plane."""
     std = math.sqrt(float(dark.measured.variance.mean()))
     counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.columns, std)
-    together = joined(counts)
+    together = joined_histogram(counts)
     first = fit_shape(together)
     return [first, *(fit_shape(histogram, first) for histogram in counts)], together
 
@@ -334,7 +334,7 @@ def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: Shap
     )
 
 
-def _of_darks(dark: Dark, sensor: Sensor, shapes: Sequence[Shape]) -> dict[str, Any]:
+def _dark_estimates(dark: Dark, sensor: Sensor, shapes: Sequence[Shape]) -> dict[str, Any]:
     """Return what the darks show."""
     measured, columns = dark.measured, dark.measured.column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
@@ -398,11 +398,11 @@ def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) ->
         deviation = np.abs(pattern - np.median(pattern))
         pattern = pattern[deviation <= FAR * ROBUST * np.median(deviation)]
         noise = share @ [flat.measured.variance[plane] for flat in flats]
-        of_dark = float(counts @ weights / scale) ** 2
+        dark_factor = float(counts @ weights / scale) ** 2
         dark = darks[flats[-1].dark].measured
-        square = (float(pattern.var()) - rows) / SMOOTH - noise - of_dark * dark.fixed[plane]
+        square = (float(pattern.var()) - rows) / SMOOTH - noise - dark_factor * dark.fixed[plane]
         error = math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt((counts - 1).sum()))
-        squares.append((square, math.hypot(error, of_dark * dark.fixed_error[plane])))
+        squares.append((square, math.hypot(error, dark_factor * dark.fixed_error[plane])))
     return squares
 
 

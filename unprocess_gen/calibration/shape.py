@@ -85,7 +85,7 @@ def histograms(frames: Iterable[NDArray[np.uint16]], columns: Float, std_dn: flo
     return [Histogram(total, width, 2 * columns.shape[1]) for total in counts]
 
 
-def joined(parts: Sequence[Histogram]) -> Histogram:
+def joined_histogram(parts: Sequence[Histogram]) -> Histogram:
     """Return the histogram of all planes."""
     return Histogram(np.sum([part.counts for part in parts], axis=0), parts[0].width, parts[0].sites)
 
@@ -137,14 +137,14 @@ def fit_shape(histogram: Histogram, start: Shape | None = None) -> Shape:
     heights = [surprise(*(best.x + STEPS * place).tolist()) for place in around]
     error = _error_of_shape(around, np.array(heights))
     pull = float(best.x[1] - NORMAL_SHAPE) / histogram.sites
-    systematic = abs(pull) * (1 if pull < 0 else 4) + _of_rounded_means(math.exp(best.x[0]), best.x[1])
+    systematic = abs(pull) * (1 if pull < 0 else 4) + _rounding_error(math.exp(best.x[0]), best.x[1])
     shape, half = float(best.x[1]) + OF_ROWS * pull, math.hypot(NORMAL_95 * error, systematic)
     normal_std, tukey_std_dn = np.exp([normal.x, best.x[0]]) * math.sqrt(histogram.sites / (histogram.sites - 1))
     interval = Estimate(shape, shape - half, shape + half)
     return Shape(float(normal_std), float(tukey_std_dn), interval, bool(best.fun < normal.fun - EVIDENCE))
 
 
-def _of_rounded_means(std: float, shape: float) -> float:
+def _rounding_error(std: float, shape: float) -> float:
     """Return an error of λ because the mean of rounded values is not μ, which widens the histogram of weak noise."""
     lattice = np.arange(-REACH, REACH, dtype=np.float64) + 0.25
     off = float(lattice @ probabilities(lattice, std, shape))

@@ -17,16 +17,16 @@ from typing import NamedTuple
 from unprocess_gen.calibration.captures import Sensor
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.iso_laws import Precision, gain_law, joined_branches, rounded, std_law
-from unprocess_gen.calibration.profile import MARK, Named, profile_head, profile_yaml, provenance
+from unprocess_gen.calibration.profile import MARK, NamedNumber, profile_head, profile_yaml, provenance
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.sources.raw.metadata import RawMetadata, read_tags
 
 FORM = "calibrate --from noise_profile"
-STATED = Precision(close=3e-8, digits=12)
+TAG_PRECISION = Precision(close=3e-8, digits=12)
 """Laws give the values of the tags within half the precision of float32."""
-COLOURS = ("R", "G", "B")
+COLOUR_NAMES = ("R", "G", "B")
 SAME = 1e-6
 """Relative difference up to which two tags are equal."""
 MOST_SWITCHES = 2
@@ -61,7 +61,7 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     files = [folder] if folder.is_file() else sorted(path for path in folder.rglob("*") if is_raw(path))
     try:
         facts = {path: read_tags(path, "calibrate") for path in files}
-        stated = {path: one for path, one in facts.items() if one.noise_profile is not None}
+        stated = {path: tags for path, tags in facts.items() if tags.noise_profile is not None}
         digests = sorted(file_sha256(path) for path in stated)
     except OSError as error:
         raise MachineError(f"{error.filename or folder}: cannot be read ({error.strerror or error})") from error
@@ -77,7 +77,7 @@ def read_stated_noise(folder: Path) -> StatedNoise:
             own, expected = getattr(stated[path], name), getattr(stated[first], name)
             if own != expected:
                 raise ConfigError(f"calibrate: {path}: {name}={own}: {first.name} has {expected}; expected one camera")
-    isos = _by_iso([_stated_iso(path, one) for path, one in stated.items()])
+    isos = _by_iso([_stated_iso(path, tags) for path, tags in stated.items()])
     _check_law(isos)
     black, white = _levels(first, stated[first])
     sensor = Sensor(int(white).bit_length(), round(black), round(white), stated[first].pattern or "RGGB", (0, 0))
@@ -108,7 +108,7 @@ def stated_variance(path: Path, facts: RawMetadata) -> tuple[tuple[float, ...], 
     numbers, span = facts.noise_profile or (), white - black
     if len(numbers) not in (2, 6):
         raise ConfigError(f"calibrate: {path}: NoiseProfile has {len(numbers)} values; expected 2, or 6 for 3 colours")
-    for name, scale, offset in zip(COLOURS, numbers[::2] * 3, numbers[1::2] * 3, strict=False):
+    for name, scale, offset in zip(COLOUR_NAMES, numbers[::2] * 3, numbers[1::2] * 3, strict=False):
         if not 0 < scale < 1 or not 0 <= offset < 1:
             raise ConfigError(
                 f"calibrate: {path}: NoiseProfile of {name}: variance = {scale:g}·x + {offset:g}; expected a slope "
@@ -127,13 +127,13 @@ def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
 def _by_iso(stated: Sequence[StatedIso]) -> list[StatedIso]:
     """Return a record for each ISO; ConfigError names a file that differs from another one of its ISO."""
     result: dict[float, StatedIso] = {}
-    for one in sorted(stated, key=lambda one: one.iso):
-        first = result.setdefault(one.iso, one)
-        for own, other in zip(one.a + one.b, first.a + first.b, strict=True):
+    for record in sorted(stated, key=lambda record: record.iso):
+        first = result.setdefault(record.iso, record)
+        for own, other in zip(record.a + record.b, first.a + first.b, strict=True):
             if abs(own - other) > SAME * other:
                 raise ConfigError(
-                    f"calibrate: {one.path}: NoiseProfile differs from that of {first.path.name}, of the same ISO "
-                    f"{one.iso:g}; expected files of one camera and mode; remove those that differ"
+                    f"calibrate: {record.path}: NoiseProfile differs from that of {first.path.name}, of the same ISO "
+                    f"{record.iso:g}; expected files of one camera and mode; remove those that differ"
                 )
     return list(result.values())
 
@@ -144,7 +144,7 @@ def _check_law(isos: Sequence[StatedIso]) -> None:
     for low, high in pairwise(isos):
         where = f"calibrate: {high.path}: NoiseProfile at ISO {high.iso:g}"
         expected = f"than at ISO {low.iso:g} ({low.path.name}); expected a rise with ISO; remove the wrong file"
-        for name, before, after in zip(COLOURS, low.a, high.a, strict=True):
+        for name, before, after in zip(COLOUR_NAMES, low.a, high.a, strict=True):
             if after <= before * (1 + SAME):
                 raise ConfigError(f"{where}: the variance of {name} has no larger slope {expected}")
         if high.b[1] < low.b[1] * (1 - SAME):
@@ -156,8 +156,8 @@ def _check_law(isos: Sequence[StatedIso]) -> None:
 def _modes(isos: Sequence[StatedIso]) -> list[list[int]]:
     """Return the places of the ISOs of each gain mode; the variance without light falls where a mode begins."""
     modes = [[0]]
-    for place, (before, one) in enumerate(pairwise(isos), start=1):
-        if one.b[1] < before.b[1] * (1 - SAME) or (one.b[1] > 0) != (before.b[1] > 0):
+    for place, (before, after) in enumerate(pairwise(isos), start=1):
+        if after.b[1] < before.b[1] * (1 - SAME) or (after.b[1] > 0) != (before.b[1] > 0):
             modes.append([])
         modes[-1].append(place)
     return modes
@@ -170,40 +170,40 @@ def _exact(value: float) -> Estimate:
 def _spreads(isos: Sequence[StatedIso]) -> dict[str, float]:
     """Return the largest relative difference of a and of b from those of green."""
     return {
-        "a": max(abs(value / one.a[1] - 1) for one in isos for value in one.a),
-        "b": max(abs(value - one.b[1]) / max(*one.b, 1e-300) for one in isos for value in one.b),
+        "a": max(abs(value / record.a[1] - 1) for record in isos for value in record.a),
+        "b": max(abs(value - record.b[1]) / max(*record.b, 1e-300) for record in isos for value in record.b),
     }
 
 
-def stated_estimates(stated: StatedNoise) -> list[Named]:
+def stated_estimates(stated: StatedNoise) -> list[NamedNumber]:
     """Return the list of estimates; the tags state no intervals."""
     named = []
-    for one in stated.isos:
+    for iso, a, b, _ in stated.isos:
         for site, plane in ((None, 1), ("R", 0), ("Gr", 1), ("Gb", 1), ("B", 2)):
-            numbers = {"dn_per_e": (one.a, "DN/e"), "b_dn2": (one.b, "DN²")}
+            numbers = {"dn_per_e": (a, "DN/e"), "b_dn2": (b, "DN²")}
             named += [
-                Named(name, one.iso, site, Estimate(values[plane], -math.inf, math.inf), unit)
+                NamedNumber(name, iso, site, Estimate(values[plane], -math.inf, math.inf), unit)
                 for name, (values, unit) in numbers.items()
             ]
-        named.append(Named("read_std_dn", one.iso, None, Estimate(math.sqrt(one.b[1]), -math.inf, math.inf), "DN"))
+        named.append(NamedNumber("read_std_dn", iso, None, Estimate(math.sqrt(b[1]), -math.inf, math.inf), "DN"))
     return named
 
 
 def stated_yaml(stated: StatedNoise, name: str) -> str:
     """Return the noise profile of NoiseProfile tags."""
-    isos, profile = [one.iso for one in stated.isos], profile_head(name, stated.sensor)
-    gains = [_exact(one.a[1]) for one in stated.isos]
+    isos, profile = [record.iso for record in stated.isos], profile_head(name, stated.sensor)
+    gains = [_exact(record.a[1]) for record in stated.isos]
     profile["branches"] = []
-    for places in joined_branches(isos, gains, _modes(stated.isos), STATED):
+    for places in joined_branches(isos, gains, _modes(stated.isos), TAG_PRECISION):
         own = [isos[place] for place in places]
-        gain = gain_law(own, [gains[place] for place in places], STATED)
-        read = std_law(own, [_exact(math.sqrt(stated.isos[place].b[1])) for place in places], STATED)
+        gain = gain_law(own, [gains[place] for place in places], TAG_PRECISION)
+        read = std_law(own, [_exact(math.sqrt(stated.isos[place].b[1])) for place in places], TAG_PRECISION)
         branch = {"iso": [own[0], own[-1]], "dn_per_e": gain, "read_law": "gaussian", "read_std_dn": read}
         profile["branches"].append(branch)
     spreads = _spreads(stated.isos)
     if spreads["a"] > SAME:
         middle = stated.isos[len(isos) // 2]
-        profile["gain_by_colour"] = [rounded(value / middle.a[1], STATED.digits) for value in middle.a]
+        profile["gain_by_colour"] = [rounded(value / middle.a[1], TAG_PRECISION.digits) for value in middle.a]
     differ = ", ".join(f"{number} by {spread:.1%}" for number, spread in spreads.items())
     source = f"{FORM}, tags of {stated.camera}, {stated.files} files, SHA-256 {stated.sha256[:16]}"
     uncertainty = f"the tags state none; planes differ from green, {differ}"

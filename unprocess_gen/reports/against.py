@@ -22,7 +22,7 @@ from unprocess_gen.calibration.profile import (
     ABSOLUTE,
     Calibration,
     KnownGain,
-    Named,
+    NamedNumber,
     dark_variance,
     estimates,
     site_names,
@@ -58,7 +58,7 @@ LACKS, UNSEEN = "missing in the profile", "missing in the frames"
 class Comparison(NamedTuple):
     """A measured number, the profile's number (None if it states none), and the verdict."""
 
-    measured: Named
+    measured: NamedNumber
     profile: float | None
     score: Score
     verdict: str
@@ -137,14 +137,10 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
 def _compared(calibration: Calibration, profile: Profile, known: dict[float, Estimate]) -> Iterator[Comparison]:
     """Yield the comparison of each estimate."""
     celsius, isos = calibration.body.dark_reference_c, calibration.captures.isos
-    variances = [Named("b_dn2", result.iso, None, dark_variance(result), "DN²") for result in calibration.isos]
+    variances = [NamedNumber("b_dn2", result.iso, None, dark_variance(result), "DN²") for result in calibration.isos]
     listed = [estimate for estimate in [*estimates(calibration), *variances] if estimate.name in EFFECT_OF_NUMBER]
     limit, sites = math.log(2 * len(listed) / FALSE_ALARM), site_names(calibration.sensor)
-    tukey = {
-        (result.iso, place): shape.is_tukey
-        for result in calibration.isos
-        for place, shape in enumerate([result.shape, *result.shapes])
-    }
+    tukey = {result.iso: [shape.is_tukey for shape in [result.shape, *result.shapes]] for result in calibration.isos}
     for estimate in listed:
         numbers = profile.numbers(estimate.iso or isos[0], celsius)
         place = 1 + sites.index(estimate.site) if estimate.site else 0
@@ -155,7 +151,7 @@ def _compared(calibration: Calibration, profile: Profile, known: dict[float, Est
         is_open |= estimate.name == "dn_per_e" and estimate.iso in known
         is_open |= estimate.name in AT_TEMPERATURE and celsius is None and bool(expected)
         # a normal distribution is nearest to Tukey's at a shape that a fit may miss
-        is_open |= estimate.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[estimate.iso or 0.0, place]
+        is_open |= estimate.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[estimate.iso or 0.0][place]
         if is_open or estimate.number is None or expected is None:
             yield Comparison(estimate, expected, Score(0.0, 1.0, 0.0), UNKNOWN)
             continue

@@ -11,7 +11,7 @@ import numpy as np
 
 from unprocess_gen.calibration.iso_laws import gain_law, std_law
 from unprocess_gen.calibration.measure import IsoResult, usable
-from unprocess_gen.calibration.profile import Calibration, Named, estimates, iso_branches, site_names
+from unprocess_gen.calibration.profile import ENDS, Calibration, NamedNumber, estimates, iso_branches, site_names
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.serialization import read_option
@@ -57,7 +57,7 @@ def write_page(calibration: Calibration, name: str, command: str, page: Path) ->
         page.write_text(text, encoding="utf-8")
 
 
-def _table(named: list[Named]) -> PageTable:
+def _table(named: list[NamedNumber]) -> PageTable:
     """Return the estimates of all sites together as a table."""
     lines = [
         (
@@ -70,9 +70,6 @@ def _table(named: list[Named]) -> PageTable:
         if site is None
     ]
     return PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4))
-
-
-ENDS = ("value", "low", "high")
 
 
 def _sensors(calibration: Calibration, name: str) -> PageTable:

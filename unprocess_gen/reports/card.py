@@ -175,7 +175,7 @@ def _croissant(described: _Described, given: Statements) -> str:
 
     facts = described.facts
     listed = {"manifest.csv": ("text/csv", facts["manifest_sha256"])}
-    shards = {one["file"]: ("application/x-tar", one["sha256"]) for one in facts["shards"] if one["file"] is not None}
+    shards = {entry["file"]: ("application/x-tar", entry["sha256"]) for entry in facts["shards"] if entry["file"]}
     files = [
         mlc.FileObject(id=file, name=file, content_url=file, encoding_formats=[kind], sha256=sha256)
         for file, (kind, sha256) in (listed | shards).items()

@@ -19,7 +19,7 @@ from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Float
 from unprocess_gen.dataset.reader import RawPairs, Sample
 from unprocess_gen.reports.noise_check.checks import Checker, overlaps, pair_sums
-from unprocess_gen.reports.noise_check.scores import joined, row_offsets, variance_points
+from unprocess_gen.reports.noise_check.scores import joined_points, row_offsets, variance_points
 from unprocess_gen.reports.noise_check.sums import Plane, Sums
 from unprocess_gen.reports.report_files import require_libraries
 
@@ -105,7 +105,7 @@ def fit_sums(key: str, sums: Sums) -> NoiseFit | None:
     The covariance of slope and intercept is (XᵀWX)⁻¹ for independent sites, plus the covariance of the offsets of rows.
     """
     planes = [plane for plane in sums.planes if len(plane.bins)]
-    points = joined(map(variance_points, planes))
+    points = joined_points(map(variance_points, planes))
     if len(np.unique(points.signal)) < 3:
         return None
     design = np.stack([points.signal, np.ones_like(points.signal)])

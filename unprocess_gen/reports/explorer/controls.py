@@ -34,7 +34,7 @@ SECTIONS = {
 WEIGHTS = ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
 
 
-class Range(NamedTuple):
+class SliderRange(NamedTuple):
     """The ends and the step of a slider."""
 
     start: float
@@ -43,11 +43,11 @@ class Range(NamedTuple):
 
 
 SLIDERS = {
-    "gains.red": Range(0.5, 4, 0.01),
-    "gains.blue": Range(0.5, 4, 0.01),
-    "gains.inverse_rgb": Range(0.3, 2.2, 0.01),
-    "gains.threshold": Range(0, 0.99, 0.01),
-    **{f"camera.weights.{name}": Range(0, 1, 0.01) for name in WEIGHTS},
+    "gains.red": SliderRange(0.5, 4, 0.01),
+    "gains.blue": SliderRange(0.5, 4, 0.01),
+    "gains.inverse_rgb": SliderRange(0.3, 2.2, 0.01),
+    "gains.threshold": SliderRange(0, 0.99, 0.01),
+    **{f"camera.weights.{name}": SliderRange(0, 1, 0.01) for name in WEIGHTS},
 }
 """Sliders by key; those of the weights have a slider for each camera."""
 
@@ -72,7 +72,7 @@ def widget(name: str, folders: list[Any]) -> InputWidget:
     setting = SETTINGS.get(name)
     if setting is None:
         options = group_options(name, conf_dir(), *folders)
-        summary = "; ".join(f"{one}: {option_summary(name, one)}" for one in group_options(name))
+        summary = "; ".join(f"{option}: {option_summary(name, option)}" for option in group_options(name))
         return Select(title=name, options=[*([NONE] if name == "body" else []), *options], description=summary or None)
     meaning = f"{setting.meaning}{f', in {setting.unit}' if setting.unit else ''}. Allowed: {setting.allowed}"
     if isinstance(setting.limit, Choice):

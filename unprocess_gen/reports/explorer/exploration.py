@@ -35,7 +35,7 @@ from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.sources.loader import list_photographs, load_source
 from unprocess_gen.sources.patches import crop_patch
 
-OUT = "pair"
+PAIR_FOLDER = "pair"
 """Folder of the dataset that the command of a page makes."""
 
 
@@ -103,7 +103,7 @@ class Exploration:
     @property
     def command(self) -> str:
         """The command that generates the pair, with the other pairs of its sources."""
-        out = [] if "out" in self.settings else [f"out={OUT}"]
+        out = [] if "out" in self.settings else [f"out={PAIR_FOLDER}"]
         return shlex.join(["gen-dataset", *self.flags, *self.overrides, *out])
 
     def add(self, overrides: Sequence[str]) -> None:

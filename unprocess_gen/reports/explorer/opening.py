@@ -24,7 +24,7 @@ from unprocess_gen.pipeline.replay import dark_places, source_changes, source_of
 from unprocess_gen.reports.explorer.exploration import Exploration
 from unprocess_gen.sources.loader import list_photographs
 
-LISTED = 1000
+SOURCES_LISTED = 1000
 """Photographs or rows that a page offers; the others are opened by their name or key."""
 
 Choices = dict[str, Callable[[], Exploration]]
@@ -73,7 +73,7 @@ def _open_sources(start: Exploration) -> Choices:
 
     return {
         f"{source.index} {source.name}": lambda source=source: opened(source)  # type: ignore[misc]
-        for source in list_photographs(config).sources[:LISTED]
+        for source in list_photographs(config).sources[:SOURCES_LISTED]
     }
 
 
@@ -86,7 +86,7 @@ def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
     return {
         f"{row['key']} {row['source']}": lambda row=row: _open_row(folder, row, start)  # type: ignore[misc]
-        for row in itertools.islice(rows, LISTED)
+        for row in itertools.islice(rows, SOURCES_LISTED)
     }
 
 

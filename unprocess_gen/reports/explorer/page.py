@@ -264,17 +264,17 @@ class Page:
         copy.js_on_click(
             CustomJS(args={"text": self._command, "file": self._file}, code="navigator.clipboard.writeText(text.value)")
         )
-        found = [copy]
+        buttons = [copy]
         for form in ("npy", "dng"):
             save = Button(label=f"Save the pair as {form.upper()}", name=f"save_{form}")
             save.on_click(partial(self._save, form))
-            found.append(save)
+            buttons.append(save)
         self._file.js_on_change("data", CustomJS(args={"file": self._file}, code=SAVE))
         for number, (label, move) in enumerate(MOVES.items()):
             button = Button(label=label, name=f"move_{number}", width=48)
             button.on_click(lambda move=move: self._move(*move))
-            found.append(button)
-        return found
+            buttons.append(button)
+        return buttons
 
     def _later(self, task: Callable[[], Any], name: str) -> None:
         """Run a task once after the changes that have arrived."""
@@ -296,7 +296,7 @@ class Page:
         if self._syncing:
             return
         if name.startswith("camera.weights."):
-            values = [f"{self._widgets[f'camera.weights.{one}'].value:.6g}" for one in WEIGHTS]
+            values = [f"{self._widgets[f'camera.weights.{camera}'].value:.6g}" for camera in WEIGHTS]
             self._state.settings["camera.weights"] = f"[{','.join(values)}]"
         elif name not in SETTINGS:
             self._state.choose(name, None if new == NONE else new)

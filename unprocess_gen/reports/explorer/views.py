@@ -116,22 +116,22 @@ def _words(values: Float) -> NDArray[np.uint32]:
 
 BINS = 128
 
-Lines = dict[str, tuple[Any, Any]]
+Curves = dict[str, tuple[Any, Any]]
 """x and y by name."""
 
 
-def source_histogram(shown: Shown) -> Lines:
+def source_histogram(shown: Shown) -> Curves:
     """Return the shares of the codes of each channel of the source."""
     bins = np.linspace(0, np.iinfo(shown.srgb.dtype).max + 1, BINS + 1)
-    found = {}
+    curves = {}
     for channel, name in enumerate(("red", "green", "blue")):
         counts = np.bincount(shown.srgb[..., channel].ravel(), minlength=int(bins[-1]))
-        found[name] = bins[:-1], counts.reshape(BINS, -1).sum(axis=1) / shown.srgb[..., 0].size
-    return found
+        curves[name] = bins[:-1], counts.reshape(BINS, -1).sum(axis=1) / shown.srgb[..., 0].size
+    return curves
 
 
-def raw_histogram(shown: Shown) -> Lines:
-    """Return the shares of DN in both frames, over those of the clean frame and all but 0.2 % of the noisy one."""
+def raw_histogram(shown: Shown) -> Curves:
+    """Return the shares of DN in both frames, over the DN of the clean frame and all but 0.2 % of the noisy one."""
     top = 2**shown.plan.sensor.bits
     counts = {}
     for name, frame in (("clean", shown.clean), ("noisy", shown.noisy)):
@@ -145,7 +145,7 @@ def raw_histogram(shown: Shown) -> Lines:
     }
 
 
-def highlight_curves(shown: Shown) -> Lines:
+def highlight_curves(shown: Shown) -> Curves:
     """Return the function that inverts the gains of each channel, of grey light (the article's Figure 4)."""
     light, camera = np.linspace(0, 1, 201), shown.plan.camera
     grey = np.repeat(light[:, None], 3, axis=1)
@@ -154,7 +154,7 @@ def highlight_curves(shown: Shown) -> Lines:
     return {f"{name}, {gain:.3g}": (light, inverted[:, channel]) for channel, (name, gain) in enumerate(named)}
 
 
-class Transfer(NamedTuple):
+class TransferPlot(NamedTuple):
     """Points of the photon transfer, the expected line, and the fit in words; the text says why there are none."""
 
     points: tuple[Any, Any]
@@ -166,7 +166,7 @@ POINTS_DRAWN = 1000
 FITTED_PX = 512
 
 
-def photon_transfer(shown: Shown) -> Transfer:
+def photon_transfer(shown: Shown) -> TransferPlot:
     """Fit the variance of the noise against the signal, in the first sites of a large frame."""
     side = FITTED_PX // 2 if shown.plan.output.layout == PACKED else FITTED_PX
     clean, noisy = (frame[..., :side, :side] for frame in (shown.pair.clean, shown.pair.noisy))
@@ -175,10 +175,10 @@ def photon_transfer(shown: Shown) -> Transfer:
     sums = pair_sums(clean, noisy, row, shown.dark_pixels)
     fit = None if sums is None else fit_sums(str(row["key"]), sums)
     if fit is None:
-        return Transfer(([], []), ([], []), "too few sites or levels for a fit")
+        return TransferPlot(([], []), ([], []), "too few sites or levels for a fit")
     step = max(1, len(fit.signal_dn) // POINTS_DRAWN)
     ends = np.array([0.0, fit.signal_dn.max(initial=1.0)])
     text = str(fit).partition(": ")[2]
-    return Transfer(
+    return TransferPlot(
         (fit.signal_dn[::step], fit.variance_dn2[::step]), (ends, fit.expected[0] * ends + fit.expected[1]), text
     )

@@ -91,7 +91,7 @@ def scores_of(sums: Sums) -> Scores:
     planes = {name: plane for name, plane in zip(names, sums.planes, strict=True) if len(plane.bins)}
     means = {name: mean_points(plane) for name, plane in planes.items()}
     variances = {name: variance_points(plane) for name, plane in planes.items()}
-    mean, variance = joined(means.values()), joined(variances.values())
+    mean, variance = joined_points(means.values()), joined_points(variances.values())
     scores = {("mean", name): points.score() for name, points in means.items()}
     scores |= {("variance against signal", name): points.score(points.signal) for name, points in variances.items()}
     scores["mean", ""], scores["mean against signal", ""] = mean.score(), mean.score(mean.signal)
@@ -160,7 +160,7 @@ class Points(NamedTuple):
         )
 
 
-def joined(points: Iterable[Points]) -> Points:
+def joined_points(points: Iterable[Points]) -> Points:
     """Points of all planes."""
     return Points(*map(np.concatenate, zip(*points, strict=True)))
 

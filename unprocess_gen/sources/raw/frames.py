@@ -87,8 +87,8 @@ def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
         raise SourceError("unsupported", f"a {suffix[1:].upper()} file states no levels and no pattern; give {needed}")
     pixels = _picture(config, content) if suffix in PICTURE_SUFFIXES else _npy(content)
     if pixels.dtype != np.uint16 or pixels.ndim != 2 or not pixels.size:
-        found = f"{pixels.dtype} {list(pixels.shape)}"
-        raise SourceError("unsupported", f"contains {found}; expected a mosaic [H, W] of uint16")
+        actual = f"{pixels.dtype} {list(pixels.shape)}"
+        raise SourceError("unsupported", f"contains {actual}; expected a mosaic [H, W] of uint16")
     if pixels.size > config.max_pixels:
         raise SourceError("too_large", f"has {pixels.size} pixels; expected source.max_pixels={config.max_pixels}")
     colours = np.array(["RGB".index(letter) for letter in raw.pattern], np.uint8).reshape(2, 2)

@@ -70,7 +70,7 @@ class RawMetadata:
 
     def completed(self, other: RawMetadata) -> RawMetadata:
         """Return these facts, completed by those of another reader."""
-        stated = {one.name: value for one in fields(self) if (value := getattr(self, one.name)) is not None}
+        stated = {field.name: value for field in fields(self) if (value := getattr(self, field.name)) is not None}
         facts = replace(other, **stated)
         return replace(facts, bits=None if facts.white_dn is None else int(facts.white_dn).bit_length())
 
@@ -155,7 +155,7 @@ def _facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model
     has_bayer = len(filters) == 4 and tags.get(33421, (2, 2)) == (2, 2) and set(filters) <= {0.0, 1.0, 2.0}
     return RawMetadata(
         # CFAPattern and BlackLevel begin at the corner of ActiveArea
-        pattern="".join("RGB"[int(one)] for one in filters) if has_bayer else None,
+        pattern="".join("RGB"[int(code)] for code in filters) if has_bayer else None,
         area=(int(area[0]), int(area[1]), int(area[2]), int(area[3])) if len(area) == 4 else None,
         black_dn=(black * 4)[:4] if black and len(set(black)) == 1 else black if is_tile else None,
         white_dn=max(white) if 50706 in tags and white else None,

@@ -20,7 +20,7 @@ from unprocess_gen.sources.raw.metadata import RawMetadata, tags_of
 MARK = "Written by gen-dataset camera"
 """Text in the first line of each file, by which an earlier one is known."""
 
-SENSOR_KEYS = """\
+SENSOR_LINES = """\
 clip: sensor            # noisy frames: sensor: at 0 and 2^bits - 1; black: at black instead of 0; none: float32 only
 saturated: auto
 dark_offset: removed    # mean of the dark current: removed (as with optical-black pixels) or kept
@@ -81,22 +81,22 @@ def camera_options(file: Path, name: str) -> CameraOptions:
     if pattern == XTRANS:
         raise ConfigError(f"camera {file}: has an X-Trans mosaic, which no sensor option has; expected a Bayer mosaic")
     model = " ".join((frame.metadata.model or "a camera without a name").split())
-    of_matrix, of_gains = _matrix_source(tags), _gains_source(tags, gains)
+    matrix_source, gains_source = _matrix_source(tags), _gains_source(tags, gains)
     levels = round(sum(black) / 4), round(min(white))
     origin = f"# {file.name}, SHA-256 {file_sha256(file)}.\n"
     entries = [f"{entry:.6g}" for entry in matrix]
     rows = ",\n          ".join(", ".join(entries[row : row + 3]) for row in (0, 3, 6))
     bits = int(levels[1]).bit_length()
-    of_levels = [f"{tag} {value}" for tag, value in _level_sources(tags, black, levels[1])]
+    level_sources = [f"{tag} {value}" for tag, value in _level_sources(tags, black, levels[1])]
     return CameraOptions(
-        f"# {model}: the matrix from XYZ to the camera. {MARK}.\n# Source: {of_matrix}.\n{origin}# Gains of the frame: "
-        f"{of_gains}.\nname: {name}\nlaw: custom\nxyz2cam: [{rows}]\n",
-        f"# {model}, {bits} bits. {MARK}.\n# Source: {', '.join(of_levels)}.\n{origin}bits: {bits}\nblack_level_dn: "
-        f"{levels[0]}\nwhite_level_dn: {levels[1]}\npattern: {pattern}\n{SENSOR_KEYS}",
+        f"# {model}: the matrix from XYZ to the camera. {MARK}.\n# Source: {matrix_source}.\n{origin}"
+        f"# Gains of the frame: {gains_source}.\nname: {name}\nlaw: custom\nxyz2cam: [{rows}]\n",
+        f"# {model}, {bits} bits. {MARK}.\n# Source: {', '.join(level_sources)}.\n{origin}bits: {bits}\n"
+        f"black_level_dn: {levels[0]}\nwhite_level_dn: {levels[1]}\npattern: {pattern}\n{SENSOR_LINES}",
         (
-            f"matrix: {of_matrix}",
-            f"gains: {of_gains}",
-            f"levels: {', '.join(of_levels)}; {bits} bits hold them",
+            f"matrix: {matrix_source}",
+            f"gains: {gains_source}",
+            f"levels: {', '.join(level_sources)}; {bits} bits hold them",
             f"pattern: {pattern} at the corner of the visible part "
             f"({'CFAPattern and ActiveArea' if tags.colour else 'LibRaw'})",
         ),
@@ -133,7 +133,7 @@ def _gains_source(tags: RawMetadata, gains: tuple[float, float] | None) -> str:
 
 
 def _level_sources(tags: RawMetadata, black: tuple[float, ...], white: int) -> list[tuple[str, str]]:
-    levels = f"{black[0]:g}" if len(set(black)) == 1 else f"{', '.join(f'{one:g}' for one in black)} (mean)"
+    levels = f"{black[0]:g}" if len(set(black)) == 1 else f"{', '.join(f'{level:g}' for level in black)} (mean)"
     return [
         ("black level (LibRaw)" if tags.black_dn is None else "BlackLevel", levels),
         ("white level (LibRaw)" if tags.white_dn is None else "WhiteLevel", f"{white}"),
