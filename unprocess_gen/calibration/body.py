@@ -104,7 +104,7 @@ def _positive(number: Estimate) -> Estimate | None:
 
 
 def _prnu(results: Sequence[IsoResult], planes: Sequence[int]) -> Estimate:
-    """Return the PRNU of planes: √((fixed variance of flats - that of darks) / signal²), weighted over levels."""
+    """Return the PRNU of planes: √((fixed variance of flats - of darks) / signal²), weighted over levels."""
     measured = [
         (*result.prnu_squares[plane], result.dark.measured.sites)
         for result in results
@@ -153,7 +153,7 @@ def _doubling(currents: dict[float, list[Estimate]]) -> Estimate | None:
 
 
 def _is_mean_removed(results: Sequence[IsoResult]) -> bool:
-    """Return whether the mean of darks stays while their variance rises: the camera subtracts the mean dark signal."""
+    """True if the mean of darks stays while their variance rises: the camera subtracts the mean dark signal."""
     for result in results:
         first, last = result.darks[0].measured, result.darks[-1].measured
         rise = (last.variance.mean() - first.variance.mean()) / result.gain.sensor.value

@@ -54,7 +54,7 @@ def calibrate(folder: Path, quick: bool = False, watch: Watch = lambda frames: f
 def calibrate_darks(
     folder: Path, profile: str | None, stated: str | None, watch: Watch = lambda frames: frames
 ) -> Calibration:
-    """Measure the darks of a folder; the gain is that of a profile, stated, or that of NoiseProfile tags.
+    """Measure the darks of a folder; the gain is stated, or taken from a profile or from NoiseProfile tags.
 
     Raises ConfigError or MachineError.
     """

@@ -115,7 +115,7 @@ class CaptureSet(NamedTuple):
 
 
 def read_captures(folder: Path, kind: str | None = None, default: Sensor | None = None) -> CaptureSet:
-    """List the frames of a folder; ``kind`` is that of raw files whose names state none, ``default`` the sensor's.
+    """List the frames of a folder; ``kind`` is for raw files whose names state none, ``default`` for the sensor.
 
     Raises ConfigError or MachineError.
     """
@@ -232,7 +232,7 @@ def _metadata(file: Path) -> dict[str, Any]:
 
 
 def _from_names(folder: Path, default: str | None = None) -> Iterator[Capture]:
-    """Yield the raw files of a folder; their names, or those of their folders, state the kind."""
+    """Yield the raw files of a folder; their names, or the names of their folders, state the kind."""
     for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
         if file.suffix.lower() not in RAW_FILES:
             raise ConfigError(

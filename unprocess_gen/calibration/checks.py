@@ -108,7 +108,7 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
 
 
 def is_clipped(dark: Measured) -> bool:
-    """Return whether black is clipped."""
+    """True if black is clipped."""
     return clipped_share(dark) > LIMITS["clipped black"].refused
 
 

@@ -1,7 +1,7 @@
 """Sum the frames of one measurement, and estimate their noise: by site of the CFA, by row, by column, and fixed.
 
-Frames are added one at a time. T is the temporal variance of a pixel, R that of the mean of a row of W sites of a
-plane, and V that of the mean of a frame. T = σ² + σ_row² + V and R = σ_row² + σ²/W + V. Therefore
+Frames are added one at a time. T is the temporal variance of a pixel, R of the mean of a row of W sites of a plane,
+and V of the mean of a frame. T = σ² + σ_row² + V and R = σ_row² + σ²/W + V. Therefore
 σ² = (T - R)·W/(W - 1).
 """
 
@@ -86,7 +86,7 @@ class Measured:
     full_share
         share of values at or above white
     row_profile, column_profile
-        means of the rows of the first frame and of the columns of all frames, without those of the frame
+        means of the rows of the first frame and of the columns of all frames, minus the means of the planes
     """
 
     count: int
@@ -152,7 +152,7 @@ class FrameSums:
         return np.asarray(self._first + self._sum / np.float64(len(self._rows)))
 
     def column_offsets(self) -> Float:
-        """Return the mean of each column without that of its plane, [4, W/2]; zeros if frames are too few for it."""
+        """Return the mean of each column minus the mean of its plane, [4, W/2]; zeros if frames are too few for it."""
         means = np.mean(self._columns, axis=0)
         return np.asarray(means - means.mean(axis=1, keepdims=True))
 

@@ -1,7 +1,8 @@
 """Fit the system gain to variances of flats, by photon transfer, with its statistical and its systematic error.
 
-The variance above that of darks is K·m·(1 + q·m) at the signal m. K is fitted to signals up to 10 % and up to 30 % of
-white, with and without q. If these fits differ by more than their statistical errors allow, the interval contains all.
+The variance of flats minus the variance of darks is K·m·(1 + q·m) at the signal m. K is fitted to signals up to 10 %
+and up to 30 % of white, with and without q. If these fits differ by more than their statistical errors allow, the
+interval contains all.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Transfer:
     Attributes
     ----------
     signal, variance, error
-        mean above that of the darks (DN); variance above that of the darks, and its own standard error (DN²)
+        mean minus the mean of the darks (DN); variance minus the variance of the darks, and its standard error (DN²)
     dark_error
         standard errors of the variances of the darks (DN²)
     dark
@@ -131,7 +132,7 @@ def fit_curve(points: Transfer, with_q: bool) -> Fit | None:
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """Fitted gains of all planes and of the sensor; q and χ² are those of the chosen fit, means of the planes."""
+    """Fitted gains of all planes and of the sensor; q and χ² belong to the chosen fit, means of the planes."""
 
     sensor: Estimate
     planes: list[Estimate]
@@ -201,7 +202,7 @@ def _widened(fit: Fit, value: float, low: float, high: float) -> tuple[float, fl
 
 
 def _have_colours(fits: Sequence[Fit]) -> bool:
-    """Return whether the gains of planes differ by more than their errors, and by more than 0.3 %."""
+    """True if the gains of planes differ by more than their errors, and by more than 0.3 %."""
     value, _ = _mean(fits)
     far = [abs(fit.gain - value) for fit in fits]
     return any(distance > max(4 * fit.error, 0.003 * value) for distance, fit in zip(far, fits, strict=True))

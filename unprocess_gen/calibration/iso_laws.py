@@ -16,7 +16,7 @@ import numpy as np
 from unprocess_gen.calibration.gain import NORMAL_95, SIGNIFICANT, Estimate
 
 MODE_RATIO = 0.85
-"""Largest ratio of read noise to that of the same gain mode, from which it belongs to another mode."""
+"""Ratio of read noise to the least read noise of a gain mode, below which it belongs to another mode."""
 CLOSE = 1e-3
 """Relative residual up to which a law is good enough, whatever the standard errors."""
 DIGITS = 7

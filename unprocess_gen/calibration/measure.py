@@ -83,7 +83,7 @@ class Dark:
 class Flat:
     """Flats of one level: frames, noise, number of the darks of the nearest exposure, and values of dead pixels, DN.
 
-    ``signals_dn`` are the means of the planes above those of the darks; light is rarely neutral in raw values.
+    ``signals_dn`` are the means of the planes minus the means of the darks; light is rarely neutral in raw values.
     """
 
     frames: list[Capture]
@@ -186,7 +186,7 @@ def measure_darks(captures: CaptureSet, iso: float, notes: list[str], watch: Wat
 
 
 def _groups(captures: CaptureSet, kind: str, iso: float, notes: list[str]) -> list[list[Capture]]:
-    """Return the measurements of a kind; those of a single frame are left out with a note."""
+    """Return the measurements of a kind; single frames are left out with a note."""
     groups = []
     for frames in captures.groups(kind, iso):
         if len(frames) < LEAST_FRAMES:
@@ -302,7 +302,7 @@ def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor, quick: bool
 
 
 def _shapes(dark: Dark, watch: Watch) -> tuple[list[Shape], Histogram]:
-    """Fit the distribution of the read noise: that of all planes, then that of each plane."""
+    """Fit the distribution of the read noise of all planes, then of each plane."""
     std = math.sqrt(float(dark.measured.variance.mean()))
     counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.columns, std)
     together = joined_histogram(counts)
@@ -311,7 +311,7 @@ def _shapes(dark: Dark, watch: Watch) -> tuple[list[Shape], Histogram]:
 
 
 def _rounded_std(measured: Measured, shape: Shape) -> float:
-    """Return the noise of darks without that of rounding."""
+    """Return the noise of darks without the noise of rounding."""
     variance = float(measured.variance.mean()) - ROUNDING_DN2
     return math.sqrt(variance) if variance > ROUNDED_STD_DN**2 else shape.std_dn
 
@@ -335,7 +335,7 @@ def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: Shap
 
 
 def _dark_estimates(dark: Dark, sensor: Sensor, shapes: Sequence[Shape]) -> dict[str, Any]:
-    """Return what the darks show."""
+    """Return the estimates of an `IsoResult` that darks give, by field."""
     measured, columns = dark.measured, dark.measured.column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
     variances = [_variance(measured, plane, shapes[0]) - ROUNDING_DN2 - temporal for plane in range(4)]
@@ -382,7 +382,7 @@ def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) ->
     """Return the square of the PRNU of each plane, and its standard error, from the mean of all frames of all levels.
 
     Frames have the weight signal/variance, which gives the mean of frame/signal the least noise. The variance of its
-    fixed pattern contains that of darks, c² times, and the temporal noise.
+    fixed pattern contains the variance of the darks' pattern, c² times, and the temporal noise.
     """
     total, squares = np.zeros(1), list[tuple[float, float]]()
     weights = [flat.signal_dn / flat.measured.variance.mean() for flat in flats]
@@ -410,7 +410,7 @@ def _full_well(flats: Sequence[Flat], sensor: Sensor, gain: Gain) -> Estimate | 
     """Return the signal of full pixels, DN: the largest mean of the planes whose variance has fallen.
 
     None if the converter ends first, or no level is that bright. If only some planes are full, the signal is scaled
-    from their gain to that of the sensor.
+    from their gain to the gain of the sensor.
     """
     chosen = usable(flats)
     beyond = [flat for flat in flats if flat not in chosen and flat.measured.full_share <= FULL_SHARE]

@@ -1,8 +1,8 @@
 """Turn the NoiseProfile tags of DNG files into a two-number noise profile: variance = a·signal + b at each ISO.
 
 With W - B = white - black, the tag's S and O of a colour give a = S·(W - B) DN and b = O·(W - B)² DN² (DNG
-Specification 1.4). The profile has those of green; red and blue follow by their relative gains. Between two ISOs of one
-gain mode a is interpolated; nothing is extrapolated.
+Specification 1.4). The profile has a and b of green; red and blue follow by their relative gains. Between two ISOs of
+one gain mode a is interpolated; nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def read_stated_noise(folder: Path) -> StatedNoise:
 
 
 def is_raw(path: Path) -> bool:
-    """Return whether the name of a file is that of a raw file."""
+    """True if a file has the name of a raw file."""
     return path.suffix.lower() in RAW_FILES
 
 
@@ -168,7 +168,7 @@ def _exact(value: float) -> Estimate:
 
 
 def _spreads(isos: Sequence[StatedIso]) -> dict[str, float]:
-    """Return the largest relative difference of a and of b from those of green."""
+    """Return the largest relative difference of a and of b from a and b of green."""
     return {
         "a": max(abs(value / record.a[1] - 1) for record in isos for value in record.a),
         "b": max(abs(value - record.b[1]) / max(*record.b, 1e-300) for record in isos for value in record.b),

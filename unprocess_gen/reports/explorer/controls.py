@@ -49,7 +49,7 @@ SLIDERS = {
     "gains.threshold": SliderRange(0, 0.99, 0.01),
     **{f"camera.weights.{name}": SliderRange(0, 1, 0.01) for name in WEIGHTS},
 }
-"""Sliders by key; those of the weights have a slider for each camera."""
+"""Sliders by key; the weights have a slider for each camera."""
 
 NONE = "(none)"
 DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}

@@ -44,8 +44,7 @@ class Shown:
     """The pair of the settings, and what they follow from.
 
     ``srgb`` are the pixels of its patch, ``clean`` and ``noisy`` its frames as mosaics in DN, ``saturated`` marks
-    sites of the clean one, ``keys`` those of all
-    pairs of the image, ``lines`` what ``plan`` says about the noise.
+    sites of the clean one. ``keys`` identify all pairs of the image, ``lines`` are lines of ``plan`` about the noise.
     """
 
     config: Config
@@ -83,8 +82,8 @@ class Shown:
 class Exploration:
     """The settings of a page, by key as texts, and which pair of them is shown.
 
-    ``others`` are overrides that add something (``+experiment=…``), ``flags`` those of Hydra, ``index`` the number of
-    the source in the listing, ``part`` what follows it in the key of the pair, ``digests`` those that a row records.
+    ``others`` are overrides that add something (``+experiment=…``), ``flags`` are flags of Hydra. ``index`` is the
+    number of the source in the listing, ``part`` the rest of the key of the pair. ``digests`` are recorded by a row.
     """
 
     composition: Recomposition
@@ -158,7 +157,7 @@ class Exploration:
 def _lines(
     settings: PairSettings, identity: tuple[str, int], source: Source, image: PlannedImage, plan: Plan, pair: Pair
 ) -> list[str]:
-    """Return what ``plan`` says about the scene and the noise of a pair."""
+    """Lines of ``plan`` about the scene and the noise of a pair."""
     config = image_config(settings.config, *identity)
     levels = plan_levels(config, *identity, image.facts, settings.dark_frames)
     is_rounded = pair.clean.dtype == np.uint16

@@ -91,7 +91,7 @@ def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices
 
 
 def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
-    """Return the settings of a dataset as overrides, whose pair is that of the row."""
+    """Return the settings of a dataset as overrides that give the pair of the row."""
     manifest, source, given = folder / "manifest.csv", source_of(row), dict(start.settings)
     config, kind = read_dataset_yaml(folder / "config.yaml")
     require_photographs(config.source, "explore")

@@ -1,7 +1,7 @@
 """Draw the page with Bokeh: controls, pictures with linked zoom, curves, and what ``plan`` says.
 
 A page on a server recomputes its pair when a control changes; a saved page shows one state. Both have the template
-``explorer.html`` and need no network: the scripts are those of the installed Bokeh.
+``explorer.html`` and need no network: the scripts come from the installed Bokeh.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class DngColour:
         return matrix([self.balance[place // 3] * entry for place, entry in enumerate(calibrated)])
 
     def white(self) -> XY:
-        """Return the white point of the frame: AsShotWhiteXY, that of AsShotNeutral, or D50 without both."""
+        """Return the white point of the frame: AsShotWhiteXY, else from AsShotNeutral, else D50."""
         if self.white_xy is not None or self.neutral is None:
             return self.white_xy or D50
         last = before = D50

@@ -22,7 +22,7 @@ from unprocess_gen.sources.raw.metadata import (
 )
 
 MOST_PATTERN = 6
-"""Side of the largest CFA tile, that of X-Trans."""
+"""Side of the largest CFA tile, of X-Trans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class RawFrame:
     colours : ndarray of uint8, [2, 2] or [6, 6]
         Colour of the sites of the top-left tile: 0 red, 1 green, 2 blue, 3 the green of the blue rows.
     metadata : RawMetadata
-        Facts; levels and pattern are those of the visible part.
+        Facts; levels and pattern of the visible part.
     """
 
     pixels: NDArray[np.uint16]

@@ -1,6 +1,6 @@
 """Turn the file of a raw source into codes of camera RGB, and into the parts of a plan that the file gives.
 
-With ``source.shrink=1`` the codes are the DN of the mosaic, the same in all channels, and each site uses that of its
+With ``source.shrink=1`` the codes are the DN of the mosaic, the same in all channels; each site uses the code of its
 filter. With 2 or 4 they are means of cells: `SourcePlan.code_levels` has their black and white. Colours decide no pixel
 of a pair; pictures are drawn with them.
 """
@@ -128,7 +128,7 @@ def file_pattern(frame: RawFrame, raw: RawConfig) -> str:
 
 
 def file_levels(facts: RawMetadata, pattern: str, raw: RawConfig) -> tuple[Levels, Levels]:
-    """Return the levels of each plane: given ones, else those of the file."""
+    """Return the levels of each plane: given levels, else the levels of the file."""
     if raw.black_dn is not None:
         black = by_plane(raw.black_dn)
     elif facts.black_dn is None:
@@ -180,7 +180,7 @@ def _planes(frame: RawFrame, pattern: str) -> Sequence[Sequence[int]]:
 
 
 def _own_noise(facts: RawMetadata, raw: RawConfig, levels: tuple[float, float]) -> tuple[float, float] | None:
-    """Return S and O of the file's own noise, given or as in the tag NoiseProfile; that of 3 planes is averaged."""
+    """Return S and O of the file's own noise, given or from the tag NoiseProfile; three planes are averaged."""
     span, stated = levels[1] - levels[0], facts.noise_profile or ()
     if raw.a_dn is not None and raw.b_dn2 is not None:
         return raw.a_dn / span, raw.b_dn2 / (span * span)

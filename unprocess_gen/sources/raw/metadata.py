@@ -69,7 +69,7 @@ class RawMetadata:
     area: tuple[int, int, int, int] | None = None
 
     def completed(self, other: RawMetadata) -> RawMetadata:
-        """Return these facts, completed by those of another reader."""
+        """Return these facts, completed by the facts of another reader."""
         stated = {field.name: value for field in fields(self) if (value := getattr(self, field.name)) is not None}
         facts = replace(other, **stated)
         return replace(facts, bits=None if facts.white_dn is None else int(facts.white_dn).bit_length())
@@ -117,7 +117,7 @@ def tags_of(content: bytes, check: bool = True) -> RawMetadata:
 
 
 def _pages(file: Any) -> Any:
-    """Yield the images of a TIFF: those of its first directories, and of their SubIFDs."""
+    """Yield the images of a TIFF: of its first directories, and of their SubIFDs."""
     for first in file.pages:
         yield from (first, *(getattr(first, "pages", ()) or ()))
 
@@ -142,7 +142,7 @@ def _require(library: str, path: Path, key: str) -> None:
 
 
 def _facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model: str) -> RawMetadata:
-    """Collect facts from the tags of TIFF and DNG by code, and from those of EXIF by name."""
+    """Collect facts from the tags of TIFF and DNG by code, and from the tags of EXIF by name."""
     black, white = tags.get(50714, ()), tags.get(50717)
     names = ("ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed", "RecommendedExposureIndex")
     stated = [exif[name] for name in names if name in exif] + [*tags.get(34855, ()), *tags.get(34867, ())]
@@ -213,7 +213,7 @@ def _from_decoder(path: Path, key: str) -> RawMetadata:
 
 
 def decoder_facts(raw: Any) -> RawMetadata:
-    """Return what LibRaw knows of an opened file with a mosaic; the pattern and the black levels of a Bayer tile."""
+    """Return the facts that LibRaw knows of a mosaic; the pattern and the black levels of a Bayer tile."""
     colours, names = raw.raw_colors_visible[:2, :2].ravel().tolist(), raw.color_desc.decode("ascii")
     red, green, blue = (float(gain) for gain in raw.camera_whitebalance[:3])
     entries = [float(f"{entry:.7g}") for entry in raw.rgb_xyz_matrix[:3].ravel()]  # LibRaw has float32

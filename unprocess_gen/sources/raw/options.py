@@ -60,7 +60,7 @@ def check_options(to: Path, sensor: Path | None) -> None:
 
 
 def camera_options(file: Path, name: str) -> CameraOptions:
-    """Read a raw file and describe its camera as options; ``name`` is that of the camera.
+    """Read a raw file and describe its camera as options; ``name`` names the camera.
 
     Raises ConfigError or MachineError.
     """
