@@ -24,7 +24,7 @@ SIGNIFICANT = 3.0
 """Standard errors from which a difference is systematic."""
 NORMAL_95 = 1.96
 """Half the 95 % interval of a normal distribution, in standard errors."""
-UNSEEN = 0.015
+UNSEEN_CURVATURE = 0.015
 """Relative systematic error of a gain from too few levels to show it. Real sensors: EMVA 1288 reference set 001."""
 
 
@@ -170,7 +170,7 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> Gain:
         low = min(means[kind][0] - NORMAL_95 * inflated[kind] for kind in means)
         high = max(means[kind][0] + NORMAL_95 * inflated[kind] for kind in means)
     if len(by_kind) == 1:
-        low, high = low - UNSEEN * value, high + UNSEEN * value
+        low, high = low - UNSEEN_CURVATURE * value, high + UNSEEN_CURVATURE * value
     sensor = Estimate(value, low, high)
     planes = [
         Estimate(fit.gain, fit.gain - (value - low) * fit.error / error, fit.gain + (high - value) * fit.error / error)

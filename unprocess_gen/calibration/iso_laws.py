@@ -17,7 +17,7 @@ from unprocess_gen.calibration.gain import NORMAL_95, SIGNIFICANT, Estimate
 
 MODE_RATIO = 0.85
 """Ratio of read noise to the least read noise of a gain mode, below which it belongs to another mode."""
-CLOSE = 1e-3
+CLOSE_RESIDUAL = 1e-3
 """Relative residual up to which a law is good enough, whatever the standard errors."""
 DIGITS = 7
 
@@ -25,7 +25,7 @@ DIGITS = 7
 class Precision(NamedTuple):
     """Relative residual up to which a law is good enough, and digits of its numbers."""
 
-    close: float = CLOSE
+    close: float = CLOSE_RESIDUAL
     digits: int = DIGITS
 
 

@@ -33,7 +33,7 @@ from unprocess_gen.calibration.gain import (
     fit_gain,
     root_estimate,
 )
-from unprocess_gen.calibration.shape import Histogram, Shape, fit_shape, histograms, joined_histogram
+from unprocess_gen.calibration.shape import Histogram, ReadShape, fit_shape, histograms, joined_histogram
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
 
@@ -112,8 +112,8 @@ class IsoResult:
     reference: int
     read: Estimate
     reads: list[Estimate]
-    shape: Shape
-    shapes: list[Shape]
+    shape: ReadShape
+    shapes: list[ReadShape]
     histogram: Histogram
     row: Estimate
     row_correlation: Estimate
@@ -301,7 +301,7 @@ def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor, quick: bool
 # --------------------------------------------------------------------------------------------------------------- noise
 
 
-def _shapes(dark: Dark, watch: Watch) -> tuple[list[Shape], Histogram]:
+def _shapes(dark: Dark, watch: Watch) -> tuple[list[ReadShape], Histogram]:
     """Fit the distribution of the read noise of all planes, then of each plane."""
     std = math.sqrt(float(dark.measured.variance.mean()))
     counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.columns, std)
@@ -310,19 +310,19 @@ def _shapes(dark: Dark, watch: Watch) -> tuple[list[Shape], Histogram]:
     return [first, *(fit_shape(histogram, first) for histogram in counts)], together
 
 
-def _rounded_std(measured: Measured, shape: Shape) -> float:
+def _rounded_std(measured: Measured, shape: ReadShape) -> float:
     """Return the noise of darks without the noise of rounding."""
     variance = float(measured.variance.mean()) - ROUNDING_DN2
     return math.sqrt(variance) if variance > ROUNDED_STD_DN**2 else shape.std_dn
 
 
-def _variance(measured: Measured, plane: int, shape: Shape) -> float:
+def _variance(measured: Measured, plane: int, shape: ReadShape) -> float:
     """Return the variance of a site, rounding included; from the fitted distribution where rounding distorts it."""
     variance = float(measured.variance[plane])
     return variance if variance - ROUNDING_DN2 > ROUNDED_STD_DN**2 else shape.std_dn**2 + ROUNDING_DN2
 
 
-def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: Shape) -> Transfer:
+def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: ReadShape) -> Transfer:
     """Return the photon transfer curve of a plane."""
     pairs = [(flat.measured, darks[flat.dark].measured) for flat in flats]
     return Transfer(
@@ -334,7 +334,7 @@ def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: Shap
     )
 
 
-def _dark_estimates(dark: Dark, sensor: Sensor, shapes: Sequence[Shape]) -> dict[str, Any]:
+def _dark_estimates(dark: Dark, sensor: Sensor, shapes: Sequence[ReadShape]) -> dict[str, Any]:
     """Return the estimates of an `IsoResult` that darks give, by field."""
     measured, columns = dark.measured, dark.measured.column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0

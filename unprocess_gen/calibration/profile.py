@@ -131,7 +131,7 @@ ENDS = ("value", "low", "high")
 ASSUMED_C = 25.0
 """Temperature of darks that do not state it."""
 
-UNKNOWN = {
+UNKNOWN_REASONS = {
     "prnu_std": "more flats of each level show it",
     "dark_e_per_s": "darks of several exposures, up to some seconds, show it",
     "hot_pixel_share": "darks of 0.2 s or more show it",
@@ -146,7 +146,7 @@ def unknown_numbers(calibration: Calibration) -> list[str]:
     known = {entry.name: entry.number for entry in _body_estimates(calibration) if entry.site is None}
     return [
         f"{name} is null: the captures do not show it; {advice}"
-        for name, advice in UNKNOWN.items()
+        for name, advice in UNKNOWN_REASONS.items()
         if known[name] is None
     ]
 

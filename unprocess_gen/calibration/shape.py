@@ -28,7 +28,7 @@ STEPS = np.array([2e-3, 1e-2])
 """Steps in the logarithm of the standard deviation and in λ between which the likelihood is a parabola."""
 FLOOR = 1e-9
 """Probability of values that no distribution explains, such as defects."""
-OF_ROWS = 2.0
+ROW_FACTOR = 2.0
 """λ is too near to `NORMAL_SHAPE` by this fraction over the sites of a row, whose mean is subtracted. Measured."""
 EVIDENCE = 8.0
 """Logarithm of the ratio of likelihoods from which Tukey's lambda is chosen."""
@@ -49,7 +49,7 @@ class Histogram:
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class ReadShape:
     """Fitted read noise: standard deviations of both distributions, λ with its interval, and which one fits better."""
 
     normal_std_dn: float
@@ -100,7 +100,7 @@ def probabilities(values: Float, std: float, shape: float | None) -> Float:
     return np.asarray(tklmbda((values + 0.5) * scale, shape) - tklmbda((values - 0.5) * scale, shape))
 
 
-def fit_shape(histogram: Histogram, start: Shape | None = None) -> Shape:
+def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape:
     """Fit a normal distribution and Tukey's lambda to a histogram."""
     from scipy.optimize import minimize, minimize_scalar
     from scipy.special import ndtr, tklmbda
@@ -138,10 +138,10 @@ def fit_shape(histogram: Histogram, start: Shape | None = None) -> Shape:
     error = _error_of_shape(around, np.array(heights))
     pull = float(best.x[1] - NORMAL_SHAPE) / histogram.sites
     systematic = abs(pull) * (1 if pull < 0 else 4) + _rounding_error(math.exp(best.x[0]), best.x[1])
-    shape, half = float(best.x[1]) + OF_ROWS * pull, math.hypot(NORMAL_95 * error, systematic)
+    shape, half = float(best.x[1]) + ROW_FACTOR * pull, math.hypot(NORMAL_95 * error, systematic)
     normal_std, tukey_std_dn = np.exp([normal.x, best.x[0]]) * math.sqrt(histogram.sites / (histogram.sites - 1))
     interval = Estimate(shape, shape - half, shape + half)
-    return Shape(float(normal_std), float(tukey_std_dn), interval, bool(best.fun < normal.fun - EVIDENCE))
+    return ReadShape(float(normal_std), float(tukey_std_dn), interval, bool(best.fun < normal.fun - EVIDENCE))
 
 
 def _rounding_error(std: float, shape: float) -> float:

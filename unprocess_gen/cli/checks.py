@@ -158,7 +158,7 @@ def _compare_frames(folder: AnyPath, frames: Path, to: str | None) -> list[str]:
     comparisons = against.compare_frames(config, frames, partial(with_bar, unit="frame"))
     for note in comparisons.notes:
         report(note)
-    compared = [comparison for comparison in comparisons.numbers if comparison.verdict != against.UNKNOWN]
+    compared = [comparison for comparison in comparisons.numbers if comparison.verdict != against.NOT_COMPARED]
     print_result(
         f"{frames}: {counted(len(compared), 'number')} compared with the profile {config.noise.name}, "
         f"{len(comparisons.differences)} wrong"

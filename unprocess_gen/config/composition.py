@@ -38,7 +38,7 @@ from unprocess_gen.config.composition_errors import assignment, explain, unknown
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.mixture import read_entries
 from unprocess_gen.config.option_files import OPTIONAL_GROUPS, check_override, conf_dir
-from unprocess_gen.config.raw_composition import OF_FILE, source_overrides
+from unprocess_gen.config.raw_composition import FILE_SENSOR, source_overrides
 from unprocess_gen.config.schema import ENTRY_GROUPS, Config, MixtureEntry
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import entry_errors, validate_config
@@ -172,7 +172,7 @@ def _with_entries(config: Config, node: DictConfig, settings: Any, overrides: Se
     folders = OptionFolders(places["main"], settings.job.config_name, places.get("command-line"))
     given = [override for override in settings.overrides.task if override.lstrip("+").partition("=")[0] != "mixture"]
     if config.source.kind == "raw":  # each entry is composed with what follows from the kind
-        given = [override for override in given if override != OF_FILE and not override.startswith("source.include=")]
+        given = [text for text in given if text != FILE_SENSOR and not text.startswith("source.include=")]
     outside = _settings_outside(node, settings.runtime.choices, given, overrides, folders)
     entries = []
     for number, (weight, options, values) in enumerate(read_entries(config.mixture)):
@@ -211,7 +211,7 @@ def _settings_outside(
     """Return the options and keys of a mixture's groups that overrides or the user's files set, as they set them."""
     chosen = {group: choices[group] for group in ENTRY_GROUPS if choices[group] != default_options()[group]}
     outside = {
-        group: text for group, name in chosen.items() if (text := f"{group}={name}") != OF_FILE or text in overrides
+        group: text for group, name in chosen.items() if (text := f"{group}={name}") != FILE_SENSOR or text in overrides
     }
     if any(text.startswith("+") for text in given) or (folders.main, folders.name) != (conf_dir().absolute(), "config"):
         own = folders.own or (None if folders.main == conf_dir().absolute() else folders.main)

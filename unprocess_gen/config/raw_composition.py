@@ -19,7 +19,7 @@ NOT_APPLIED = {
 }
 """Groups that undo what a photograph went through."""
 
-OF_FILE = "sensor=source"
+FILE_SENSOR = "sensor=source"
 """Override that takes the sensor of raw sources from their files."""
 
 SENSOR_LEVELS = tuple(f"sensor.{name}" for name in ("bits", "black_level_dn", "white_level_dn", "pattern"))
@@ -48,10 +48,10 @@ def _raw_overrides(node: Any, given: dict[str, str]) -> Iterator[str]:
     chosen = node.hydra.runtime.choices.sensor
     if chosen == default_options()["sensor"] and "sensor" not in given:
         chosen = "source"
-        yield OF_FILE
+        yield FILE_SENSOR
     for key in SENSOR_LEVELS:
         if key in given and chosen == "source":
-            raise ConfigError(f"{given[key]}: {OF_FILE} takes it from each file; choose a sensor, or remove it")
+            raise ConfigError(f"{given[key]}: {FILE_SENSOR} takes it from each file; choose a sensor, or remove it")
     if "sensor.pattern" in given and OmegaConf.select(node, "source.shrink") == 1:
         problem = "the mosaic has the pattern of its file; set source.shrink=2, or remove it"
         raise ConfigError(f"{given['sensor.pattern']}: source.kind=raw: {problem}")

@@ -9,16 +9,16 @@ from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.config.values import refusal
 from unprocess_gen.simulation.reference.cfa import MONO
 
-OF_PHOTOGRAPHS = {"downscale": 1, "dequantize": "off", "icc": "ignore"}
+PHOTOGRAPH_SETTINGS = {"downscale": 1, "dequantize": "off", "icc": "ignore"}
 """Keys of the source that prepare photographs, with the value of raw sources."""
-OF_RAW = {"shrink": 1, "own_noise": "keep"}
+RAW_SETTINGS = {"shrink": 1, "own_noise": "keep"}
 """Keys of raw sources, with the value of photographs."""
 
 
 def check_raw_source(config: Config) -> None:
     """Raise ConfigError if settings of raw sources and of photographs are mixed, or contradict each other."""
     source, is_raw = config.source, config.source.kind == "raw"
-    for name, value in (OF_PHOTOGRAPHS if is_raw else OF_RAW).items():
+    for name, value in (PHOTOGRAPH_SETTINGS if is_raw else RAW_SETTINGS).items():
         if (setting := getattr(source, name)) != value:
             kind, advice = ("photographs", "use source.shrink") if is_raw else ("raw sources", "set source.kind=raw")
             raise refusal(f"source.{name}", setting, f"is for {kind}; expected {value}, or {advice}")

@@ -294,16 +294,16 @@ CHOSEN, PROFILE = "Chosen for a run", "Every profile"
 TWO_NUMBERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
 """Sections of the keys of `NoiseConfig`."""
 
-Body = TypeVar("Body")
+BodyGroup = TypeVar("BodyGroup")
 
 Fields = Mapping[str, tuple[Any, Any]]
 """Type and default of each field."""
 
 
-def with_fields(added: Fields, before: str = "") -> Callable[[type[Body]], type[Body]]:
+def with_fields(added: Fields, before: str = "") -> Callable[[type[BodyGroup]], type[BodyGroup]]:
     """Add fields to the body of a dataclass, at its end or before one of its fields."""
 
-    def add(group: type[Body]) -> type[Body]:
+    def add(group: type[BodyGroup]) -> type[BodyGroup]:
         types = list(group.__annotations__.items())
         place = list(group.__annotations__).index(before) if before else len(types)
         types[place:place] = [(name, kind) for name, (kind, _) in added.items()]

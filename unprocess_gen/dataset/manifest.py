@@ -354,7 +354,7 @@ def _check_together(row: Row) -> None:
         raise ValueError("status is empty")
     if row["status"] != "ok":
         return
-    for name in _NEEDED if any(row[name] not in (None, "") for name in _OF_FRAMES) else _NEEDED_TO_PLAN:
+    for name in _NEEDED if any(row[name] not in (None, "") for name in _FRAME_COLUMNS) else _NEEDED_TO_PLAN:
         if row[name] is None or row[name] == "":
             raise ValueError(f"{name} is empty")
     largest = TARGET_BYTES if row["targets"] else 4 if "float32" in (row["dtype"], row["clean_dtype"]) else 2
@@ -369,7 +369,7 @@ _NEEDED_TO_PLAN = "width", "height", "shard", "level", "draw", "frame", "dtype",
 _NEEDED = *_NEEDED_TO_PLAN, "clean_xxh3", "noisy_xxh3"
 """Columns without which the members of a pair can neither be found nor checked."""
 
-_OF_FRAMES = "clean_xxh3", "noisy_xxh3", "targets", *(column.name for (column,) in COLUMNS_OF[Counts].values())
+_FRAME_COLUMNS = "clean_xxh3", "noisy_xxh3", "targets", *(column.name for (column,) in COLUMNS_OF[Counts].values())
 """Columns that depend on frames; all of them are empty in a manifest without frames."""
 
 

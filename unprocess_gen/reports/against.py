@@ -51,7 +51,7 @@ FIELDS = (
     *("profile", "difference_percent", "standard_errors", "verdict"),
 )
 """Columns of the list."""
-AGREES, DIFFERS, UNKNOWN = "agrees", "differs", "not compared"
+AGREES, DIFFERS, NOT_COMPARED = "agrees", "differs", "not compared"
 LACKS, UNSEEN = "missing in the profile", "missing in the frames"
 
 
@@ -91,7 +91,7 @@ class Comparison(NamedTuple):
         name, iso, site, number, unit = self.measured
         number = number or Estimate(math.nan, math.nan, math.nan)
         values = [number.value, number.low, number.high, math.nan if self.profile is None else self.profile]
-        values += [math.nan] * 2 if self.verdict == UNKNOWN else [self.percent, self.score.errors]
+        values += [math.nan] * 2 if self.verdict == NOT_COMPARED else [self.percent, self.score.errors]
         numbers = [f"{value:.7g}" if math.isfinite(value) else "" for value in values]
         return [name, "" if iso is None else f"{iso:g}", site or "", unit, *numbers, self.verdict]
 
@@ -105,7 +105,7 @@ class Comparisons(NamedTuple):
     @property
     def differences(self) -> list[Comparison]:
         """Numbers that differ; sites are left out of a number that differs at all sites together."""
-        differing = [line for line in self.numbers if line.verdict not in (AGREES, UNKNOWN)]
+        differing = [line for line in self.numbers if line.verdict not in (AGREES, NOT_COMPARED)]
         whole = {(line.measured.name, line.measured.iso) for line in differing if line.measured.site is None}
         return [
             line
@@ -153,7 +153,7 @@ def _compared(calibration: Calibration, profile: Profile, known: dict[float, Est
         # a normal distribution is nearest to Tukey's at a shape that a fit may miss
         is_open |= estimate.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[estimate.iso or 0.0][place]
         if is_open or estimate.number is None or expected is None:
-            yield Comparison(estimate, expected, Score(0.0, 1.0, 0.0), UNKNOWN)
+            yield Comparison(estimate, expected, Score(0.0, 1.0, 0.0), NOT_COMPARED)
             continue
         score = _score(estimate.number, expected)
         verdict = AGREES

@@ -43,7 +43,7 @@ FARTHEST_STEPS = 2**18
 
 BLOCK_SITES = 2**20
 
-Histogram = NDArray[np.int64]
+StepCounts = NDArray[np.int64]
 Map = NDArray[np.float32]
 
 
@@ -139,24 +139,24 @@ def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
     return (slice(top, top + step) for top in range(0, shape[0], step))
 
 
-def median_of(counts: Histogram) -> int:
+def median_of(counts: StepCounts) -> int:
     """Return the lower median of counted integers."""
     return int(np.searchsorted(np.cumsum(counts), (int(counts.sum()) + 1) // 2))
 
 
-def trimmed_mean(counts: Histogram) -> float:
+def trimmed_mean(counts: StepCounts) -> float:
     """Return the mean of counted integers, without the `FARTHEST` at both ends; exact."""
     count, first, _ = _trimmed_sums(counts)
     return float(Fraction(first, count))
 
 
-def trimmed_variance(counts: Histogram, steps: int) -> float:
+def trimmed_variance(counts: StepCounts, steps: int) -> float:
     """Return the variance of counted integers, without the `FARTHEST` at both ends; exact."""
     count, first, second = _trimmed_sums(counts)
     return float(Fraction(count * second - first * first, count * count * steps * steps))
 
 
-def _trimmed_sums(counts: Histogram) -> tuple[int, int, int]:
+def _trimmed_sums(counts: StepCounts) -> tuple[int, int, int]:
     """Return the number, the sum and the sum of squares of counted integers, without the `FARTHEST` at both ends."""
     cut = int(int(counts.sum()) * FARTHEST)
     ascending = np.cumsum(counts)
@@ -167,12 +167,12 @@ def _trimmed_sums(counts: Histogram) -> tuple[int, int, int]:
     return count, first, sum(value * value * times for value, times in pairs)
 
 
-BLACK_LEVELS: dict[str, Callable[[Histogram], float]] = {"median": median_of, "mean": trimmed_mean}
+BLACK_LEVELS: dict[str, Callable[[StepCounts], float]] = {"median": median_of, "mean": trimmed_mean}
 """Statistic of counted pixels that is the black level, by the value of ``noise.dark_frames_level``."""
 
 
 def shading_differences(
-    values: Map, black_dn: float, frames: Iterable[NDArray[Any]], level: Callable[[Histogram], float] = median_of
+    values: Map, black_dn: float, frames: Iterable[NDArray[Any]], level: Callable[[StepCounts], float] = median_of
 ) -> tuple[float, float]:
     """Level and variance of dark frames minus a map and ``black_dn``, in steps of 1/16 DN; DN and DN² of the frames.
 

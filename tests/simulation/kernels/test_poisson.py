@@ -196,7 +196,7 @@ def first_terms(words: np.ndarray, rate: float) -> np.ndarray:
     s = z * (np.sqrt(near) * reciprocal)
     s2 = s * s
     terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
-    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * np.float32(kernels._OF_RECIPROCAL))
+    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * np.float32(kernels._RECIPROCAL_TERM))
     assert rest.dtype == np.float32
     return np.asarray(np.float64(near) + rest.astype(np.float64))
 

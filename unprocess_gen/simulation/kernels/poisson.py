@@ -235,7 +235,7 @@ which is at most 6e-6 (8 + 12.5 + rate / 50), of the rate, and of rounding to fl
 TRUNCATION_ERRORS = 2e-7, 0.0325
 """Error of the first terms in float64 with exact normals: less than the sum of these, times 3 + √rate and 1 / rate."""
 
-_TERMS, _OF_RECIPROCAL = (1 / 6, -1 / 72, 3.74468638e-3, -1.52239065e-3, 6.95733048e-4), -0.0305402523
+_TERMS, _RECIPROCAL_TERM = (1 / 6, -1 / 72, 3.74468638e-3, -1.52239065e-3, 6.95733048e-4), -0.0305402523
 """Coefficients of x - rate - √rate·z ≈ (z² + 2)·P(s) + c / rate, s = z / √rate.
 
 The first two are coefficients of the expansion; the others minimise the largest error times the rate.
@@ -255,7 +255,7 @@ def _count_high_rates(
         s, z2 = z * (root * reciprocal), z * z
         s2 = s * s
         terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
-        value = (rate - 0.5) + (root * z + ((z2 + 2.0) * terms + reciprocal * _OF_RECIPROCAL))
+        value = (rate - 0.5) + (root * z + ((z2 + 2.0) * terms + reciprocal * _RECIPROCAL_TERM))
         counted = (value + ROUND32) - ROUND32
         most = (rate * error_of_rate + reciprocal * error_of_reciprocal) + (1.0 + error_of_1)
         is_open = simd.less_than(1.5 - most, simd.absolute(value - counted))
@@ -297,7 +297,7 @@ def _bounds_by_first_terms(rate: float, z: float) -> tuple[float, float]:
         return 0.0, np.inf
     c, s, reciprocal = _TERMS, z / root, 1.0 / rate
     terms = c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * c[4])))
-    value = rate + (root * z + ((z * z + 2.0) * terms + reciprocal * _OF_RECIPROCAL))
+    value = rate + (root * z + ((z * z + 2.0) * terms + reciprocal * _RECIPROCAL_TERM))
     error = TRUNCATION_ERRORS[0] * (3.0 + root) + TRUNCATION_ERRORS[1] * reciprocal
     return np.floor(value - error), np.floor(value + error)
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 Codes = tuple[int, int, int]
 
-SCENE_KINDS = ("dead_leaves", "colour_chart", "gradients", "night_lamps", "highlights")
+SYNTHETIC_KINDS = ("dead_leaves", "colour_chart", "gradients", "night_lamps", "highlights")
 
 DEFAULT_COUNT = 10
 
@@ -35,7 +35,7 @@ DEFAULT_COUNT = 10
 def listing(limit: int | None) -> tuple[str, ...]:
     """Return the names of the first ``limit`` scenes (None: ten); kinds alternate."""
     count = DEFAULT_COUNT if limit is None else limit
-    return tuple(f"{SCENE_KINDS[i % len(SCENE_KINDS)]}-{i // len(SCENE_KINDS)}" for i in range(count))
+    return tuple(f"{SYNTHETIC_KINDS[i % len(SYNTHETIC_KINDS)]}-{i // len(SYNTHETIC_KINDS)}" for i in range(count))
 
 
 FRAMES_PER_CLIP = 8
@@ -98,9 +98,9 @@ def _draw(name: str) -> NDArray[np.uint8]:
 def _kind(name: str) -> str:
     """Return the kind in a name; a number has one spelling only, so that a picture has one name."""
     match = re.fullmatch(r"(.*)-(?:0|[1-9][0-9]*)", name)
-    if match is None or match[1] not in SCENE_KINDS:
+    if match is None or match[1] not in SYNTHETIC_KINDS:
         raise ValueError(
-            f"synthetic scene {name!r}: expected <kind>-<number>, the kind one of {', '.join(SCENE_KINDS)} "
+            f"synthetic scene {name!r}: expected <kind>-<number>, the kind one of {', '.join(SYNTHETIC_KINDS)} "
             "and the number 0 or more without leading zeros"
         )
     return match[1]
@@ -690,5 +690,5 @@ def _shade(
 Painter = Callable[[_Draws, int, int], Float]
 
 PAINTERS: dict[str, Painter] = dict(
-    zip(SCENE_KINDS, (_dead_leaves, _colour_chart, _gradients, _night_lamps, _highlights), strict=True)
+    zip(SYNTHETIC_KINDS, (_dead_leaves, _colour_chart, _gradients, _night_lamps, _highlights), strict=True)
 )
