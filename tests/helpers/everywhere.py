@@ -49,7 +49,6 @@ from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels import body, render
 from unprocess_gen.simulation.kernels.electrons import Electrons
-from unprocess_gen.simulation.kernels.philox import philox_keys
 from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.kernels.strips import STRIP, allocate_scratch
 from unprocess_gen.simulation.pair import make_pair
@@ -173,11 +172,13 @@ def doubles() -> str:
         clean_dtype, dtype = (
             np.float32 if is_float else np.uint16 for is_float in (plan.output.clean_normalised, plan.output.normalised)
         )
-        scene, noise, readout = render._records((plan,), shape, 256, origin)
+        form = render._form_of((plan,), shape, (origin[0] % 2, origin[1] % 2))
+        scene, noise = render._records(form, (plan,), shape, 256, origin)
         scratch = allocate_scratch(np.float32 if uses_scene32(plan) else np.float64)
         clean, noisy = np.empty(codes[..., 0].size, clean_dtype), np.empty((1, codes[..., 0].size), dtype)
         counts = np.zeros((1, render.COUNT_FIELDS), dtype=np.int64)
-        render._render(codes, scene, noise, philox_keys([plan]), origin, readout, scratch, clean, noisy, counts)
+        fixed = codes, scene, noise, form.keys, origin, form.readout
+        render._render(*fixed, scratch, clean, noisy, counts)
         found += [clean, noisy, counts, scratch]
         if isinstance(noise, Electrons):
             found += members(noise.body)

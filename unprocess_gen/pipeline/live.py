@@ -8,7 +8,7 @@ import math
 import operator
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -166,8 +166,7 @@ class LivePairs:
         plan, patch = self._redrawn(source.settings, image, srgb, epoch)
         if self._patch is not None:
             patch = _crop(plan, epoch, patch, self._patch, crop)
-        for kernels in kernels_for(self._targets, plan):
-            self_test.check(kernels)
+        _check_kernels(self._targets, plan)
         pixels, dark_pixels = crop_patch(srgb, patch), source.settings.dark_folder
         clean, noisy, counts = make_crop(pixels, plan, patch.origin, epoch, dark_pixels)
         targets, frames = {}, (clean, noisy)
@@ -178,7 +177,7 @@ class LivePairs:
             frames = self._frame(clean, plan), self._frame(noisy, plan)
         if self._arrays_only:
             return (*frames, *targets.values())
-        row: Any = LiveRow(lambda: source.row(image, plan.replace(epoch=epoch), patch, Pair(clean, noisy, counts())))
+        row: Any = LiveRow(partial(_build_row, source, image, plan, epoch, patch, clean, noisy, counts))
         return LiveSample(*frames, row, source.name, targets)
 
     def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
@@ -239,6 +238,13 @@ class LiveRow(Mapping[str, Value]):
         return dict, (self._row,)
 
 
+def _build_row(
+    source: LiveSource, image: LiveImage, plan: Plan, epoch: int, patch: Patch, clean: Frame, noisy: Frame, counts: Any
+) -> dict[str, Value]:
+    """Return the row of a pair in an epoch."""
+    return source.row(image, plan.replace(epoch=epoch), patch, Pair(clean, noisy, counts()))
+
+
 def _without_none(row: Mapping[str, Value]) -> dict[str, Value]:
     """Return a row whose columns have one type in every pair: NaN instead of None, text where some pairs have text."""
     texts = {column.name for column in COLUMNS if column.type is number_or_text}
@@ -266,6 +272,13 @@ def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, spli
 
         dataset = load_config(dataset)
     return [PlannedPairs(dataset, root, cache)]
+
+
+@lru_cache(maxsize=4096)
+def _check_kernels(targets: tuple[str, ...], plan: Plan) -> None:
+    """Test the kernels of a plan and its targets, once for each plan: their names take 3 % of a patch of 128 x 128."""
+    for kernels in kernels_for(targets, plan):
+        self_test.check(kernels)
 
 
 def _is_dataset(place: Any) -> bool:

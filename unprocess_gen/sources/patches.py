@@ -42,7 +42,7 @@ def _random(rule: PatchRule, stream_key: int, height: int, width: int, epoch: in
 
 def even_corner(place: tuple[int, int], side: int, height: int, width: int) -> tuple[int, int]:
     """Return the even row and column of a square in a rectangle that two random words choose."""
-    rows, columns = ((length - side) // 2 + 1 for length in (height, width))
+    rows, columns = (height - side) // 2 + 1, (width - side) // 2 + 1
     return 2 * (place[0] * rows >> 32), 2 * (place[1] * columns >> 32)
 
 

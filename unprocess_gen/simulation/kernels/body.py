@@ -194,12 +194,14 @@ def _fill_defects(
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
             fill_word_blocks(key, strip, streams[0], bright)
-            fill_word_blocks(key, strip, streams[2], dead)
             row = simd.pointer_to(target, y * out.shape[1] + x + strip.lead)
             bright_count = np.int64(0)
             for n in range(strip.first, strip.after):
                 bright_count += np.uint64(bright[n]) < below[0]
-                row[n] = np.uint16(np.uint64(dead[n]) < below[1]) * np.uint16(DEAD)
+            if below[1] > 0:  # without dead pixels, their words would double the time
+                fill_word_blocks(key, strip, streams[2], dead)
+                for n in range(strip.first, strip.after):
+                    row[n] = np.uint16(np.uint64(dead[n]) < below[1]) * np.uint16(DEAD)
             if bright_count > 0:
                 fill_word_blocks(key, strip, streams[1], steps)
                 for n in range(strip.first, strip.after):

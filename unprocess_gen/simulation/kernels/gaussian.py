@@ -10,7 +10,6 @@ Design: ``docs/design/kernels.md``.
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,7 +57,6 @@ def variance_lines(plans: tuple[Plan, ...], dtype: Any = np.float64) -> NDArray[
         return np.array([plan.noise.variance_line for plan in plans]).astype(dtype)
 
 
-@functools.lru_cache(maxsize=1024)
 def gaussian_noise(plans: tuple[Plan, ...]) -> Gaussian:
     """Return the noise of the plans' frames."""
     lines, error, _, quadratics = normal.normal_quantiles()
@@ -66,7 +64,6 @@ def gaussian_noise(plans: tuple[Plan, ...]) -> Gaussian:
     return Gaussian(variance_lines(plans), black_dn, lines, quadratics, float(error) + ROUNDING_ERROR)
 
 
-@functools.lru_cache(maxsize=4)
 def gaussian_noise32(plans: tuple[Plan, ...]) -> Gaussian32:
     """Return the noise of the plans' frames in float32."""
     black_dn = np.full(SIZE, plans[0].sensor.black_level_dn, dtype=np.float32)

@@ -32,15 +32,12 @@ def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Philo
     return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
 
 
-def philox_keys(plans: Sequence[Plan], epoch: int | None = None) -> NDArray[np.uint64]:
-    """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row.
-
-    ``epoch`` replaces the epoch of the plans.
-    """
+def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
+    """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
     rows = []
     for plan in plans:
         key, noise = plan.stream_key, plan.noise
-        word = frame_word(noise.frame, noise.epoch if epoch is None else epoch)
+        word = frame_word(noise.frame, noise.epoch)
         rows.append((key & 0xFFFFFFFF, key >> 32, noise.level << 12 | noise.draw, word))
     return np.array(rows, dtype=np.uint64)
 

@@ -26,7 +26,6 @@ noise: `Gaussian`, `Gaussian32` or `Electrons`. Each function below that is made
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,7 +93,6 @@ CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE, LIGHT_HI
 COUNT_FIELDS = 7
 
 
-@functools.lru_cache(maxsize=1024)
 def readout_of(
     plans: tuple[Plan, ...], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
 ) -> ReadOut:

@@ -8,13 +8,15 @@ except `clean.Scene32` with `gaussian.Gaussian32`, whose errors are stated in `c
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import kernel
+from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.core.types import PACKED, Counts, DarkFramePlan, DarkPixels, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE, body_of, light_factor
 from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene_of, with_response
@@ -62,7 +64,7 @@ def render_pairs(
     list of Pair
         One pair per plan; all share the clean array.
     """
-    clean, noisy, numbers = _fill_frames(srgb, plans, len(plans), origin, dark_pixels)
+    clean, noisy, numbers = _fill_frames(srgb, tuple(plans), len(plans), origin, dark_pixels)
     counts = _counts_of(numbers, plans[0])
     return [Pair(clean, frame, counted) for frame, counted in zip(noisy, counts, strict=True)]
 
@@ -75,7 +77,7 @@ def render_crop(
     The records of a plan serve all its epochs: preparing them for each would take longer than a patch of 128 x 128. The
     counts are built when they are asked for, because a record of Python takes 5 µs.
     """
-    clean, noisy, numbers = _fill_frames(srgb, [plan], 1, origin, None, epoch)
+    clean, noisy, numbers = _fill_frames(srgb, (plan,), 1, origin, epoch=epoch)
     return clean, noisy[0], lambda: _counts_of(numbers, plan)[0]
 
 
@@ -91,55 +93,85 @@ def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
 
 def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
     """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
-    return _fill_frames(srgb, [plan.replace(dark=DarkFramePlan())], 0, origin, None)[0]
+    return _fill_frames(srgb, (plan.replace(dark=DarkFramePlan()),), 0, origin)[0]
+
+
+class _Form(NamedTuple):
+    """Hold what all crops of one size share, wherever they are: looked up once for each, because records are hashed."""
+
+    shape: tuple[int, ...]
+    clean_dtype: Any
+    noisy_dtype: Any
+    scene: type[Scene]
+    noise: Gaussian | Gaussian32 | None  # None for noise in electrons, which depends on the place
+    readout: ReadOut
+    keys: NDArray[np.uint64]
+
+
+@functools.lru_cache(maxsize=1024)
+def _form_of(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int, int]) -> _Form:
+    """Return the form of frames of ``shape`` whose first site is ``corner`` of a tile."""
+    first, in_float32 = plans[0], uses_scene32(plans[0])
+    packed = first.output.layout == PACKED
+    noise = None if first.noise.counts_electrons else (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
+    return _Form(
+        (4, shape[0] // 2, shape[1] // 2) if packed else shape,
+        np.float32 if first.output.clean_normalised else np.uint16,
+        np.float32 if first.output.normalised else np.uint16,
+        Scene32 if in_float32 else Scene,
+        noise,
+        readout_of(plans, shape if packed else (0, 0), corner, in_float32),
+        philox_keys(plans),
+    )
 
 
 def _fill_frames(
     srgb: Srgb,
-    plans: Sequence[Plan],
+    plans: tuple[Plan, ...],
     count: int,
     origin: tuple[int, int],
-    dark_pixels: DarkPixels | None,
+    dark_pixels: DarkPixels | None = None,
     epoch: int | None = None,
 ) -> tuple[Frame, Frame, NDArray[np.int64]]:
     """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`.
 
     Only the numbers of the first noisy frame include the counts of the clean frame.
     """
-    first, shape = plans[0], (srgb.shape[0], srgb.shape[1])
-    frame_shape = (4, shape[0] // 2, shape[1] // 2) if first.output.layout == PACKED else shape
-    clean = np.empty(frame_shape, dtype=np.float32 if first.output.clean_normalised else np.uint16)
-    noisy = np.empty((count, *frame_shape), dtype=np.float32 if first.output.normalised else np.uint16)
-    counts = np.zeros((max(count, 1), COUNT_FIELDS), dtype=np.int64)
-    codes_per_channel = 256 if srgb.itemsize == 1 else 65536
-    scene, noise, readout = _records(tuple(plans), shape, codes_per_channel, origin, dark_pixels, epoch)
-    scratch = scratch_of_thread(np.float32 if uses_scene32(first) else np.float64)
+    shape = srgb.shape[0], srgb.shape[1]
+    form = _form_of(plans, shape, (origin[0] % 2, origin[1] % 2))
+    clean = np.empty(form.shape, form.clean_dtype)
+    noisy = np.empty((count, *form.shape), form.noisy_dtype)
+    counts = np.zeros((max(count, 1), COUNT_FIELDS), np.int64)
+    scene, noise = _records(form, plans, shape, 256 if srgb.itemsize == 1 else 65536, origin, dark_pixels, epoch)
     # a view, a read-only array or a subclass would be another type, compiled again
     codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
-    keys, frames = philox_keys(plans, epoch)[:count], (clean.reshape(-1), noisy.reshape(count, clean.size))
-    _render(codes, scene, noise, keys, origin, readout, scratch, *frames, counts)
+    keys = form.keys[:count]
+    if epoch is not None:
+        keys = keys.copy()
+        keys[0, 3] = frame_word(plans[0].noise.frame, epoch)
+    scratch = scratch_of_thread(np.float32 if form.scene is Scene32 else np.float64)
+    frames = clean.reshape(-1), noisy.reshape(count, clean.size)
+    _render(codes, scene, noise, keys, origin, form.readout, scratch, *frames, counts)
     return clean, noisy, counts
 
 
 def _records(
+    form: _Form,
     plans: tuple[Plan, ...],
     shape: tuple[int, int],
     codes: int,
     origin: tuple[int, int],
     dark_pixels: DarkPixels | None = None,
     epoch: int | None = None,
-) -> tuple[Scene, Gaussian | Gaussian32 | Electrons, ReadOut]:
-    """Return the scene, the noise and the read-out, whose classes select the compiled code.
+) -> tuple[Scene, Gaussian | Gaussian32 | Electrons]:
+    """Return the scene and the noise, whose classes select the compiled code.
 
     Patches of an image find what they share in caches: preparing it would take a quarter of the time of a patch.
     """
-    first, corner, in_float32 = plans[0], (origin[0] % 2, origin[1] % 2), uses_scene32(plans[0])
-    scene = scene_of(first, codes, corner, Scene32 if in_float32 else Scene)
-    readout = readout_of(plans, shape if first.output.layout == PACKED else (0, 0), corner, in_float32)
-    if in_float32:
-        return scene, gaussian_noise32(plans), readout
-    if not first.noise.counts_electrons:
-        return scene, gaussian_noise(plans), readout
+    first = plans[0]
+    scene = scene_of(first, codes, (origin[0] % 2, origin[1] % 2), form.scene)
+    if form.noise is not None:
+        return scene, form.noise
     frames = tuple(slots_in_epoch(plan, epoch) for plan in plans)
     body = body_of(frames[0].patterns, shape, origin, is_live=epoch is not None)
     factor = light_factor(frames[0].patterns, body, shape, origin, first.noise.averaged)
@@ -147,7 +179,7 @@ def _records(
         scene = with_response(scene, factor)
     if first.noise.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
         body = body._replace(response=EQUAL_RESPONSE)
-    return scene, electron_noise(plans, frames, body, dark_pixels, shape, origin), readout
+    return scene, electron_noise(plans, frames, body, dark_pixels, shape, origin)
 
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
