@@ -20,12 +20,13 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
+from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.targets import TARGETS
-from unprocess_gen.core.types import Frame, Pair, Patch, Plan, Srgb, Value
+from unprocess_gen.core.types import Facts, Frame, Pair, Patch, Plan, Srgb, Value
 from unprocess_gen.dataset.columns import COLUMNS, number_or_text
 from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_folders, name_apart
 from unprocess_gen.dataset.training import to_light
-from unprocess_gen.pipeline.live_sources import LiveImage, LiveSource, PlannedPairs, RecordedPairs
+from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.targets import kernels_for, levels_of, noise_law, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
@@ -145,6 +146,7 @@ class LivePairs:
         self._ends = [*itertools.accumulate(map(len, self._sources))]
         self._redraw, self._patch, self._patches, self._as_float = redraw, patch, patches, as_float
         self._targets, self._arrays_only = tuple(targets), arrays_only
+        self._facts: Recent[int, Facts | None] = Recent(KEPT)  # they read all pixels of a photograph
 
     def __len__(self) -> int:
         return (self._ends[-1] if self._ends else 0) * self._patches
@@ -163,7 +165,7 @@ class LivePairs:
         image = source.image(number - (self._ends[place - 1] if place else 0))
         epoch = epoch if self._redraw != "none" else 0
         srgb = source.pixels(image)
-        plan, patch = self._redrawn(source.settings, image, srgb, epoch)
+        plan, patch = self._redrawn(source.settings, image, srgb, epoch, number)
         if self._patch is not None:
             patch = _crop(plan, epoch, patch, self._patch, crop)
         _check_kernels(self._targets, plan)
@@ -194,12 +196,17 @@ class LivePairs:
             for sample in samples
         ]
 
-    def _redrawn(self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int) -> tuple[Plan, Patch]:
+    def _redrawn(
+        self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int
+    ) -> tuple[Plan, Patch]:
         """Return the plan of an epoch, without its number, and the patch."""
         plan, patch = image.plan, image.patch
         if epoch and self._redraw == "all":
             config, (height, width) = config_of_key(settings.config, plan.stream_key, epoch), srgb.shape[:2]
-            facts = facts_for(config, srgb, image.source.frames, parts_of(plan))
+            facts = self._facts.get(number)
+            if facts is None:
+                facts = facts_for(config, srgb, image.source.frames, parts_of(plan))
+                self._facts.keep(number, facts)
             plan = redraw_plan(config, plan, facts, settings.dark_frames, epoch)
             rule = patch_rule(config.source)
             patch = list_patches(rule, plan.stream_key, height, width, plan.output.layout, epoch)[patch.number]
