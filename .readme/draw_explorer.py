@@ -1,4 +1,4 @@
-"""Draw explorer.png for the documentation: python .readme/draw_explorer.py. Requires Chromium and its driver."""
+"""Draw explorer.jpg for the documentation: python .readme/draw_explorer.py. Requires Chromium and its driver."""
 
 from __future__ import annotations
 

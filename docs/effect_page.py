@@ -65,8 +65,8 @@ pictures show a part of a built-in scene, one pixel per site. `python docs/draw_
 - Left: the frame with the effect minus the frame without, and no other effect. Grey is no difference. The text states
   the DN that are drawn black and white, and the amplification compared with a frame drawn from black to white level.
 - Middle and right: all noise (noisy minus clean frame) that `effects.all=auto` simulates in the scene, and the same
-  without this effect, both drawn from -3 to 3 standard deviations. The other effects have no such pictures, because a
-  part of a single frame does not show them: they remain in means over frames, rows, columns or planes.
+  without this effect, both drawn from -3 to 3 standard deviations. The other effects have no such pictures: no scene
+  calls for them, or they show in means over frames, rows, columns or planes only.
 
 The table counts the profiles for which `auto` simulates an effect, of those that are calibrated at the ISO of the
 scene. [Effects by scene](scenes.md) has the ratios behind it."""
