@@ -2,12 +2,13 @@
 
 ``python train_denoiser.py`` uses the built-in scenes; ``--photos FOLDER`` uses the photographs of a folder. It needs
 PyTorch, and writes a dataset (``denoiser_scenes`` or ``denoiser_photos``) and the picture ``denoiser.jpg`` below
-``--out``. The last fifth of the photographs is not trained on; all figures come from it.
+``--out``. A fifth of the photographs is not trained on; all figures come from it.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,6 +26,7 @@ NOISE = "imx385_iso12800"
 CROP = 64
 """Side of a training crop, in sites of the mosaic; even."""
 BATCH = 16
+"""Crops of a batch, and crops of each image in an epoch."""
 WIDTH = 32
 """Channels of the hidden layers."""
 
@@ -45,24 +47,24 @@ def light_and_std(noisy: np.ndarray, row: Mapping[str, Any]) -> tuple[np.ndarray
     return ug.pack(ug.to_light(even, row), row["pattern"]), ug.pack(std, row["pattern"])
 
 
-class RandomCrops(Dataset):
-    """Serve one random crop of each pair: noisy planes, clean planes and noise map, float32 [4, side / 2, side / 2].
+class LiveCrops(Dataset):
+    """Serve crops with new noise in each epoch: noisy planes, clean planes and noise map, float32 [4, 32, 32].
 
-    Rows and columns of the crops are even, so that every crop begins with the same filter of the CFA pattern.
+    An item is (epoch, number), as `unprocess_gen.EpochSampler` yields them. Levels and noise of all pairs are those of
+    ``row``.
     """
 
-    def __init__(self, pairs: ug.RawPairs, side: int) -> None:
-        self.pairs = pairs
-        self.side = side
+    def __init__(self, data: Path, row: Mapping[str, Any]) -> None:
+        self.live = ug.LivePairs(data, split="train", cache="memory", patch=CROP, patches=BATCH, arrays_only=True)
+        self.row = row
 
     def __len__(self) -> int:
-        return len(self.pairs)
+        return len(self.live)
 
-    def __getitem__(self, index: int) -> tuple[torch.Tensor, ...]:
-        clean, noisy, row = self.pairs[index]
-        clean, noisy = ug.random_crop([clean, noisy], self.side, lambda count: int(torch.randint(count, ())))
-        light, std = light_and_std(noisy, row)
-        truth = ug.pack(ug.to_light(clean, row), row["pattern"])
+    def __getitem__(self, item: tuple[int, int]) -> tuple[torch.Tensor, ...]:
+        clean, noisy = self.live[item]
+        light, std = light_and_std(noisy, self.row)
+        truth = ug.pack(ug.to_light(clean, self.row), self.row["pattern"])
         return torch.from_numpy(light), torch.from_numpy(truth), torch.from_numpy(std)
 
 
@@ -81,15 +83,15 @@ class Denoiser(nn.Module):
         return noisy - std * self.layers(torch.cat([noisy, std], dim=1))
 
 
-def train(model: Denoiser, pairs: ug.RawPairs, steps: int, workers: int) -> None:
-    """Minimise the mean error in units of the noise, over random crops of ``pairs``."""
+def train(model: Denoiser, crops: LiveCrops, steps: int, workers: int) -> None:
+    """Minimise the mean error in units of the noise."""
     optimiser = torch.optim.Adam(model.parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    crops = RandomCrops(pairs, CROP)
-    drawn = torch.utils.data.RandomSampler(crops, replacement=True, num_samples=steps * BATCH)
-    loader = DataLoader(crops, batch_size=BATCH, sampler=drawn, num_workers=workers)
+    sampler = ug.EpochSampler(len(crops))
+    loader = DataLoader(crops, batch_size=BATCH, sampler=sampler, num_workers=workers, persistent_workers=workers > 0)
+    epochs = itertools.chain.from_iterable(itertools.repeat(loader))
     start, losses = time.process_time(), []
-    for step, (noisy, clean, std) in enumerate(loader, start=1):
+    for step, (noisy, clean, std) in enumerate(itertools.islice(epochs, steps), start=1):
         loss = ((model(noisy, std) - clean).abs() / std).mean()
         optimiser.zero_grad()
         loss.backward()
@@ -184,17 +186,15 @@ def main() -> None:
     )
     data = options.out / f"denoiser_{name}"
     try:
-        ug.generate(ug.load_config([source, f"noise={NOISE}", f"out={data}"]))
+        ug.generate(ug.load_config([source, f"noise={NOISE}", "split={train: 0.8, test: 0.2}", f"out={data}"]))
+        known, new = ug.RawPairs(data, split="train"), ug.RawPairs(data, split="test")
     except ug.UnprocessGenError as error:
         raise SystemExit(f"{parser.prog}: {error}") from error
-    pairs = ug.RawPairs(data)
-    held_out = max(len(pairs) // 5, 1)
-    known, new = pairs[:-held_out], pairs[-held_out:]
     model = Denoiser()
     size = sum(parameter.numel() for parameter in model.parameters())
     print(f"{len(known)} pairs to train on, {len(new)} held out; {size:,} parameters")
 
-    train(model, known, options.steps, options.workers)
+    train(model, LiveCrops(data, known[0].row), options.steps, options.workers)
 
     few = known[:: max(len(known) // 8, 1)]
     gaussians = {f"Gaussian, {std} sites": gaussian(std) for std in (0.4, 0.6, 0.8, 1.0, 1.3, 1.7)}
