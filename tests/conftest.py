@@ -45,7 +45,7 @@ from unprocess_gen.sources.scenes import synthetic
 
 _BUCKETS = itertools.count()
 
-KEY = re.compile(rf"(({'|'.join(GROUPS)})\.\w+|{'|'.join(settings_of(Config))})=")
+KEY = re.compile(rf"(({'|'.join(GROUPS)})(\.\w+)+|{'|'.join(settings_of(Config))})=")
 """Begin of an override that sets the value of a key."""
 
 pytest_plugins = ["helpers.linux_only", "helpers.promise_report"]
