@@ -185,6 +185,7 @@ def test_help_of_a_word_describes_the_verb_or_group(run_main: RunMain) -> None:
     assert run_main("--help", "-q").out == HELP
     for setting in ("noise.iso", "noise=sony_a7s2"):
         assert run_main("--help", setting) == run_main("--help", "noise")
+    assert run_main("--help", "split=null").out.startswith("  split=null")
 
 
 def test_help_and_errors_name_the_same_exit_codes() -> None:

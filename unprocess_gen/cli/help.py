@@ -55,7 +55,7 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
     lines = [f"  gen-dataset {verb.name:<11} {verb.summary}" for verb in verbs.values()]
     described = json.loads((conf / KEYS_FILE).read_text(encoding="utf-8"))
     groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(described["groups"], conf)]
-    keys = [_hanging(f"  {key:<{INDENT + 6}}", text) for key, text in described["top"].items()]
+    keys = key_help("", conf)
     blocks = [INTRODUCTION + "\n".join(lines), SETTINGS_HELP + "\n".join(groups), "\nKeys at the top level:", *keys]
     shown = [*(flag for flag in HYDRA_FLAGS if flag.key in SHOWN_HYDRA_FLAGS), *STANDARD]
     flags = [
@@ -66,6 +66,13 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
     ]
     blocks += ["\nFlags:", *(_two_columns(*flag) for flag in flags)]
     return "\n".join(blocks) + "\n" + ENDING + exit_code_lines()
+
+
+def key_help(name: str, conf: Path) -> list[str]:
+    """Return the help of the key at the top level with this name, or of all without a name."""
+    keys = json.loads((conf / KEYS_FILE).read_text(encoding="utf-8"))["top"]
+    named = {key: text for key, text in keys.items() if name in ("", key.partition("=")[0])}
+    return [_hanging(f"  {key:<{INDENT + 6}}", text) for key, text in named.items()]
 
 
 def group_lines(keys: Mapping[str, Sequence[str]], conf: Path) -> list[tuple[str, str]]:

@@ -21,7 +21,7 @@ from importlib import import_module
 from unprocess_gen import __version__
 from unprocess_gen.cli.arguments import Verb, flag_parser, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
-from unprocess_gen.cli.help import global_help, group_help, verb_help
+from unprocess_gen.cli.help import global_help, group_help, key_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
 from unprocess_gen.cli.signals import SIGNALS, TerminationSignal
 from unprocess_gen.cli.verbs import VERBS
@@ -72,7 +72,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:
-    """Return the help of the verb; without one, of the verb or group after ``--help``; else the program's help.
+    """Return the help of the verb; without one, of the verb, group or key after ``--help``; else the program's help.
 
     The group may be named by one of its settings, such as ``noise.iso``.
     """
@@ -85,6 +85,7 @@ def _help(verb: str, flags: Sequence[str]) -> str:
     name = re.split("[.=]", word)[0]
     parts = [verb_help(VERBS[name])] if name in VERBS else []
     parts += [group_help(name, conf_dir())] if name in GROUPS or name in ADDED_GROUPS else []
+    parts += key_help(name, conf_dir())
     if not parts:
         names = list(dict.fromkeys([*VERBS, *GROUPS, *ADDED_GROUPS]))
         raise ConfigError(
