@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import joblib
 import numpy as np
 import torch
-from common import Sensor, arguments, halves, interval, write
+from common import Level, Sensor, arguments, halves, interval, write
 from real_pairs import real_pairs
 from torch import nn
 
@@ -70,13 +71,17 @@ def noise_by_level(noisy: Any, clean: Any) -> Any:
     return std
 
 
-def srgb_patches(model: str, pictures: Sequence[Any], seed: int) -> Iterator[tuple[Any, Any]]:
-    """Yield noisy and clean patches of a model; white models have the strength of the two-number patch."""
-    physical = model == "physical"
-    camera = ug.CameraNoise(SCENE if physical else [*SCENE, *TWO], seed=seed)
+def camera_patches(settings: Sequence[str], pictures: Sequence[Any], seed: int) -> list[tuple[Any, Any]]:
+    """Return clean and noisy patches of `CameraNoise`."""
+    camera = ug.CameraNoise(settings, seed=seed)
+    return [camera(crop, index=number) for number, crop in crops(pictures, seed)]
+
+
+def srgb_patches(model: str, patches: Sequence[tuple[Any, Any]], seed: int) -> Iterator[tuple[Any, Any]]:
+    """Yield noisy and clean patches of a model; white models have the strength of the two-number ``patches``."""
     random = np.random.default_rng(100 + seed)
-    for number, crop in crops(pictures, seed):
-        clean, noisy = (picture.astype(np.float64) for picture in camera(crop, index=number))
+    for pair in patches:
+        clean, noisy = (picture.astype(np.float64) for picture in pair)
         if model in ("awgn", "signal_dependent"):
             std = np.std(noisy - clean) if model == "awgn" else noise_by_level(noisy, clean)
             noisy = np.clip(np.rint(clean + random.normal(0, 1, clean.shape) * std), 0, 255)
@@ -146,6 +151,43 @@ def by_scene(scenes: Sequence[str], values: Any) -> Any:
     return np.array([np.mean(values[[scene == other for other in scenes]], axis=0) for scene in sorted(set(scenes))])
 
 
+def by_seed(scores: Callable[..., dict[str, Any]], *given: Any) -> list[dict[str, Any]]:
+    """Return what a function gives for each seed, each in its own process with one thread."""
+    return list(joblib.Parallel(n_jobs=len(SEEDS))(joblib.delayed(scores)(seed, *given) for seed in SEEDS))
+
+
+def srgb_scores(seed: int, pairs: Sequence[tuple[str, Any, Any]], pictures: Sequence[Any]) -> dict[str, Any]:
+    """Train all models with a seed; return PSNR and SSIM of each pair."""
+    prepare()
+    two, scores = camera_patches([*SCENE, *TWO], pictures, seed), {}
+    for model in SRGB:
+        patches = camera_patches(SCENE, pictures, seed) if model == "physical" else two
+        net = trained(srgb_patches(model, patches, seed), 3, seed)
+        scores[model] = [quality(denoised(net, noisy), clean) for _, noisy, clean in pairs]
+        print(model, seed, np.mean(scores[model], axis=0), flush=True)
+    return scores
+
+
+def raw_scores(seed: int, judged: Sequence[Level], sensor: Sensor, pictures: Sequence[Any]) -> dict[str, Any]:
+    """Train all models of raw noise with a seed; return the error of each level."""
+    prepare()
+    scores = {}
+    for model in RAW:
+        net = trained(raw_patches(model, pictures, seed, sensor), 1, seed)
+        scores[model] = [
+            shares(lambda dn, net=net: denoised(net, to_input(dn, sensor)[..., None]), level, sensor)
+            for level in judged
+        ]
+        print(model, seed, np.median(scores[model]), flush=True)
+    return scores
+
+
+def prepare() -> None:
+    """Make PyTorch repeatable."""
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+
+
 def judge_srgb(folder: Path, pictures: Sequence[Any]) -> dict[str, Any]:
     """Train on all models, and compare them on real sRGB pairs."""
     pairs = [(pair.scene, pair.noisy / 255, pair.clean / 255) for pair in real_pairs(folder)]
@@ -153,14 +195,10 @@ def judge_srgb(folder: Path, pictures: Sequence[Any]) -> dict[str, Any]:
         raise SystemExit(f"{folder}: no pairs; expected files named as in PolyU, SIDD, SID or ELD")
     scenes = [scene for scene, _, _ in pairs]
     scores = {"noisy": np.array([quality(noisy, clean) for _, noisy, clean in pairs])}
+    seeds = by_seed(srgb_scores, pairs, pictures)
     for model in SRGB:
-        seeds = []
-        for seed in SEEDS:
-            net = trained(srgb_patches(model, pictures, seed), 3, seed)
-            seeds.append([quality(denoised(net, noisy), clean) for _, noisy, clean in pairs])
-            print(model, seed, np.mean(seeds[-1], axis=0), flush=True)
-        scores[model] = np.mean(seeds, axis=0)
-        scores[f"{model}_seeds"] = np.mean(seeds, axis=1)[:, 0]
+        scores[model] = np.mean([found[model] for found in seeds], axis=0)
+        scores[f"{model}_seeds"] = np.mean([found[model] for found in seeds], axis=1)[:, 0]
     means = {model: by_scene(scenes, scores[model]) for model in ("noisy", *SRGB)}
     differences = [("two_numbers", "awgn"), ("two_numbers", "signal_dependent"), ("physical", "two_numbers")]
     return {
@@ -185,19 +223,8 @@ def judge_raw(folder: Path, pictures: Sequence[Any]) -> dict[str, Any]:
     """Train on all models, and compare them on pairs of raw frames without clean ones."""
     calibrating, judged = halves(folder)
     sensor = Sensor(calibrating)
-    errors: dict[str, Any] = {}
-    for model in RAW:
-        seeds = []
-        for seed in SEEDS:
-            net = trained(raw_patches(model, pictures, seed, sensor), 1, seed)
-            seeds.append(
-                [
-                    shares(lambda dn, net=net: denoised(net, to_input(dn, sensor)[..., None]), level, sensor)
-                    for level in judged
-                ]
-            )
-            print(model, seed, np.median(seeds[-1]), flush=True)
-        errors[model] = np.mean(seeds, axis=0)
+    seeds = by_seed(raw_scores, judged, sensor, pictures)
+    errors = {model: np.mean([found[model] for found in seeds], axis=0) for model in RAW}
     return {
         "judged_levels": len(judged),
         "error_to_noise": {model: interval(errors[model]) for model in RAW},
@@ -223,8 +250,6 @@ def shares(denoise: Callable[[Any], Any], level: Any, sensor: Sensor) -> float:
 def main() -> None:
     """Run the experiment."""
     options = arguments(__doc__, "training", "folder of PolyU, SIDD, SID or ELD")
-    torch.set_num_threads(2)
-    torch.use_deterministic_algorithms(True)
     pictures = photographs(options.photos)
     results: dict[str, Any] = {"photographs": len(pictures), "steps": STEPS, "seeds": len(SEEDS)}
     results["srgb"] = judge_srgb(options.data, pictures)
