@@ -51,30 +51,29 @@ def products_of(frame: Any, scale: float) -> list[Any]:
     return products
 
 
-def real_and_simulated(
-    sensor: Sensor, levels: list[Level], model: str, first: int, folder: str, scale: float
-) -> list[tuple[Any, Any]]:
-    """Return products of the tiles of each real frame, and of a frame that was simulated for it."""
-    pairs = []
-    for level in levels:
-        clean = smooth(level)
-        for frame in level.frames:
-            extra = (f"noise.dark_frames={folder}", "effects.all=auto") if model == "dark_frames" else ()
-            name = "physical" if model == "dark_frames" else model
-            made = sensor.simulate(name, clean, first + len(pairs), *extra)
-            pairs.append((products_of(frame, scale), products_of(made, scale)))
-    return pairs
+def simulated(sensor: Sensor, levels: list[Level], model: str, first: int, folder: str, scale: float) -> list[Any]:
+    """Return the products of a frame that is simulated for each frame of the levels."""
+    extra = (f"noise.dark_frames={folder}", "effects.all=auto") if model == "dark_frames" else ()
+    name = "physical" if model == "dark_frames" else model
+    cleans = [clean for level in levels for clean in [smooth(level)] * len(level.frames)]
+    frames = (sensor.simulate(name, clean, first + number, *extra) for number, clean in enumerate(cleans))
+    return [products_of(frame, scale) for frame in frames]
+
+
+def recorded(levels: list[Level], scale: float) -> list[Any]:
+    """Return the products of each frame of the levels."""
+    return [products_of(frame, scale) for level in levels for frame in level.frames]
 
 
 def trained(pairs: list[tuple[Any, Any]], seed: int) -> Classifier:
     """Train a classifier on pairs of real and simulated tiles."""
     torch.manual_seed(seed)
-    real, simulated = ([torch.cat(sizes) for sizes in zip(*side, strict=True)] for side in zip(*pairs, strict=True))
+    real, made = ([torch.cat(sizes) for sizes in zip(*side, strict=True)] for side in zip(*pairs, strict=True))
     classifier, labels = Classifier(), torch.cat((torch.ones(BATCH), torch.zeros(BATCH)))
     optimiser = torch.optim.Adam(classifier.parameters(), 0.003)
     for _ in range(STEPS):
-        places = [torch.randint(len(side[0]), (BATCH,)) for side in (real, simulated)]
-        chosen = [torch.cat((a[places[0]], b[places[1]])) for a, b in zip(real, simulated, strict=True)]
+        places = [torch.randint(len(side[0]), (BATCH,)) for side in (real, made)]
+        chosen = [torch.cat((a[places[0]], b[places[1]])) for a, b in zip(real, made, strict=True)]
         loss = nn.functional.binary_cross_entropy_with_logits(classifier(chosen), labels)
         optimiser.zero_grad()
         loss.backward()
@@ -103,7 +102,7 @@ def dark_folder(sensor: Sensor, levels: list[Level]) -> str:
 def main() -> None:
     """Run the experiment."""
     options = arguments(__doc__, "classifier", "captures of a sensor: EMVA data, captures.csv, or raw darks and flats")
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     calibrating, judged = halves(options.data)
     sensor = Sensor(calibrating)
@@ -112,10 +111,10 @@ def main() -> None:
         train, test = ([level for level in half if level.kind == kind] for half in (calibrating, judged))
         folder = dark_folder(sensor, train) if kind == "dark" else ""
         scale = float(np.sqrt(np.mean([np.subtract(*map(float_of, level.frames[:2])).var() / 2 for level in train])))
-        results[kind] = {}
+        results[kind], real = {}, [recorded(levels, scale) for levels in (train, test)]
         for model in models:
-            training = real_and_simulated(sensor, train, model, 10_000, folder, scale)
-            testing = real_and_simulated(sensor, test, model, 20_000, folder, scale)
+            made = [simulated(sensor, *half, folder, scale) for half in ((train, model, 10_000), (test, model, 20_000))]
+            training, testing = (list(zip(*half, strict=True)) for half in zip(real, made, strict=True))
             scores = [accuracies(trained(training, seed), testing) for seed in SEEDS]
             by_frame = np.mean(scores, axis=0)
             results[kind][model] = {
