@@ -128,7 +128,7 @@ def classifier(results: dict[str, Any]) -> str:
         best = min((one["accuracy"][0], model) for model, one in found.items())
         two = found["two_numbers"]["accuracy"][0]
         goals.append(
-            f"- On {kind}s, {NAMES[best[1]]} is recognised least: {number(100 * best[0])} %."
+            f"- On {kind}s, recognised least: {NAMES[best[1]]}, {number(100 * best[0])} %."
             f" Goal, at most 55 %: {met(best[0] <= 0.55)}."
             f" Two numbers exceed 55 %: {met(two > 0.55)}."
         )
