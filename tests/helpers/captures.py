@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Iterator, Sequence
@@ -13,6 +14,7 @@ import numpy as np
 
 import unprocess_gen as ug
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import read_option
 from unprocess_gen.dataset.dng import encode
 
 LEVELS = (0.01, 0.02, 0.04, 0.06, 0.09, 0.12, 0.16, 0.2, 0.25, 0.3)
@@ -92,6 +94,11 @@ def load(*overrides: str) -> Config:
     return ug.load_config(list(overrides))
 
 
+@functools.cache
+def load_profile(name: str) -> Any:
+    return read_option("noise", name)
+
+
 @dataclass(frozen=True)
 class Camera:
     """A simulated camera: a profile at an ISO, the side of its frames, and a seed, which is its body."""
@@ -100,21 +107,24 @@ class Camera:
     iso: float
     side: int = 512
     seed: int = 0
-    overrides: tuple[str, ...] = ()
 
     def pair(self, light: float, seconds: float, number: int) -> ug.RawPair:
         """Record a frame of even light, a fraction of white above black."""
-        config = load(
-            *("camera=identity", "gains=unity", "isp=linear", f"noise={self.profile}", f"scene.iso={self.iso}"),
-            *(f"scene.exposure_s={seconds}", "effects.all=on", "sensor.units=1", *self._levels(), *self.overrides),
-        )
+        config = self.config
+        scene = dataclasses.replace(config.scene, exposure_s=seconds)
         codes = np.full((self.side, self.side, 3), round(light * 65535), np.uint16)
-        return ug.make_pair(codes, config, seed=self.seed, key=f"{self.profile} {self.iso} {light} {seconds} {number}")
+        key = f"{self.profile} {self.iso} {light} {seconds} {number}"
+        return ug.make_pair(codes, dataclasses.replace(config, scene=scene), seed=self.seed, key=key)
 
-    def _levels(self) -> list[str]:
-        noise = load(f"noise={self.profile}", f"scene.iso={self.iso}").noise
-        names = ("bits", "black_level_dn", "white_level_dn")
-        return [f"sensor.{name}={getattr(noise, name)}" for name in names]
+    @property
+    def config(self) -> Config:
+        """Settings of the camera, on a sensor with the levels of the profile."""
+        noise = load_profile(self.profile)
+        levels = [f"sensor.{name}={getattr(noise, name)}" for name in ("bits", "black_level_dn", "white_level_dn")]
+        return load(
+            *("camera=identity", "gains=unity", "isp=linear", f"noise={self.profile}", f"scene.iso={self.iso}"),
+            *("effects.all=on", "sensor.units=1", *levels),
+        )
 
     @property
     def truth(self) -> dict[str, Any]:
