@@ -253,6 +253,7 @@ def main() -> None:
     pictures = photographs(options.photos)
     results: dict[str, Any] = {"photographs": len(pictures), "steps": STEPS, "seeds": len(SEEDS)}
     results["srgb"] = judge_srgb(options.data, pictures)
+    write(results, options.to)
     if options.raw:
         results["raw"] = judge_raw(options.raw, pictures)
     write(results, options.to)
