@@ -46,7 +46,8 @@ def compared(profile: str, seed: int) -> list[Compared]:
     """Record captures of a profile at its ISOs, calibrate, and compare with what was simulated."""
     folder = Path(tempfile.mkdtemp()) / "captures"
     cameras = {iso: Camera(profile, iso, seed=seed) for iso in ISOS[profile]}
-    found = calibrate(record(folder, *cameras.values(), long_s=(1.0, 4.0, 16.0), bright=BRIGHT.get(profile, 0)))
+    # with three flats of each level, the tolerance of the gain is four standard errors
+    found = calibrate(record(folder, *cameras.values(), flats=3, long_s=(1.0, 4.0, 16.0), bright=BRIGHT.get(profile, 0)))
     shutil.rmtree(folder.parent)
     truths, sites = {iso: camera.truth for iso, camera in cameras.items()}, site_names(found.sensor)
     result = []
@@ -80,7 +81,6 @@ def test_intervals_contain_true_values() -> None:
     every = [one for one in every if one.estimate.name != "read_shape" or one.read_dn >= LEAST_STD_DN]
     for name in names:
         own = [one for one in every if one.estimate.name == name]
-        print(name, len(own), sum(one.estimate.number.low <= one.true <= one.estimate.number.high for one in own))
-    inside = sum(one.estimate.number.low <= one.true <= one.estimate.number.high for one in every)
-    assert len(every) >= 200
-    assert 0.92 <= inside / len(every) <= 0.98
+        inside = sum(one.estimate.number.low <= one.true <= one.estimate.number.high for one in own)
+        print(name, len(own), inside)
+        assert 0.92 <= inside / len(own) <= (0.98 if len(own) >= 200 else 1), name

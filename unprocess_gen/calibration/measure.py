@@ -101,7 +101,7 @@ class Flat:
 
 @dataclass(frozen=True, slots=True)
 class IsoResult:
-    """Measured noise of one ISO; lists are by plane of `TILE`."""
+    """Measured noise of one ISO; lists are by plane of `TILE`, and `black` ends with that of all planes."""
 
     iso: float
     gain: Gain
@@ -345,12 +345,6 @@ def _dark_estimates(dark: Dark, sensor: Sensor, shapes: Sequence[ReadShape]) -> 
     ]
     read = root_estimate(float(np.mean(variances)), float(np.linalg.norm(measured.error)) / 4)
     row, correlation = root_estimate(*measured.row), measured.row_correlation
-    drift = measured.frame_means.var(axis=0, ddof=1) / measured.count
-    per_line = max(measured.fixed_column[0], 0.0) / measured.shape[1] + max(measured.fixed.mean(), 0.0) / measured.sites
-    own = (measured.variance / measured.sites + max(measured.row[0], 0.0) / measured.shape[0]) / measured.count
-    ripple = math.exp(-2 * math.pi**2 * float(np.mean(variances))) / math.pi
-    drifts = drift > own * (1 + 4 * math.sqrt(2 / (measured.count - 1)))  # the black level changes between frames
-    errors = np.sqrt(np.where(drifts, drift, own) + per_line + ripple**2)
     return {
         "read": read,
         "reads": reads,
@@ -360,13 +354,30 @@ def _dark_estimates(dark: Dark, sensor: Sensor, shapes: Sequence[ReadShape]) -> 
         "column_temporal": root_estimate(*columns),
         "black": [
             estimate(float(mean) - sensor.black_dn, float(error))
-            for mean, error in zip(measured.mean_dn, errors, strict=True)
+            for mean, error in zip(_with_mean(measured.mean_dn), _black_errors(measured, variances), strict=True)
         ],
         "dsnu_dn": root_estimate(
             float((measured.fixed - max(measured.fixed_column[0], 0.0)).mean()),
             float(np.linalg.norm(measured.fixed_error)) / 4,
         ),
     }
+
+
+def _with_mean(planes: Float) -> Float:
+    """Numbers of the planes, and their mean."""
+    return np.append(planes, planes.mean(axis=-1, keepdims=True), axis=-1)
+
+
+def _black_errors(measured: Measured, variances: Sequence[float]) -> Float:
+    """Standard errors of the black of each plane, and of all; two planes share the offset of a line."""
+    height, width = np.outer(measured.shape, [1, 1, 1, 1, 2])
+    sites = np.array([1, 1, 1, 1, 4]) * measured.sites
+    drift = _with_mean(measured.frame_means).var(axis=0, ddof=1) / measured.count
+    per_line = max(measured.fixed_column[0], 0.0) / width + max(measured.fixed.mean(), 0.0) / sites
+    own = (_with_mean(measured.variance) / sites + max(measured.row[0], 0.0) / height) / measured.count
+    ripple = math.exp(-2 * math.pi**2 * float(np.mean(variances))) / math.pi
+    drifts = drift > own * (1 + 4 * math.sqrt(2 / (measured.count - 1)))  # the black level changes between frames
+    return np.asarray(np.sqrt(np.where(drifts, drift, own) + per_line + ripple**2))
 
 
 def usable(flats: Sequence[Flat]) -> list[Flat]:

@@ -91,8 +91,7 @@ def _iso_estimates(result: IsoResult, known: KnownGain | None, sites: Sequence[s
     yield NamedNumber("column_std_dn", iso, None, result.column, "DN")
     yield NamedNumber("column_temporal_std_dn", iso, None, result.column_temporal, "DN")
     yield NamedNumber("dsnu_std_dn", iso, None, result.dsnu_dn, "DN")
-    black = Estimate(*(sum(getattr(number, end) for number in result.black) / 4 for end in ("value", "low", "high")))
-    yield NamedNumber("black_error_dn", iso, None, black, "DN")
+    yield NamedNumber("black_error_dn", iso, None, result.black[-1], "DN")
     for site, gain in zip(sites, result.gain.planes, strict=False):
         yield NamedNumber("dn_per_e", iso, site, gain, "DN/e")
     for site, read, plane_shape, error in zip(sites, result.reads, result.shapes, result.black, strict=False):
@@ -232,9 +231,9 @@ def _branch(results: Sequence[IsoResult], sensor: Sensor, two_parameter: bool) -
 
 
 def _by_colour(values: Sequence[float], sensor: Sensor) -> list[float]:
-    """Return the values of planes as R, G1, B, G2; their mean for a monochrome sensor."""
+    """Return the values of planes as R, G1, B, G2; for a monochrome sensor the last one, of all planes."""
     names = site_names(sensor)
-    return [values[names.index(name)] for name in ("R", "Gr", "B", "Gb")] if names else [sum(values) / len(values)]
+    return [values[names.index(name)] for name in ("R", "Gr", "B", "Gb")] if names else [values[-1]]
 
 
 WITH_DEFAULTS = ("dark_doubling_c", "dead_pixel_level", "dsnu_std_e", "hot_pixel_e_per_s")
