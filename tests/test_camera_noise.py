@@ -7,6 +7,7 @@ import pickle
 import cv2
 import numpy as np
 import pytest
+from helpers.cases import slow_except
 
 import unprocess_gen as ug
 from unprocess_gen.simulation.pair import make_pair
@@ -68,7 +69,7 @@ def test_codes_return_for_every_camera(camera: str, gains: str, isp: str) -> Non
             )
 
 
-@pytest.mark.parametrize("demosaic", ["edge_aware", "malvar", "menon"])
+@pytest.mark.parametrize("demosaic", ["edge_aware", *slow_except((), ("malvar", "menon"))])
 @pytest.mark.filterwarnings("ignore")
 def test_every_demosaicking_restores_flat_colours(demosaic: str) -> None:
     if demosaic != "edge_aware":

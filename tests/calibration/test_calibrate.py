@@ -61,6 +61,7 @@ def test_simulated_camera_is_measured(calibrated: Any, tmp_path: Path) -> None:
     assert found["full_well_e", None, None]["value"] is None
 
 
+@pytest.mark.slow
 def test_profile_is_used_as_it_was_written(calibrated: Any, run_main: RunMain, tmp_path: Path) -> None:
     """Noise of data made with it and with the darks that are kept passes the check; so do the captures."""
     folder, page, kept, listed = (tmp_path / name for name in ("captures", "page.html", "kept", "list.csv"))

@@ -63,6 +63,7 @@ def numbers_at(profile: Path, *isos: float) -> list[tuple[float, float]]:
     return numbers
 
 
+@pytest.mark.slow
 def test_tags_of_own_files_give_back_their_numbers(run_main: RunMain, tmp_path: Path) -> None:
     folder, profile, expected = tmp_path / "dng", profile_of(tmp_path), {}
     folder.mkdir()

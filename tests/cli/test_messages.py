@@ -273,6 +273,7 @@ def test_error_that_replaces_a_signal_is_reported_as_the_signal(number: signal.S
     assert done.stderr.startswith(f"gen-dataset: {ENDS[number]}")
 
 
+@pytest.mark.slow
 def test_nohup_is_respected(tmp_path: Path) -> None:
     process = start(tmp_path, "source.limit=1", "n_jobs=1", "out=ds", prefix=("nohup",))
     wait_for((tmp_path / "ds/.work").exists)

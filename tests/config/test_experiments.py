@@ -228,6 +228,7 @@ def test_crvd_like_supports_every_iso_twice(make: Make, tmp_path: Path) -> None:
     assert [row["iso"] for *_, row in RawPairs(tmp_path / "ds")] == [iso for iso in CRVD for _ in range(2)]
 
 
+@pytest.mark.slow
 def test_eld_low_light_has_isos_and_factors_of_its_dataset(make: Make, tmp_path: Path) -> None:
     """Section 5 of the paper: ISO 800, 1600, 3200; factors 100 and 200. K of the release: Kmin 0.415039 at ISO 100."""
     fill(tmp_path / "photos", 6)

@@ -173,6 +173,7 @@ def test_unusable_address_is_refused(address: str, photographs: Path, run_main: 
     assert len(done.err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_scheduler_without_workers_ends_the_run(photographs: Path, run_main: RunMain, tmp_path: Path) -> None:
     with dask_cluster(tmp_path / "cluster", workers=0) as empty:
         started = time.monotonic()

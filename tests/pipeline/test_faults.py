@@ -176,6 +176,7 @@ def test_run_continues_when_a_worker_is_killed_at_random_moments(
     figure("resume", f"worker killed: same bytes in {kill + 1} of {kills} runs, {hits} hit while running")
 
 
+@pytest.mark.slow
 def test_orphaned_workers_do_not_disturb_the_next_run(
     photographs: Path,
     undisturbed: str,

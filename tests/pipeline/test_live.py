@@ -123,7 +123,7 @@ def test_an_epoch_has_words_of_its_own() -> None:
             frame_word(frame, epoch)
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_items_depend_on_no_process_and_no_order(method: str, night: Path, tmp_path: Path) -> None:
     live = ug.LivePairs(night, redraw="all", cache=tmp_path / "cache", patch=32)
     items = [(epoch, number) for epoch in (3, 0, 2) for number in range(len(live))]

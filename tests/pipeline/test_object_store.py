@@ -104,6 +104,7 @@ def test_url_gets_the_bytes_of_a_folder(
     assert ug.verify(str(out)) == []
 
 
+@pytest.mark.slow
 def test_bucket_to_bucket_records_both_urls(
     twelve: Path, bucket: ObjectPath, undisturbed: Path, run_main: RunMain, tmp_path: Path
 ) -> None:
@@ -117,7 +118,8 @@ def test_bucket_to_bucket_records_both_urls(
     assert done.code == 2 and "is the dataset itself" in done.err
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [20])
 def test_killed_run_ends_as_if_undisturbed(
     kills: int, twelve: Path, bucket: ObjectPath, undisturbed: Path, scratch: Path, proxy: Proxy, tmp_path: Path
 ) -> None:
@@ -161,6 +163,7 @@ def test_committed_shards_are_not_made_twice(
     assert_same(bucket / "ds", undisturbed)
 
 
+@pytest.mark.slow
 def test_failing_answers_during_a_run_are_repeated(
     twelve: Path, bucket: ObjectPath, undisturbed: Path, proxy: Proxy
 ) -> None:
@@ -192,6 +195,7 @@ def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, un
     assert_same(bucket / "ds", undisturbed)
 
 
+@pytest.mark.slow
 def test_run_with_other_settings_loses_the_race(
     twelve: Path, bucket: ObjectPath, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

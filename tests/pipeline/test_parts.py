@@ -382,6 +382,7 @@ def test_photographs_may_be_elsewhere_on_another_host(
 
 
 @pytest.mark.linux_only("kills a process by a signal")
+@pytest.mark.slow
 def test_photograph_that_kills_its_part_gets_provisional_rows(
     photographs: Path, run_main: RunMain, cli: Cli, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
@@ -410,6 +411,7 @@ def test_photograph_that_kills_its_part_gets_provisional_rows(
 # A lock that does not work --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_coordinators_without_a_lock_make_one_dataset(
     photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
 ) -> None:

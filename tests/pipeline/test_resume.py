@@ -63,7 +63,7 @@ def undisturbed(forty: Path, made_hash: MadeHash) -> str:
 # Killed ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [1, pytest.param(10, marks=pytest.mark.slow)])
 def test_run_killed_repeatedly_ends_as_if_undisturbed(
     kills: int,
     forty: Path,
@@ -498,6 +498,7 @@ def twelve_undisturbed(make: Make, tree_hash: TreeHash, tmp_path_factory: pytest
     return tree_hash(folder / "ds")
 
 
+@pytest.mark.slow
 def test_source_that_kills_two_workers_is_retried_by_reruns(
     twelve_undisturbed: str, cli: Cli, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:

@@ -147,6 +147,7 @@ def test_unclipped_noise_has_mean_zero_in_black() -> None:
     assert abs(clipped.mean(dtype=np.float64) - std / np.sqrt(2 * np.pi)) < 5 * 0.6 * std / 512
 
 
+@pytest.mark.slow
 def test_numpys_instruction_sets_change_no_byte() -> None:
     """A new process simulates the golden float32 pairs, whose parameters NumPy computes."""
     code = (

@@ -81,7 +81,7 @@ MAX_SITES = 9000
 READ_SHAPES = (0.0, -0.1, 0.1571, -0.45, 5.0)
 """Shapes of Tukey's distribution; few, because each table takes 0.2 s."""
 
-QUICK, SLOW = 20, 500
+QUICK, SLOW = 8, 500
 """Cases of each kind and dtype."""
 
 

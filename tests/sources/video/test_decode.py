@@ -117,6 +117,7 @@ for path in sorted(Path(sys.argv[1]).iterdir()):
 """
 
 
+@pytest.mark.slow
 def test_processors_with_and_without_simd_give_the_same_frames(tmp_path: Path) -> None:
     """And FFmpeg's own conversion does not: so the switch was thrown, and that is why it is not used."""
     libraries = Path(av.__path__[0]).parent / "av.libs"
