@@ -24,7 +24,8 @@ from torch import nn
 import unprocess_gen as ug
 
 WIDTH, SIDE, BATCH, STEPS, RATE, SEEDS = 24, 48, 8, 400, 0.002, (0, 1, 2)
-SCENE = ["noise=canon_5d4", "scene=low_light", "scene.iso=[log_uniform, 800, 6400]"]
+NOISE = ["noise=canon_5d4", "scene.iso=[log_uniform, 800, 6400]"]
+SCENES = {"srgb": "low_light", "srgb_daylight": "daylight"}
 SRGB = ("awgn", "signal_dependent", "two_numbers", "physical")
 RAW = ("awgn", "two_numbers", "physical")
 TWO = ["effects.all=off", "effects.shot=on", "effects.read=on"]
@@ -156,12 +157,14 @@ def by_seed(scores: Callable[..., dict[str, Any]], *given: Any) -> list[dict[str
     return list(joblib.Parallel(n_jobs=len(SEEDS))(joblib.delayed(scores)(seed, *given) for seed in SEEDS))
 
 
-def srgb_scores(seed: int, pairs: Sequence[tuple[str, Any, Any]], pictures: Sequence[Any]) -> dict[str, Any]:
+def srgb_scores(
+    seed: int, pairs: Sequence[tuple[str, Any, Any]], pictures: Sequence[Any], settings: Sequence[str]
+) -> dict[str, Any]:
     """Train all models with a seed; return PSNR and SSIM of each pair."""
     prepare()
-    two, scores = camera_patches([*SCENE, *TWO], pictures, seed), {}
+    two, scores = camera_patches([*settings, *TWO], pictures, seed), {}
     for model in SRGB:
-        patches = camera_patches(SCENE, pictures, seed) if model == "physical" else two
+        patches = camera_patches(settings, pictures, seed) if model == "physical" else two
         net = trained(srgb_patches(model, patches, seed), 3, seed)
         scores[model] = [quality(denoised(net, noisy), clean) for _, noisy, clean in pairs]
         print(model, seed, np.mean(scores[model], axis=0), flush=True)
@@ -188,14 +191,21 @@ def prepare() -> None:
     torch.use_deterministic_algorithms(True)
 
 
-def judge_srgb(folder: Path, pictures: Sequence[Any]) -> dict[str, Any]:
+def noise_codes(pairs: Iterator[tuple[Any, Any]]) -> float:
+    """Return the median over pictures of the standard deviation of their noise, codes of 8 bits."""
+    return float(np.median([np.std(noisy - clean) for noisy, clean in pairs]) * 255)
+
+
+def judge_srgb(folder: Path, pictures: Sequence[Any], scene: str) -> dict[str, Any]:
     """Train on all models, and compare them on real sRGB pairs."""
+    settings = [*NOISE, f"scene={scene}"]
     pairs = [(pair.scene, pair.noisy / 255, pair.clean / 255) for pair in real_pairs(folder)]
     if not pairs:
         raise SystemExit(f"{folder}: no pairs; expected files named as in PolyU, SIDD, SID or ELD")
     scenes = [scene for scene, _, _ in pairs]
     scores = {"noisy": np.array([quality(noisy, clean) for _, noisy, clean in pairs])}
-    seeds = by_seed(srgb_scores, pairs, pictures)
+    seeds = by_seed(srgb_scores, pairs, pictures, settings)
+    trained_on = srgb_patches("two_numbers", camera_patches([*settings, *TWO], pictures, 0), 0)
     for model in SRGB:
         scores[model] = np.mean([found[model] for found in seeds], axis=0)
         scores[f"{model}_seeds"] = np.mean([found[model] for found in seeds], axis=1)[:, 0]
@@ -203,6 +213,7 @@ def judge_srgb(folder: Path, pictures: Sequence[Any]) -> dict[str, Any]:
     differences = [("two_numbers", "awgn"), ("two_numbers", "signal_dependent"), ("physical", "two_numbers")]
     return {
         "pairs": len(pairs),
+        "noise_codes": {"trained": noise_codes(trained_on), "judged": noise_codes(pair[1:] for pair in pairs)},
         "scenes": len(means["noisy"]),
         "parameters": sum(p.numel() for p in network(3).parameters()),
         "psnr_db": {model: interval(means[model][:, 0], np.mean) for model in means},
@@ -252,8 +263,9 @@ def main() -> None:
     options = arguments(__doc__, "training", "folder of PolyU, SIDD, SID or ELD")
     pictures = photographs(options.photos)
     results: dict[str, Any] = {"photographs": len(pictures), "steps": STEPS, "seeds": len(SEEDS)}
-    results["srgb"] = judge_srgb(options.data, pictures)
-    write(results, options.to)
+    for name, scene in SCENES.items():
+        results[name] = judge_srgb(options.data, pictures, scene)
+        write(results, options.to)
     if options.raw:
         results["raw"] = judge_raw(options.raw, pictures)
     write(results, options.to)
