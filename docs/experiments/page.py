@@ -185,9 +185,8 @@ judged patch at each level. Medians over patches with 95 % intervals; the real c
 """
 
 
-def training(results: dict[str, Any]) -> str:
-    """Return the page of experiment 4."""
-    srgb = results["srgb"]
+def trained_on_pictures(srgb: dict[str, Any]) -> str:
+    """Return the tables of models trained on pictures of one scene."""
     cells = [
         [NAMES[model], with_interval(srgb["psnr_db"][model]), with_interval(srgb["ssim"][model])]
         for model in srgb["psnr_db"]
@@ -200,11 +199,9 @@ def training(results: dict[str, Any]) -> str:
         ]
         for pair, values in srgb["psnr_difference_db"].items()
     ]
-    page = f"""# Does it train better
-
-One network of {srgb["parameters"]} parameters was trained on {results["photographs"]} photographs with each kind of
-noise, in {results["steps"]} steps, with {results["seeds"]} seeds. It was judged on {srgb["pairs"]}
-real sRGB pairs of {srgb["scenes"]} scenes; 95 % intervals over scenes.
+    noise = srgb["noise_codes"]
+    return f"""The median noise of the training patches has a standard deviation of {noise["trained"]:.1f} codes,
+that of the real pictures {noise["judged"]:.1f}.
 
 {table(["training noise", "PSNR, dB", "SSIM"], cells)}
 
@@ -212,6 +209,25 @@ Paired differences; an interval that contains 0 shows no difference:
 
 {table(["difference", "PSNR, dB", "SSIM"], differences)}
 """
+
+
+def training(results: dict[str, Any]) -> str:
+    """Return the page of experiment 4."""
+    srgb = results["srgb"]
+    page = f"""# Does it train better
+
+One network of {srgb["parameters"]} parameters was trained on {results["photographs"]} photographs with each kind of
+noise, in {results["steps"]} steps, with {results["seeds"]} seeds. It was judged on {srgb["pairs"]}
+real sRGB pairs of {srgb["scenes"]} scenes; 95 % intervals over scenes.
+
+## On pictures, with the noise of low light
+
+{trained_on_pictures(srgb)}
+## On pictures, with the noise of daylight
+
+This part was added after the first result, because the noise of low light is stronger than that of the real pictures.
+
+{trained_on_pictures(results["srgb_daylight"])}"""
     if "raw" not in results:
         return page
     raw = results["raw"]
