@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import itertools
+import logging
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ from helpers.photographs import fill
 from helpers.processes import WAIT_S, wait_for
 
 from unprocess_gen.cli import runs
+from unprocess_gen.cli.messages import _StderrHandler
+from unprocess_gen.sources.image.codec_messages import captured
 
 COMMANDS = {
     "help": ["--help"],
@@ -280,3 +284,18 @@ def test_nohup_is_respected(tmp_path: Path) -> None:
     process.send_signal(signal.SIGHUP)
     process.communicate(timeout=WAIT_S)
     assert process.returncode == 0
+
+
+def test_line_of_another_thread_is_no_message_of_a_codec(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = logging.LogRecord("unprocess_gen", logging.INFO, "", 0, "1/3 images", None, None)
+    thread = threading.Thread(target=_StderrHandler().emit, args=(line,))
+    with open(2, "w", closefd=False) as stderr:
+        monkeypatch.setattr("sys.stderr", stderr)
+        with captured() as taken:
+            thread.start()
+            thread.join(0.2)
+        thread.join()
+        monkeypatch.undo()
+    assert (bytes(taken), capfd.readouterr().err) == (b"", "gen-dataset: 1/3 images\n")

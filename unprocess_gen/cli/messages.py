@@ -17,6 +17,7 @@ from typing import Any, TextIO
 
 from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
 from unprocess_gen.core.output_paths import check_log_file
+from unprocess_gen.sources.image.codec_messages import REDIRECTED
 
 LOGGER = logging.getLogger("unprocess_gen")
 RESULTS = logging.getLogger("unprocess_gen.results")
@@ -100,7 +101,8 @@ class _StderrHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print one message; results are on stdout already."""
         if record.name != RESULTS.name:
-            print(f"gen-dataset: {record.getMessage()}", file=sys.stderr, flush=True)
+            with REDIRECTED:
+                print(f"gen-dataset: {record.getMessage()}", file=sys.stderr, flush=True)
 
 
 class _FileHandler(logging.FileHandler):

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from tqdm import tqdm
 
+from unprocess_gen.sources.image.codec_messages import REDIRECTED
+
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.tasks import RunContext
 
@@ -142,7 +144,7 @@ class _Unfailing:
 
     def write(self, text: str) -> None:
         """Write text if stderr still accepts it."""
-        with suppress(OSError, ValueError):
+        with REDIRECTED, suppress(OSError, ValueError):
             sys.stderr.write(text)
 
     def flush(self) -> None:
