@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES
+from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 from unprocess_gen.sources.mosaics import even_sides, read_mosaic
 from unprocess_gen.sources.raw.metadata import read_metadata
 
@@ -31,7 +32,6 @@ OPTIONAL = ("exposure_s", "level", "temperature_c", "black_level_dn", "white_lev
 KIND_NAMES = {"dark": ("dark", "bias"), "flat": ("flat",)}
 """Kinds of frames, and the words by which names state them."""
 EMVA_ISO = 100.0
-MOSAIC_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
 LEAST_SIDE = 32
 SAME_EXPOSURE = 0.05
 """Relative difference of ISO and exposure from metadata, which cameras round."""
@@ -182,8 +182,8 @@ def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
     kind, pattern = row["kind"].strip().lower(), row.get("pattern", "").strip().upper()
     if kind not in KIND_NAMES:
         raise ConfigError(f"{place}: kind={row['kind']}: expected {' or '.join(KIND_NAMES)}")
-    if pattern and pattern not in MOSAIC_PATTERNS:
-        raise ConfigError(f"{place}: pattern={pattern}: expected one of {', '.join(MOSAIC_PATTERNS)}")
+    if pattern and pattern not in (*PATTERNS, MONO):
+        raise ConfigError(f"{place}: pattern={pattern}: expected one of {', '.join((*PATTERNS, MONO))}")
     given: dict[str, Any] = {
         name: _number(place, name, row[name]) for name in ("iso", *OPTIONAL) if name in row and _is_numeric(name)
     }

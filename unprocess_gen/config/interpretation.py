@@ -236,7 +236,7 @@ def canonical_patch(source: SourceConfig) -> list[Any] | None:
 
 # ---------------------------------------------------------------------------------------------- switches and choices
 
-NO_CLIP = "none"
+UNCLIPPED = "none"
 """Value of ``sensor.clip`` with which noisy frames are not clipped."""
 
 
@@ -248,7 +248,7 @@ def saturated_as(config: Config) -> str:
     """
     if config.sensor.saturated != "auto":
         return config.sensor.saturated
-    limited = config.noise.full_well_e is not None or config.sensor.clip != NO_CLIP
+    limited = config.noise.full_well_e is not None or config.sensor.clip != UNCLIPPED
     return "white" if is_physical(config.noise) and limited else "noisy"
 
 

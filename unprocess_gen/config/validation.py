@@ -18,8 +18,8 @@ from pathlib import Path
 from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.distributions import parse_drawn
 from unprocess_gen.config.interpretation import (
-    NO_CLIP,
     ONLY_WITH_DARK_FRAMES,
+    UNCLIPPED,
     effect_switch,
     entry_configs,
     gain_distributions,
@@ -377,6 +377,6 @@ def _check_output(config: Config) -> None:
     elif quantise == "off":
         problem = "integer output is always rounded and clipped; set output.dtype=float32"
         raise refusal("effects.quantise", "off", problem)
-    elif config.sensor.clip == NO_CLIP:
+    elif config.sensor.clip == UNCLIPPED:
         problem = "output.dtype=uint16 holds no values beyond the sensor's range; set output.dtype=float32"
-        raise refusal("sensor.clip", NO_CLIP, problem)
+        raise refusal("sensor.clip", UNCLIPPED, problem)

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert, matrix, multiply
+from unprocess_gen.simulation.reference.light import XY
 
-XY = tuple[float, float]
-"""CIE 1931 chromaticity."""
 Neutral = tuple[float, float, float]
 """Camera values of a neutral surface."""
 
