@@ -531,7 +531,7 @@ def test_integers_that_no_float_holds_are_refused(number: int) -> None:
 def test_choices_match_their_implementations() -> None:
     words = {f"{group}.{name}": one.limit.words for group, name, one in all_settings() if isinstance(one.limit, Choice)}
     assert words["gains.highlight"] == tuple(unprocess.INVERSE_HIGHLIGHTS)
-    assert set(words["isp.tone"]) == set(unprocess.INVERSE_TONES) == set(tone_curves.TONES)
+    assert set(words["isp.tone"]) == set(unprocess.INVERSE_TONES) == set(tone_curves.EXACT_INVERSE_TONES)
     assert words["sensor.pattern"] == (*cfa.PATTERNS, cfa.MONO)
     assert words["source.icc"] == ICC_CHOICES
     assert (words["output.dtype"], words["output.layout"]) == ((UINT16, FLOAT32), (MOSAIC, PACKED))

@@ -293,7 +293,7 @@ def test_quantiles_of_drawn_uniforms_have_enough_digits(k: int) -> None:
 
 def rows_from(quantiles: np.ndarray) -> np.ndarray:
     """Return the rows of the table from the quantiles at the nodes [1024, 3], as `lookup_tables._normal_row` does."""
-    t = [node / lookup_tables.SEGMENTS for node in lookup_tables.NODES]
+    t = [node / lookup_tables.SEGMENTS for node in lookup_tables.CHEBYSHEV_NODES]
     z = quantiles.T
     slope01, slope12 = (z[1] - z[0]) / (t[1] - t[0]), (z[2] - z[1]) / (t[2] - t[1])
     c2 = (slope12 - slope01) / (t[2] - t[0])
@@ -306,7 +306,7 @@ def rows_from(quantiles: np.ndarray) -> np.ndarray:
 def at_nodes(inv_cdf) -> np.ndarray:
     return np.array(
         [
-            [-inv_cdf(math.ldexp(1 + segment / 32 + node / 32, octave - 33)) for node in lookup_tables.NODES]
+            [-inv_cdf(math.ldexp(1 + segment / 32 + node / 32, octave - 33)) for node in lookup_tables.CHEBYSHEV_NODES]
             for octave in range(32)
             for segment in range(32)
         ]

@@ -95,7 +95,7 @@ HYDRA_FLAGS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PlaceArgument:
     """The file or folder that a verb works on: its name in ``--help``, what it must be, what shells complete."""
 
     metavar: str
@@ -117,7 +117,7 @@ class Verb:
     summary: str
     run: str
     arguments: tuple[Argument, ...] = ()
-    place: Place | None = None
+    place: PlaceArgument | None = None
     composes: bool = False
     words: tuple[str, ...] = ()
     extra: Argument | None = None

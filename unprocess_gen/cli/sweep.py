@@ -29,7 +29,7 @@ NOT_IN_NAMES = (
 )
 """Settings that do not decide a dataset's bytes, and so are not in the names of folders."""
 
-LONGEST_NAME = 200
+LONGEST_FOLDER_NAME = 200
 """Longest name of a folder, bytes; file systems allow 255."""
 
 SHARES = ("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy_clipped_high", "saturated")
@@ -99,14 +99,14 @@ def _key(override: str) -> str:
 def job_folder(overrides: Sequence[str], swept: Container[str] = ()) -> str:
     """Return the name of a job's folder: its overrides, with slashes encoded.
 
-    A name longer than `LONGEST_NAME` begins with the overrides of swept keys, is cut, and ends with a digest.
+    A name longer than `LONGEST_FOLDER_NAME` begins with the overrides of swept keys, is cut, and ends with a digest.
     """
     name = _encoded(overrides) or "default"
-    if len(os.fsencode(name)) <= LONGEST_NAME:
+    if len(os.fsencode(name)) <= LONGEST_FOLDER_NAME:
         return name
     digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
     swept_first = sorted(overrides, key=lambda override: _key(override) not in swept)
-    return os.fsencode(_encoded(swept_first))[: LONGEST_NAME - 20].decode(errors="ignore") + "-" + digest
+    return os.fsencode(_encoded(swept_first))[: LONGEST_FOLDER_NAME - 20].decode(errors="ignore") + "-" + digest
 
 
 def _encoded(overrides: Sequence[str]) -> str:

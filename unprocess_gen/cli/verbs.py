@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import date
 
-from unprocess_gen.cli.arguments import SOURCE, Argument, Place, Verb
+from unprocess_gen.cli.arguments import SOURCE, Argument, PlaceArgument, Verb
 
 
 def _integer(name: str, text: str, low: int | None = None, metavar: str = "N", *, required: bool = False) -> Argument:
@@ -45,9 +45,9 @@ SETTINGS_SOURCE = Argument(
     ("--source",), "folder of the photographs, or one photograph: source.root=ROOT", "ROOT", completes="files"
 )
 PARTS = _integer("parts", "number of parts", 1, required=True)
-PREPARED = Place("OUT", "the folder of a prepared run")
+PREPARED = PlaceArgument("OUT", "the folder of a prepared run")
 PART = _integer("part", "number of the part, from 0", 0, "K")
-DATASET = Place("DIR", "the folder of a dataset")
+DATASET = PlaceArgument("DIR", "the folder of a dataset")
 KEYS = Argument(
     ("--keys",), "rows by source index, range or key, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
 )
@@ -132,7 +132,7 @@ _VERBS = (
                 "folders",
             ),
         ),
-        Place("DIR", "the folder of a dataset or of a sweep"),
+        PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
     ),
     Verb(
         "replay",
@@ -144,7 +144,7 @@ _VERBS = (
             KEYS,
             _to("write the arrays to FOLDER", "FOLDER"),
         ),
-        Place("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
+        PlaceArgument("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
     ),
     Verb(
         "report",
@@ -157,7 +157,7 @@ _VERBS = (
             Argument(("--published",), "with --card: date of publication", "DATE", _date, "a date, such as 2026-01-31"),
             *INPUTS,
         ),
-        Place("DIR", "the folder of a dataset or of a sweep"),
+        PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
     ),
     Verb(
         "explore",
@@ -177,7 +177,7 @@ _VERBS = (
             ),
             SETTINGS_SOURCE,
         ),
-        Place("PHOTO", "a photograph, a folder of photographs, or a dataset", "files", optional=True),
+        PlaceArgument("PHOTO", "a photograph, a folder of photographs, or a dataset", "files", optional=True),
         composes=True,
     ),
     Verb(
@@ -218,7 +218,7 @@ _VERBS = (
                 required=True,
             ),
         ),
-        Place("DIR", "the folder of a dataset or of a sweep"),
+        PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
         resumes=True,
     ),
     Verb(
@@ -294,7 +294,7 @@ _VERBS = (
                 "folders",
             ),
         ),
-        Place("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
+        PlaceArgument("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
     ),
     Verb(
         "camera",
@@ -311,7 +311,7 @@ _VERBS = (
                 "files",
             ),
         ),
-        Place("FILE", "the raw file: a DNG, or another one that LibRaw reads", "files"),
+        PlaceArgument("FILE", "the raw file: a DNG, or another one that LibRaw reads", "files"),
     ),
     Verb(
         "completion",

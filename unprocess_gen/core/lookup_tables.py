@@ -35,7 +35,7 @@ COEFFICIENT_GRID = (2.0**-36, 2.0**-28, 2.0**-20)
 The rounding costs less than 1e-9. Quantiles that are four units in the last place off give the same table.
 """
 
-NODES = (0.5 - math.sqrt(3) / 4, 0.5, 0.5 + math.sqrt(3) / 4)
+CHEBYSHEV_NODES = (0.5 - math.sqrt(3) / 4, 0.5, 0.5 + math.sqrt(3) / 4)
 """Chebyshev nodes of a segment: interpolation at them has nearly the smallest possible maximum error."""
 
 
@@ -113,7 +113,7 @@ def tukey_table(shape: float) -> Float:
         std = tukey_std(shape)
         for octave in range(OCTAVES):
             for segment in range(SEGMENTS):
-                nodes = (1 + (segment + Decimal(node)) / SEGMENTS for node in NODES)
+                nodes = (1 + (segment + Decimal(node)) / SEGMENTS for node in CHEBYSHEV_NODES)
                 tails = (node * Decimal(2) ** (octave - 33) for node in nodes)
                 rows.append(_interpolate([float(tukey_quantile(tail, shape) / std) for tail in tails]))
     return freeze(np.array(rows))
@@ -219,13 +219,13 @@ def exponential_levels() -> Float:
 def _normal_row(octave: int, segment: int) -> tuple[float, float, float]:
     """Return the unrounded coefficients of one row of the normal table."""
     quantile = NormalDist().inv_cdf
-    z = [-quantile(math.ldexp(1 + segment / SEGMENTS + node / SEGMENTS, octave - 33)) for node in NODES]
+    z = [-quantile(math.ldexp(1 + segment / SEGMENTS + node / SEGMENTS, octave - 33)) for node in CHEBYSHEV_NODES]
     return _interpolate(z)
 
 
 def _interpolate(z: Sequence[float]) -> tuple[float, float, float]:
-    """Return the quadratic in the position within a segment that has the values ``z`` at `NODES`."""
-    t = [node / SEGMENTS for node in NODES]
+    """Return the quadratic in the position within a segment that has the values ``z`` at `CHEBYSHEV_NODES`."""
+    t = [node / SEGMENTS for node in CHEBYSHEV_NODES]
     slope01, slope12 = (z[1] - z[0]) / (t[1] - t[0]), (z[2] - z[1]) / (t[2] - t[1])
     c2 = (slope12 - slope01) / (t[2] - t[0])
     c1 = slope01 - c2 * (t[0] + t[1])

@@ -56,7 +56,7 @@ MIN_PIECE, MAX_PIECE = 2**16, 2**23
 UPLOADS = 4
 """Pieces of `MAX_PIECE` bytes of one file that are uploaded at a time and are in memory."""
 
-PREFIX = "unprocess_gen-"
+TEMPORARY_PREFIX = "unprocess_gen-"
 """Beginning of the names of temporary folders, by which a later run on this host finds those that a kill left."""
 
 DELETED_AT_ONCE = 1000
@@ -313,7 +313,7 @@ class ObjectPath:
     @contextmanager
     def local_copy(self) -> Iterator[Path]:
         """Provide a temporary copy of the object on the local disk."""
-        with tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
+        with tempfile.TemporaryDirectory(prefix=TEMPORARY_PREFIX) as folder:
             file = Path(folder) / self.name
             with self.open(first_piece=MAX_PIECE) as source, file.open("wb") as copy:
                 shutil.copyfileobj(source, copy, MAX_PIECE)
@@ -372,7 +372,7 @@ class ObjectPath:
 
     def scratch_place(self, unfinished: str) -> tuple[Path, str]:
         """Local folder for unfinished files, ``TMPDIR``, and the first letters of the names of its folders."""
-        return Path(tempfile.gettempdir()), PREFIX
+        return Path(tempfile.gettempdir()), TEMPORARY_PREFIX
 
 
 def started_ahead(

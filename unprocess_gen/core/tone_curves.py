@@ -67,8 +67,8 @@ def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
     MachineError
         If a published curve has another SHA-256 or the package data is missing.
     """
-    if tone not in TONES:
-        raise ValueError(f"tone={tone}: unknown tone curve; expected one of {', '.join(TONES)}")
+    if tone not in EXACT_INVERSE_TONES:
+        raise ValueError(f"tone={tone}: unknown tone curve; expected one of {', '.join(EXACT_INVERSE_TONES)}")
     return _linear_table(tone, gamma_text(gamma), codes)
 
 
@@ -99,14 +99,14 @@ def srgb_expand(v: Decimal) -> Decimal:
     return Decimal(((v + Decimal("0.055")) / Decimal("1.055")) ** Decimal("2.4"))
 
 
-TONES: dict[str, Callable[[Decimal], Decimal]] = {"smoothstep": smoothstep_inverse, "none": lambda x: x}
+EXACT_INVERSE_TONES: dict[str, Callable[[Decimal], Decimal]] = {"smoothstep": smoothstep_inverse, "none": lambda x: x}
 
 
 def exact_curve(tone: str, gamma: str, code: int, codes: int) -> Decimal:
     """Return the linear light of one code to `DIGITS` digits; ``gamma`` is spelled as by `types.gamma_text`."""
     with localcontext() as context:
         context.prec = DIGITS
-        v = TONES[tone](Decimal(code) / (codes - 1))
+        v = EXACT_INVERSE_TONES[tone](Decimal(code) / (codes - 1))
         if gamma == "srgb":
             return srgb_expand(v)
         return v ** Decimal(gamma) if v else v

@@ -153,7 +153,7 @@ HEXADECIMAL = Spelling("{:016x}".format, lambda text: int(text, 16))
 LIST = Spelling(";".join, lambda text: tuple(text.split(";")) if text else ())
 FLAG = Spelling(int, bool)
 LEVEL_LIST = Spelling(lambda levels: ";".join(map(repr, levels)), lambda text: tuple(map(float, text.split(";"))))
-GAMMA = Spelling(
+GAMMA_SPELLING = Spelling(
     lambda gamma: number_or_text(gamma_text(gamma)), lambda value: value if value == "srgb" else float(value)
 )
 
@@ -165,7 +165,7 @@ COORDINATE = integers(0, 2**32 - 1)
 """Pixel coordinates and frame numbers are 32-bit counters of the random streams."""
 SIDE = integers(1, 2**32)
 MATRIX_ENTRY = Range(-1e10, 1e10)
-GAIN = Range(1e-4, 1e4)
+GAINS = Range(1e-4, 1e4)
 ANY_TEXT = Text(re.compile("[^\x00-\x1f\x7f\ud800-\udfff]*"), "text without control characters")
 KEY_TEXT = Text(re.compile(r"\d{8,12}(-p\d{4,12})?(-l\d\dd\d\d)?"), "eight digits, then -pNNNN and -lNNdNN if present")
 HEX_64 = Text(re.compile(r"([0-9a-f]{16})?|none"), "16 hexadecimal digits")
@@ -314,12 +314,12 @@ COLUMNS = (
                CameraPlan, "rgb2cam")
         for i in range(3) for j in range(3)
     ),
-    Column("red_gain", "forward white-balance gain of red", GAIN, CameraPlan),
-    Column("blue_gain", "forward white-balance gain of blue", GAIN, CameraPlan),
-    Column("inverse_rgb_gain", "inverse of the brightening gain; all channels are multiplied by it", GAIN, CameraPlan),
+    Column("red_gain", "forward white-balance gain of red", GAINS, CameraPlan),
+    Column("blue_gain", "forward white-balance gain of blue", GAINS, CameraPlan),
+    Column("inverse_rgb_gain", "inverse of the brightening gain; all channels are multiplied by it", GAINS, CameraPlan),
     Column("tone", "inverted tone curve: smoothstep or none", OneOf(("smoothstep", "none")), IspPlan),
     Column("gamma", "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",), number_or_text), IspPlan,
-           spelling=GAMMA),
+           spelling=GAMMA_SPELLING),
     Column("highlight", "preservation of highlights: per_channel, gray_mean or none",
            OneOf(("per_channel", "gray_mean", "none")), CameraPlan),
     Column("highlight_threshold", "linear signal above which highlights are preserved, 1 is white",

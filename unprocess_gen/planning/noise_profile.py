@@ -151,7 +151,7 @@ LINES = ("line", "scale_line")
 def _number_of_iso(kind: str, iso: float, *numbers: float) -> float:
     """Evaluate a form that depends on the ISO only."""
     with localcontext(prec=DIGITS):
-        return float(ISO_FORMS[kind](Decimal(iso), *map(Decimal, numbers)))
+        return float(ISO_FUNCTIONS[kind](Decimal(iso), *map(Decimal, numbers)))
 
 
 @functools.lru_cache(maxsize=256)
@@ -233,8 +233,8 @@ def _neighbours(iso: Decimal, pairs: Sequence[Decimal]) -> tuple[Decimal, Decima
     return (iso / low).ln() / (high / low).ln(), values[above - 1], values[above]
 
 
-ISO_FORMS: dict[str, Callable[..., Decimal]] = {"per_iso": _per_iso, "root": _root, "by_iso": _by_iso}
-FORMS = (*ISO_FORMS, *LINES)
+ISO_FUNCTIONS: dict[str, Callable[..., Decimal]] = {"per_iso": _per_iso, "root": _root, "by_iso": _by_iso}
+FORMS = (*ISO_FUNCTIONS, *LINES)
 """Functions that a branch may contain instead of a number, as ``[form, number, …]``."""
 
 

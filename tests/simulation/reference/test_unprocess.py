@@ -87,7 +87,7 @@ def test_the_tone_curve_preserves_black_white_and_the_centre(top: int) -> None:
 
 def test_no_tone_does_not_change_the_image() -> None:
     x = codes(255) / 255
-    assert unprocess.no_tone(x, 1 - x) is x
+    assert unprocess.inverse_no_tone(x, 1 - x) is x
 
 
 @pytest.mark.parametrize("gamma", [2.2, 1.8, 1.0, "srgb"])

@@ -40,8 +40,8 @@ from unprocess_gen.reports.explorer.opening import Choices
 from unprocess_gen.reports.html_pages import visible
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
-COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0072b2", "noisy": "#d55e00"}
-CURVES = {
+LINE_COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0072b2", "noisy": "#d55e00"}
+PLOTS = {
     "source_histogram": ("Histogram of the source", "code", "share of the pixels"),
     "raw_histogram": ("Histogram of the raw frames", "DN", "share of the sites"),
     "highlight": ("Highlight function (Figure 4)", "intensity i of grey light", "f(i)"),
@@ -89,10 +89,10 @@ class Page:
         for div in (self._message, self._facts, self._plan):
             div.update(sizing_mode="stretch_width", stylesheets=[TEXTS])
         self._pictures = {name: self._picture(name) for name in views.PICTURES}
-        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in CURVES}
-        self._curves = {name: self._curve(name) for name in CURVES}
+        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in PLOTS}
+        self._curves = {name: self._curve(name) for name in PLOTS}
         self._points = ColumnDataSource({"x": [], "y": []})
-        self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=COLOURS["clean"])
+        self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=LINE_COLOURS["clean"])
         self._command = TextInput(name="command", value="", sizing_mode="stretch_width", title="Command of this pair")
         self._stretch = Select(name="stretch", title="raw and developed", options=list(STRETCHES), value=STRETCHES[0])
         self._open = Select(name="open", title="photograph or row", options=list(choices), value=label)
@@ -127,7 +127,7 @@ class Page:
         return drawn
 
     def _curve(self, name: str) -> Any:
-        title, x, y = CURVES[name]
+        title, x, y = PLOTS[name]
         is_histogram = "histogram" in name
         size = {"width": 420, "height": 260, "sizing_mode": "stretch_width", "tools": "pan,wheel_zoom,box_zoom,reset"}
         scale = {"y_axis_type": "log", "y_range": (1e-6, 1)} if name == "raw_histogram" else {}
@@ -197,7 +197,7 @@ class Page:
             "transfer": {"expected": transfer.line},
         }
         for name, lines in curves.items():
-            colours = [COLOURS.get(label.partition(",")[0], COLOURS["noisy"]) for label in lines]
+            colours = [LINE_COLOURS.get(label.partition(",")[0], LINE_COLOURS["noisy"]) for label in lines]
             xs, ys = ([list(line[axis]) for line in lines.values()] for axis in (0, 1))
             if name == "raw_histogram":
                 ys = [[share or None for share in line] for line in ys]
@@ -380,7 +380,7 @@ def _text(text: str) -> str:
     return html.escape(str(visible(text)))
 
 
-SHARES = {
+SHOWN_SHARES = {
     "saturated in the clean frame": "saturated",
     "clean below black": "clean_clipped_low",
     "clean above white": "clean_clipped_high",
@@ -395,7 +395,7 @@ def _facts(shown: Shown, transfer: str) -> str:
     row, sites, camera = shown.row, shown.clean.size, shown.plan.camera
     facts = {
         "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
-        **{name: f"{int(row[column] or 0) / sites:.3%}" for name, column in SHARES.items()},
+        **{name: f"{int(row[column] or 0) / sites:.3%}" for name, column in SHOWN_SHARES.items()},
         "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
         "noise of the pair": transfer,
         "effects": ", ".join(shown.plan.noise.effects),
@@ -416,6 +416,6 @@ def _variables(live: bool) -> dict[str, Any]:
         "style": (TEMPLATES / "style.css").read_text(encoding="utf-8"),
         "sections": {section: names_of(section) for section in SECTIONS},
         "pictures": views.PICTURES,
-        "curves": CURVES,
+        "curves": PLOTS,
         "moves": [f"move_{number}" for number in range(len(MOVES))],
     }

@@ -28,7 +28,7 @@ FALSE_ALARM = 1e-6
 """Probability of any alarm for a dataset whose noise is as recorded."""
 SHARED_ROUNDING = 0.15
 """Fraction of the rounding error that pairs with other curves or gains share, because most histograms decrease."""
-CURVES = 4096
+CURVE_NUMBERS = 4096
 """Groups of pairs whose rounding errors are added separately."""
 PAIRS_LISTED = 20
 """Pairs with wrong noise that are listed."""
@@ -198,7 +198,7 @@ class Pool:
 def curve_group(plan: Plan) -> int:
     """Group of plans that map codes to the same clean values."""
     curve = plan.scene.exposure_ratio, plan.camera, plan.isp, plan.sensor
-    return zlib.crc32(repr(curve).encode()) % CURVES
+    return zlib.crc32(repr(curve).encode()) % CURVE_NUMBERS
 
 
 def overlaps(folder: AnyPath) -> Iterator[tuple[int, int]]:

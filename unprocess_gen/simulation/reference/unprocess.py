@@ -168,12 +168,12 @@ def inverse_smoothstep(x: Float, rest: Float) -> Float:
     return np.asarray(np.where(x > 0.5, 1 - y, y))
 
 
-def no_tone(x: Float, rest: Float) -> Float:
+def inverse_no_tone(x: Float, rest: Float) -> Float:
     """Return ``x``: no tone curve was applied."""
     return x
 
 
-INVERSE_TONES = {"smoothstep": inverse_smoothstep, "none": no_tone}
+INVERSE_TONES = {"smoothstep": inverse_smoothstep, "none": inverse_no_tone}
 
 
 def expand_gamma(v: Float, gamma: float | str) -> Float:

@@ -19,7 +19,7 @@ Neutral = tuple[float, float, float]
 
 D50: XY = (0.3457, 0.3585)
 """Chromaticity at which the search for the white point begins (dng_color_spec::NeutralToXY)."""
-STEPS, CLOSE = 30, 1e-7
+MOST_ITERATIONS, CLOSE = 30, 1e-7
 """Most steps of the search, and the distance at which it ends."""
 
 LIGHT_K = {
@@ -96,7 +96,7 @@ class DngColour:
         if self.white_xy is not None or self.neutral is None:
             return self.white_xy or D50
         last = before = D50
-        for _ in range(STEPS):
+        for _ in range(MOST_ITERATIONS):
             before, last = last, _xy(_apply(invert(self.matrix_at(last)), self.neutral))
             if abs(last[0] - before[0]) + abs(last[1] - before[1]) < CLOSE:
                 return last

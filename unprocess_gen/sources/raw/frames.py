@@ -30,7 +30,7 @@ from unprocess_gen.sources.raw.metadata import LOSSY, RawMetadata
 XTRANS = "XTRANS"
 """Value of the column ``raw_pattern`` for tiles of 6 x 6 sites."""
 XTRANS_CELL = 6
-LONGEST_NAME = 64
+LONGEST_CAMERA_NAME = 64
 """Characters of the name of a camera in a row."""
 LEAST_GAIN, MOST_GAIN = 1e-3, 1e3
 """Gains beyond which the white balance of a file is an error."""
@@ -200,7 +200,7 @@ def _camera(facts: RawMetadata) -> CameraPlan:
     name = "".join(letter for letter in facts.model or "" if letter.isascii() and letter.isprintable())
     rgb2cam = colour.IDENTITY if matrix is None else colour.rgb2cam(matrix)
     weights = (0.0, 0.0, 0.0, 0.0)
-    return CameraPlan(name[:LONGEST_NAME] or "unknown", weights, rgb2cam, red, blue, 1.0, "per_channel", 0.9)
+    return CameraPlan(name[:LONGEST_CAMERA_NAME] or "unknown", weights, rgb2cam, red, blue, 1.0, "per_channel", 0.9)
 
 
 def camera_colours(facts: RawMetadata) -> tuple[colour.Matrix | None, tuple[float, float] | None]:
