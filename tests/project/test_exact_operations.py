@@ -5,12 +5,10 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-PACKAGE = Path(__file__).parents[2] / "unprocess_gen"
+from helpers.modules import MODULES, PACKAGE, tree
 
 EXACT_FUNCTIONS = {
     *("abs", "add", "subtract", "multiply", "divide", "sqrt", "square", "rint", "floor", "ceil", "trunc"),
@@ -61,10 +59,10 @@ def nodes_deciding_bytes(node: ast.AST) -> Iterator[ast.AST]:
             yield from nodes_deciding_bytes(child)
 
 
-def inexact_operations(source: str) -> list[str]:
+def inexact_operations(module: ast.Module) -> list[str]:
     """Return the expressions of a module that machines may round differently."""
     found: list[ast.AST] = []
-    for node in nodes_deciding_bytes(ast.parse(source)):
+    for node in nodes_deciding_bytes(module):
         match node:
             case ast.BinOp(op=ast.MatMult()) | ast.Call(func=ast.Name(id="pow")):
                 found.append(node)
@@ -83,8 +81,8 @@ def inexact_operations(source: str) -> list[str]:
 
 def test_modules_call_no_function_that_machines_round_differently() -> None:
     found = {
-        str(path.relative_to(PACKAGE)): inexact_operations(path.read_text(encoding="utf-8"))
-        for path in sorted(PACKAGE.rglob("*.py"))
+        str(path.relative_to(PACKAGE)): inexact_operations(tree(path))
+        for path in MODULES
         if not any(path.is_relative_to(PACKAGE / outside) for outside in OUTSIDE_OUTPUT)
     }
     assert len(found) > 50
@@ -94,8 +92,8 @@ def test_modules_call_no_function_that_machines_round_differently() -> None:
 def test_only_reports_use_what_the_noise_check_expects() -> None:
     calls = {
         path.relative_to(PACKAGE).parts[0]
-        for path in PACKAGE.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for path in MODULES
+        for node in ast.walk(tree(path))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == NOISE_CHECK_METHOD
     }
     assert calls == {"reports"}
@@ -106,4 +104,4 @@ INEXACT = ("a @ b", "np.exp(a)", "np.einsum('ij,j', a, b)", "math.log(2)", "a **
 
 @pytest.mark.parametrize("line", [*INEXACT, "cv2.resize(a)"])
 def test_functions_that_round_differently_are_found(line: str) -> None:
-    assert inexact_operations(line)
+    assert inexact_operations(ast.parse(line))

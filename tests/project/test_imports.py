@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pytest
 from helpers.everywhere import KERNELS
-
-import unprocess_gen
-
-PACKAGE = Path(unprocess_gen.__file__).parent
+from helpers.modules import MODULES, PACKAGE, tree
 
 ONLY_IN = {
     "hydra": {
@@ -55,7 +52,7 @@ ONLY_IN = {
 def imported(path: Path) -> set[str]:
     """Return the top-level names that a module imports, inside functions too."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -66,11 +63,7 @@ def imported(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("library", ONLY_IN)
 def test_libraries_are_imported_in_listed_modules_only(library: str) -> None:
-    found = {
-        ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
-        for path in PACKAGE.rglob("*.py")
-        if library in imported(path)
-    }
+    found = {".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in MODULES if library in imported(path)}
 
     assert found == ONLY_IN[library]
 

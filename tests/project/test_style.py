@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from helpers.modules import MODULES, tree
+
 ROOT = Path(__file__).parents[2]
-PACKAGE = ROOT / "unprocess_gen"
 
 BANNED = {
     r"rooms?": "module, buffers, space",
@@ -48,7 +49,7 @@ WITH_SECTIONS = ("simulation.reference", "simulation.effects")
 
 
 def python_files() -> list[Path]:
-    return sorted([*PACKAGE.rglob("*.py"), *(ROOT / "tests").rglob("*.py")])
+    return [*MODULES, *sorted((ROOT / "tests").rglob("*.py"))]
 
 
 def prose(path: Path) -> Iterator[tuple[int, str]]:
@@ -81,7 +82,7 @@ def banned_words(path: Path) -> list[str]:
 
 
 def docstrings(path: Path) -> Iterator[tuple[int, str, str]]:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
             text = ast.get_docstring(node)
             if text:
@@ -107,16 +108,16 @@ def public_functions() -> tuple[str, ...]:
 
     functions = {
         f"{module_of(path)}.{node.name}"
-        for path in PACKAGE.rglob("*.py")
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        for path in MODULES
+        for node in tree(path).body
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
     }
     exported = {f"{getattr(getattr(unprocess_gen, name), '__module__', '')}.{name}" for name in unprocess_gen.__all__}
     packages = tuple(f"unprocess_gen.{package}" for package in WITH_SECTIONS)
     imported = set()
-    for path in PACKAGE.rglob("*.py"):
+    for path in MODULES:
         own = module_of(path).split(".")[1:2]
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree(path)):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[1:2] != own:
                 imported |= {f"{node.module}.{alias.name}" for alias in node.names}
     shared = {name for name in functions & imported if name.startswith(packages)}
@@ -145,7 +146,7 @@ def test_words_are_plain() -> None:
 
 
 def test_docstrings_begin_with_their_subject() -> None:
-    found = [violation for path in sorted(PACKAGE.rglob("*.py")) for violation in bad_first_lines(path)]
+    found = [violation for path in MODULES for violation in bad_first_lines(path)]
     assert not found, "\n".join(found)
 
 
