@@ -32,6 +32,7 @@ LAYERS = (
     ("pipeline", "calibration"),
     ("planning", "sources", "dataset"),
     ("config",),
+    ("statistics",),
     ("simulation",),
     ("core",),
 )

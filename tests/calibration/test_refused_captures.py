@@ -70,7 +70,7 @@ def banded(shot: Shot, pixels: np.ndarray) -> np.ndarray:
 
 def vignetted(shot: Shot, pixels: np.ndarray) -> np.ndarray:
     y, x = (np.linspace(-1, 1, length) for length in SHAPE)
-    return BLACK + (pixels - BLACK) * (1 - 0.45 * (y[:, None] ** 2 + x**2)) if shot.kind == "flat" else pixels
+    return BLACK + (pixels - BLACK) * (1 - 0.5 * (y[:, None] ** 2 + x**2)) if shot.kind == "flat" else pixels
 
 
 FAULTS: dict[str, tuple[Change, str]] = {

@@ -37,7 +37,6 @@ from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.noise_check import checks
 from unprocess_gen.reports.noise_check.checks import (
-    FALSE_ALARM,
     PAIRS_LISTED,
     TESTS,
     Alarm,
@@ -50,10 +49,11 @@ from unprocess_gen.reports.noise_check.checks import (
     threshold,
 )
 from unprocess_gen.reports.noise_check.expectation import PlaneNoise
-from unprocess_gen.reports.noise_check.scores import Score, Scores, scores_of
+from unprocess_gen.reports.noise_check.scores import Scores, scores_of
 from unprocess_gen.simulation.effects import BY_NAME, order
 from unprocess_gen.simulation.effects.expectation import RARE, Site, tukey_distribution
 from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.statistics.scores import FALSE_ALARM, Score
 
 FACTS = Facts(512, 512, 256, 0, 255)
 NIGHT_A7S2 = ("noise=sony_a7s2", "scene=night", "effects.row=on")

@@ -9,13 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unprocess_gen.calibration.gain import (
-    Estimate,
-    combined,
-    estimate,
-    root_estimate,
-    weighted_slope,
-)
+from unprocess_gen.calibration.captures import Sensor
+from unprocess_gen.calibration.gain import Estimate, combined, estimate, root_estimate, weighted_slope
 from unprocess_gen.calibration.measure import IsoResult, usable
 
 LEAST_EXPOSURE_RATIO = 2.0
@@ -29,102 +24,82 @@ LEAST_WARMING_C = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class BodyResult:
-    """Numbers of the camera body; None for those that the captures do not show."""
+class Body:
+    """Numbers of the camera body by name, None for those that captures do not show; temperature of the dark current.
 
-    prnu: Estimate | None = None
-    prnus: tuple[Estimate, ...] = ()
-    dsnu_e: Estimate | None = None
-    dark_e_per_s: Estimate | None = None
-    dark_reference_c: float | None = None
-    dark_doubling_c: Estimate | None = None
-    hot_share: Estimate | None = None
-    hot_e_per_s: Estimate | None = None
-    dead_share: Estimate | None = None
-    dead_level: Estimate | None = None
-    full_well_e: Estimate | None = None
-    is_mean_removed: bool = True
+    PRNU is that of the sensor, then of each plane; the others are of the sensor.
+    """
+
+    numbers: dict[str, list[Estimate | None]]
+    reference_c: float | None
+
+    def __getitem__(self, name: str) -> Estimate | None:
+        """Return an estimate of the sensor."""
+        return self.numbers[name][0]
 
 
-def measure_body(results: Sequence[IsoResult], black_dn: float) -> BodyResult:
+def measure_body(results: Sequence[IsoResult], sensor: Sensor) -> Body:
     """Combine the results of all ISOs."""
-    has_flats = any(usable(result.flats) for result in results)
-    prnus = tuple(_prnu(results, (plane,)) for plane in range(4)) if has_flats else ()
+    planes = (range(4), *((plane,) for plane in range(4)))
+    prnus = [_prnu(results, chosen) for chosen in planes] if any(result.prnu_squares for result in results) else []
     currents = _dark_currents(results)
-    doubling = _doubling(currents)
     warmest = max(currents, default=None)
     current = combined(currents[warmest]) if warmest is not None else None
-    if current is not None and current.low <= 0:
-        current = None
-    wells = [_in_electrons(result.full_well_dn, result.gain.sensor) for result in results if result.full_well_dn]
-    hot_share, hot_e_per_s = _hot(results, wells[0].value if wells else math.inf)
-    dead_share, dead_level = _dead(results, black_dn)
-    dsnu = [result.dsnu_dn.scaled(1 / result.gain.sensor.value) for result in results if result.dsnu_dn.value]
-    return BodyResult(
-        prnu=_positive(_prnu(results, range(4))) if has_flats else None,
-        prnus=prnus,
-        dsnu_e=combined(dsnu) if dsnu else None,
-        dark_e_per_s=current,
-        dark_reference_c=warmest if warmest else None,
-        dark_doubling_c=doubling,
-        hot_share=hot_share,
-        hot_e_per_s=hot_e_per_s,
-        dead_share=dead_share,
-        dead_level=dead_level,
-        full_well_e=wells[0] if wells else None,
-        is_mean_removed=_is_mean_removed(results),
-    )
+    wells = [result.full_well_dn.over(result["dn_per_e"]) for result in results if result.full_well_dn]
+    well = wells[0] if wells else None
+    hot_share, hot_current = _hot(results, sensor, well.value if well else math.inf)
+    dead_share, dead_level = _dead(results, sensor.black_dn)
+    dsnus = [
+        result["dsnu_std_dn"].scaled(1 / result["dn_per_e"].value) for result in results if result["dsnu_std_dn"].value
+    ]
+    numbers = {
+        "dsnu_std_e": combined(dsnus) if dsnus else None,
+        "dark_e_per_s": current if current is not None and current.low > 0 else None,
+        "dark_doubling_c": _doubling(currents),
+        "hot_pixel_share": hot_share,
+        "hot_pixel_e_per_s": hot_current,
+        "dead_pixel_share": dead_share,
+        "dead_pixel_level": dead_level,
+        "full_well_e": well,
+    }
+    prnu = prnus[0] if prnus and prnus[0].value > 0 else None
+    listed = {"prnu_std": [prnu, *prnus[1:]]} | {name: [number] for name, number in numbers.items()}
+    return Body(listed, warmest or None)
 
 
-def without_dark_current(result: IsoResult, body: BodyResult) -> IsoResult:
+def without_dark_current(result: IsoResult, body: Body) -> IsoResult:
     """Return a result whose read noise does not contain the dark current of its darks: K²·D·t less variance."""
-    if body.dark_e_per_s is None:
+    current, doubling = body["dark_e_per_s"], body["dark_doubling_c"]
+    if current is None:
         return result
-    celsius, doubling = result.dark.frames[0].temperature_c, body.dark_doubling_c
-    warmth = 1.0
-    if celsius is not None and body.dark_reference_c is not None and doubling is not None:
-        warmth = 2 ** ((celsius - body.dark_reference_c) / doubling.value)
-    added = body.dark_e_per_s.scaled(result.gain.sensor.value**2 * result.dark.exposure_s * warmth)
-
-    def corrected(read: Estimate) -> Estimate:
-        return root_estimate(read.value**2 - added.value, math.hypot(2 * read.value * read.error, added.error))
-
-    return replace(result, read=corrected(result.read), reads=[corrected(read) for read in result.reads])
-
-
-def _in_electrons(number: Estimate, gain: Estimate) -> Estimate:
-    """Return a number in DN in electrons; its interval contains the error of the gain."""
-    value, gain_error = number.value / gain.value, (gain.high - gain.low) / 2 / gain.value
-    below, above = (math.hypot(end / number.value - 1, gain_error) * value for end in (number.low, number.high))
-    return Estimate(value, value - below, value + above)
-
-
-def _positive(number: Estimate) -> Estimate | None:
-    return number if number.value > 0 else None
+    celsius, warmth = result.dark.frames[0].temperature_c, 1.0
+    if celsius is not None and body.reference_c is not None and doubling is not None:
+        warmth = 2 ** ((celsius - body.reference_c) / doubling.value)
+    added = current.scaled(result["dn_per_e"].value ** 2 * result.dark.exposure_s * warmth)
+    reads = [
+        root_estimate(read.value**2 - added.value, math.hypot(2 * read.value * read.error, added.error))
+        for read in result.numbers["read_std_dn"]
+    ]
+    return replace(result, numbers=result.numbers | {"read_std_dn": reads})
 
 
 def _prnu(results: Sequence[IsoResult], planes: Sequence[int]) -> Estimate:
-    """Return the PRNU of planes: √((fixed variance of flats - of darks) / signal²), weighted over levels."""
-    measured = [
-        (*result.prnu_squares[plane], result.dark.measured.sites)
-        for result in results
-        if result.prnu_squares
-        for plane in planes
-    ]
-    values, errors, sites = np.array(measured).T
-    weights = 1 / errors**2
+    """Return the PRNU of planes: √((fixed variance of flats - of darks) / signal²), weighted over ISOs."""
+    squares = [result.prnu_squares[plane] for result in results if result.prnu_squares for plane in planes]
+    values, errors = np.array(squares).T
+    weights, sites = 1 / errors**2, results[0].dark.measured.sites * len(planes)
     square = float(weights @ values / weights.sum())
     # the pixels are a sample of the sensor's
-    error = math.hypot(float(weights.sum()) ** -0.5, square * math.sqrt(2 / (sites[0] * len(planes))))
-    return root_estimate(square, error)
+    return root_estimate(square, math.hypot(float(weights.sum()) ** -0.5, square * math.sqrt(2 / sites)))
 
 
 def _dark_currents(results: Sequence[IsoResult]) -> dict[float, list[Estimate]]:
     """Return the dark currents of all ISOs by temperature (0 if it is not stated): slope of σ²/K² over the exposure."""
     currents = defaultdict(list)
     for result in results:
-        gain, by_temperature = result.gain, defaultdict(list)
-        gains = np.array([plane.value for plane in gain.planes] if gain.has_colours else [gain.sensor.value] * 4)
+        sensor, *planes = result.numbers["dn_per_e"]
+        gains = np.array([gain.value for gain in (planes if result.has_colours else [sensor] * 4)])
+        by_temperature = defaultdict(list)
         for dark in result.darks:
             by_temperature[dark.frames[0].temperature_c or 0.0].append(dark)
         for temperature, darks in by_temperature.items():
@@ -133,36 +108,25 @@ def _dark_currents(results: Sequence[IsoResult]) -> dict[float, list[Estimate]]:
                 continue
             electrons = np.array([(dark.measured.variance / gains**2).mean() for dark in darks])
             errors = np.array([np.linalg.norm(dark.measured.error / gains**2) / 4 for dark in darks])
-            slope, error = weighted_slope(seconds, electrons, errors)
-            gain_error = 2 * slope * gain.sensor.error / gain.sensor.value
-            currents[temperature].append(estimate(slope, math.hypot(error, gain_error)))
+            slope = weighted_slope(seconds, electrons, errors)
+            gain_error = 2 * slope.value * sensor.error / sensor.value
+            currents[temperature].append(estimate(slope.value, math.hypot(slope.error, gain_error)))
     return dict(currents)
 
 
 def _doubling(currents: dict[float, list[Estimate]]) -> Estimate | None:
     """Return the rise of the temperature that doubles the dark current; None without two temperatures."""
-    points = [(celsius, combined(values)) for celsius, values in currents.items()]
+    points = [(celsius, combined(values)) for celsius, values in sorted(currents.items())]
     points = [(celsius, value) for celsius, value in points if value.low > 0]
-    if len(points) < 2 or max(points)[0] - min(points)[0] < LEAST_WARMING_C:
+    if len(points) < 2 or points[-1][0] - points[0][0] < LEAST_WARMING_C:
         return None
-    celsius = np.array([point[0] for point in points])
-    logs = np.array([math.log2(point[1].value) for point in points])
-    errors = np.array([point[1].error / point[1].value / math.log(2) for point in points])
-    slope, error = weighted_slope(celsius, logs, errors)
-    return estimate(1 / slope, error / slope**2) if slope > 0 else None
+    numbers = [(celsius, value.value, value.error) for celsius, value in points]
+    celsius, values, errors = np.array(numbers).T
+    slope = weighted_slope(celsius, np.log2(values), errors / values / math.log(2))
+    return estimate(1 / slope.value, slope.error / slope.value**2) if slope.value > 0 else None
 
 
-def _is_mean_removed(results: Sequence[IsoResult]) -> bool:
-    """True if the mean of darks stays while their variance rises: the camera subtracts the mean dark signal."""
-    for result in results:
-        first, last = result.darks[0].measured, result.darks[-1].measured
-        rise = (last.variance.mean() - first.variance.mean()) / result.gain.sensor.value
-        if rise > 0 and last.mean_dn.mean() - first.mean_dn.mean() > rise / 2 > 0.5:
-            return False
-    return True
-
-
-def _hot(results: Sequence[IsoResult], full_well_e: float) -> tuple[Estimate | None, Estimate | None]:
+def _hot(results: Sequence[IsoResult], sensor: Sensor, full_well_e: float) -> tuple[Estimate | None, Estimate | None]:
     """Return share and mean current of hot pixels, from the darks that show the most currents.
 
     The currents are exponentially distributed (the profile's law), so those above a threshold have the mean of all plus
@@ -172,10 +136,10 @@ def _hot(results: Sequence[IsoResult], full_well_e: float) -> tuple[Estimate | N
 
     measured = list[tuple[int, float, int, float]]()
     for result in results:
-        gain, dark = result.gain.sensor.value, result.darks[-1]
+        gain, dark = result["dn_per_e"].value, result.darks[-1]
         if dark.exposure_s < LEAST_HOT_EXPOSURE_S:
             continue
-        limit = LARGEST_HOT * min(dark.hot_white_dn, full_well_e * gain)
+        limit = LARGEST_HOT * min(sensor.white_dn - float(dark.measured.mean_dn.max()), full_well_e * gain)
         known = int(np.count_nonzero(dark.hot_dn < limit))
         above = float((np.minimum(dark.hot_dn, limit) - dark.hot_threshold_dn).sum()) / (gain * dark.exposure_s)
         least = dark.hot_threshold_dn / (gain * dark.exposure_s)

@@ -73,7 +73,7 @@ def measure_all(captures: CaptureSet, quick: bool, watch: Watch, known: KnownGai
         if not gain.low > 0:  # not known: as if exact, in electrons
             gains[iso] = Estimate(gain.value, gain.value, gain.value)
     results = [measure_iso(captures, iso, quick, watch, gains.get(iso)) for iso in captures.isos]
-    body = measure_body(results, captures.sensor.black_dn)
+    body = measure_body(results, captures.sensor)
     results = [without_dark_current(result, body) for result in results]
     calibration = Calibration(captures, results, body, [], known)
     notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(calibration)]

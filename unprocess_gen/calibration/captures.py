@@ -14,14 +14,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from unprocess_gen.core.errors import ConfigError, MachineError
-from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES
+from unprocess_gen.core.records import check_record
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 from unprocess_gen.sources.mosaics import even_sides, read_mosaic
 from unprocess_gen.sources.raw.metadata import read_metadata
@@ -38,6 +40,8 @@ SAME_EXPOSURE = 0.05
 APART = 0.03
 """Relative difference of signals from which flats without a stated level are of different levels."""
 
+Number = Annotated[float, Meta(ge=0, le=1e9)]
+
 
 @dataclass(frozen=True, slots=True)
 class Capture:
@@ -48,15 +52,15 @@ class Capture:
     """
 
     path: Path
-    kind: str
-    iso: float
-    exposure_s: float | None = None
+    kind: Annotated[str, Meta(pattern="^(dark|flat)$")]
+    iso: Annotated[float, Meta(gt=0, le=1e9)]
+    exposure_s: Number | None = None
     level: str = ""
-    black_level_dn: float | None = None
-    white_level_dn: float | None = None
-    pattern: str | None = None
-    bits: int | None = None
-    temperature_c: float | None = None
+    black_level_dn: Number | None = None
+    white_level_dn: Number | None = None
+    pattern: Annotated[str, Meta(pattern=f"^({'|'.join((*PATTERNS, MONO))})$")] | None = None
+    bits: Annotated[int, Meta(ge=1, le=16)] | None = None
+    temperature_c: Annotated[float, Meta(gt=-273, le=1e9)] | None = None
 
     @property
     def group(self) -> tuple[float, str, float, str, float]:
@@ -103,10 +107,12 @@ class CaptureSet(NamedTuple):
     notes: list[str]
 
     def groups(self, kind: str, iso: float) -> Iterator[list[Capture]]:
-        """Yield the frames of each exposure and level of one ISO."""
+        """Yield the frames of each exposure and level of one ISO; levels that are not stated follow from the light."""
         frames = [frame for frame in self.captures if (frame.kind, frame.iso) == (kind, iso)]
         for _, group in groupby(sorted(frames, key=lambda frame: frame.group), key=lambda frame: frame.group):
-            yield list(group)
+            together = list(group)
+            has_level = kind == "dark" or together[0].level or len(together) <= 2
+            yield from [together] if has_level else _by_light(together, self.sensor.black_dn)
 
     @property
     def isos(self) -> list[float]:
@@ -121,7 +127,7 @@ def read_captures(folder: Path, kind: str | None = None, default: Sensor | None 
     """
     if not folder.is_dir():
         raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of raw frames, darks and flats")
-    try:
+    with machine_errors(folder):
         if (folder / TABLE).is_file():
             captures = list(_from_list(folder))
         elif (folder / EMVA).is_file():
@@ -129,16 +135,17 @@ def read_captures(folder: Path, kind: str | None = None, default: Sensor | None 
         else:
             captures = list(_from_names(folder, kind))
         if not captures:
-            raise ConfigError(
-                f"calibrate: {folder}: contains no raw frame; expected darks and flats as {', '.join(SUFFIXES)}"
-            )
+            expected = f"expected darks and flats as {', '.join(SUFFIXES)}"
+            raise ConfigError(f"calibrate: {folder}: contains no raw frame; {expected}")
         digests = [file_sha256(capture.path) for capture in captures]
-    except OSError as error:
-        raise MachineError(f"{error.filename or folder}: cannot be read ({error.strerror or error})") from error
     _check_twins(captures, digests)
     notes: list[str] = []
-    sensor = _sensor(captures, notes, default)
-    return CaptureSet(captures, sensor, hashlib.sha256("\n".join(sorted(digests)).encode()).hexdigest(), notes)
+    return CaptureSet(captures, _sensor(captures, notes, default), joined_sha256(digests), notes)
+
+
+def joined_sha256(digests: Iterable[str]) -> str:
+    """Return the SHA-256 of the list of digests, one a line in ascending order."""
+    return hashlib.sha256("\n".join(sorted(digests)).encode()).hexdigest()
 
 
 def _check_twins(captures: Iterable[Capture], digests: Iterable[str]) -> None:
@@ -179,42 +186,22 @@ def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
     file = folder / row["file"]
     if not file.is_file() or file.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{place}: file={row['file']}: no such frame; expected a file as {', '.join(SUFFIXES)}")
-    kind, pattern = row["kind"].strip().lower(), row.get("pattern", "").strip().upper()
-    if kind not in KIND_NAMES:
-        raise ConfigError(f"{place}: kind={row['kind']}: expected {' or '.join(KIND_NAMES)}")
-    if pattern and pattern not in (*PATTERNS, MONO):
-        raise ConfigError(f"{place}: pattern={pattern}: expected one of {', '.join((*PATTERNS, MONO))}")
-    given: dict[str, Any] = {
-        name: _number(place, name, row[name]) for name in ("iso", *OPTIONAL) if name in row and _is_numeric(name)
-    }
-    given |= {"pattern": pattern or None, "level": row.get("level", "").strip()}
+    cells = {name: text.strip() for name, text in row.items() if name != "file" and text.strip()}
+    cells |= {"kind": row["kind"].strip().lower()}
     stated = _metadata(file) if file.suffix.lower() in RAW_FILES else {}
-    for name in ("iso", "exposure_s"):
-        if given.get(name) and stated.get(name) and not math.isclose(given[name], stated[name], rel_tol=SAME_EXPOSURE):
-            problem = f"the metadata of {file.name} state {stated[name]:g}; expected frames that are listed as recorded"
-            raise ConfigError(f"{place}: {name}={given[name]:g}: {problem}")
-    facts = stated | {name: value for name, value in given.items() if value is not None}
-    if facts.get("iso") is None:
+    if "iso" not in stated | cells:
         raise ConfigError(f"{place}: iso is empty, and {file.name} does not state it; expected an ISO")
-    return Capture(file, kind, **facts)
-
-
-def _is_numeric(name: str) -> bool:
-    return name not in ("level", "pattern")
-
-
-def _number(place: str, name: str, text: str) -> float | None:
-    """Return the number of a cell, None if it is empty."""
-    if not text.strip():
-        return None
     try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    is_valid = math.isfinite(value) and (value >= 0 if name != "temperature_c" else value > -273)
-    if not is_valid or (name == "iso" and value == 0) or (name == "bits" and value not in range(1, 17)):
-        raise ConfigError(f"{place}: {name}={text}: expected a number{' above 0' if name == 'iso' else ''}")
-    return int(value) if name == "bits" else value
+        capture = check_record({"path": file} | stated | cells, Capture, strict=False)
+    except ValueError as error:
+        name, _, problem = str(error).partition(": ")
+        raise ConfigError(f"{place}: {name}={row.get(name)}: {problem}") from error
+    for name in ("iso", "exposure_s"):
+        own = getattr(capture, name)
+        if own and stated.get(name) and not math.isclose(own, stated[name], rel_tol=SAME_EXPOSURE):
+            problem = f"the metadata of {file.name} state {stated[name]:g}; expected frames that are listed as recorded"
+            raise ConfigError(f"{place}: {name}={own:g}: {problem}")
+    return capture
 
 
 def _metadata(file: Path) -> dict[str, Any]:
@@ -268,7 +255,7 @@ def _from_emva(folder: Path) -> Iterator[Capture]:
                 file = folder / words[1].replace("\\", "/")
                 if not file.is_file():
                     raise ConfigError(f"{path}, line {number}: {words[1]}: no such file; restore it")
-                yield Capture(file, kind, EMVA_ISO, seconds, level, pattern="MONO", bits=bits)
+                yield Capture(file, kind, EMVA_ISO, seconds, level, pattern=MONO, bits=bits)
             else:
                 raise ValueError
         except (ValueError, IndexError):
@@ -280,11 +267,11 @@ def _from_emva(folder: Path) -> Iterator[Capture]:
 
 def _sensor(captures: list[Capture], notes: list[str], default: Sensor | None) -> Sensor:
     """Return the sensor of all frames; levels that no file states are measured, with a note."""
-    stated = {name: _common(captures, name) for name in ("bits", "black_level_dn", "white_level_dn", "pattern")}
+    files = {capture.path: capture for capture in captures}
+    stated = {name: common(files, name) for name in ("bits", "black_level_dn", "white_level_dn", "pattern")}
     if default is not None:
-        own: dict[str, Any] = {"black_level_dn": default.black_dn, "white_level_dn": default.white_dn}
-        own |= {"bits": default.bits, "pattern": default.pattern}
-        stated = {name: own[name] if value is None else value for name, value in stated.items()}
+        own = zip(stated, (default.bits, default.black_dn, default.white_dn, default.pattern), strict=True)
+        stated = {name: value if stated[name] is None else stated[name] for name, value in own}
     height, width = captures[0].pixels().shape
     shape = height, width
     darks = [capture for capture in captures if capture.kind == "dark"]
@@ -310,24 +297,24 @@ def _sensor(captures: list[Capture], notes: list[str], default: Sensor | None) -
     return Sensor(bits, float(round(black or 0.0)), float(round(white)), stated["pattern"] or "RGGB", shape)
 
 
-def _common(captures: Iterable[Capture], name: str) -> Any:
-    """Return the value that all frames have; ConfigError names the first frame that differs."""
-    first, *others = captures
-    for capture in others:
-        if getattr(capture, name) != getattr(first, name):
+def common(files: Mapping[Path, Any], name: str) -> Any:
+    """Return the fact that all files have; ConfigError names the first file that differs."""
+    (first, facts), *others = files.items()
+    expected = getattr(facts, name)
+    for path, other in others:
+        if getattr(other, name) != expected:
             raise ConfigError(
-                f"calibrate: {capture.path}: {name}={getattr(capture, name)}: {first.path.name} has "
-                f"{getattr(first, name)}; expected frames of one camera and mode; remove those that differ"
+                f"calibrate: {path}: {name}={getattr(other, name)}: {first.name} has {expected}; expected frames of "
+                "one camera and mode; remove those that differ"
             )
-    return getattr(first, name)
+    return expected
 
 
-def with_measured_levels(captures: list[Capture], signals: Mapping[Path, float]) -> list[Capture]:
-    """Return flats without a stated level, each with a level that frames of nearly the same mean signal share."""
-    result, before, number = [], -math.inf, 0
-    for capture in sorted(captures, key=lambda capture: signals[capture.path]):
-        signal = signals[capture.path]
-        number += signal > max(before * (1 + APART), 0.0)
-        before = signal
-        result.append(replace(capture, level=f"{number}"))
-    return result
+def _by_light(frames: Iterable[Capture], black_dn: float) -> Iterator[list[Capture]]:
+    """Yield flats of nearly the same mean signal, with a number for their level."""
+    signals = {frame: float(frame.pixels().mean()) - black_dn for frame in frames}
+    ordered = sorted(signals, key=lambda frame: signals[frame])
+    values = np.array([signals[frame] for frame in ordered])
+    starts = 1 + np.flatnonzero(values[1:] > np.maximum(values[:-1] * (1 + APART), 0.0))
+    for number, places in enumerate(np.split(np.arange(len(ordered)), starts), start=1):
+        yield [replace(ordered[place], level=f"{number}") for place in places]

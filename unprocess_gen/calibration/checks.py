@@ -1,4 +1,8 @@
-"""Check captures before they are fitted: refuse what cannot be measured, and warn of what makes numbers doubtful."""
+"""Check captures before they are fitted: refuse what cannot be measured, and warn of what makes numbers doubtful.
+
+Statistics are scores, as in ``verify --noise``: a limit is exceeded if noise would exceed it with the probability of an
+alarm. The limits themselves are what real sensors and lamps show, or what changes the estimates little.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,12 @@ import numpy as np
 from unprocess_gen.calibration.captures import Capture, Sensor
 from unprocess_gen.calibration.frame_sums import Measured
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Float
+from unprocess_gen.statistics.scores import UNFORESEEN, Score, alarm_limit
 
 
-class StatisticLimit(NamedTuple):
-    """Limits of a statistic: from which value frames are doubtful, and refused; what it means, and what is expected."""
+class Limits(NamedTuple):
+    """From which value of a statistic frames are doubtful, and refused; what it means, and what is expected."""
 
     doubtful: float
     refused: float
@@ -23,58 +29,46 @@ class StatisticLimit(NamedTuple):
 
 
 LIMITS = {
-    "light in darks": StatisticLimit(
-        math.inf,
-        0.05,
-        "the mean is {value:.1%} of white away from black",
+    "light in darks": Limits(
+        *(math.inf, 0.05, "the mean is {:.1%} of white away from black"),
         "frames without light; correct kind, or black_level_dn in captures.csv",
     ),
-    "clipped black": StatisticLimit(
-        math.inf,
-        0.005,
-        "{value:.1%} of the values are the lowest that occurs: black is clipped, and a part of the noise is missing",
+    "clipped black": Limits(
+        *(math.inf, 0.005, "{:.1%} of the values are the lowest that occurs: black is clipped, and noise is missing"),
         "raw frames with an offset",
     ),
-    "frames differ": StatisticLimit(
-        math.inf,
-        1.2,
-        "the variances of the frames differ by a factor of {value:.2f}",
+    "frames differ": Limits(
+        *(math.inf, 1.2, "the variances of the frames differ by a factor of {:.2f}"),
         "frames of one ISO and exposure; remove those of another",
     ),
-    "missing codes": StatisticLimit(
-        0.02,
-        0.25,
-        "{value:.0%} of the values within the noise never occur: the camera scales its values",
+    "missing codes": Limits(
+        *(0.02, 0.25, "{:.0%} of the values within the noise never occur: the camera scales its values"),
         "values of the converter, not scaled ones, or ones of fewer bits",
     ),
-    "neighbours": StatisticLimit(
-        0.025,  # real sensors reach 0.03 (EMVA 1288 reference set 001)
-        0.08,
-        "the noise of neighbouring sites has a correlation of {value:.3f}; a profile has none",
+    "neighbours": Limits(  # real sensors reach 0.03 (EMVA 1288 reference set 001)
+        *(0.025, 0.08, "the noise of neighbouring sites has a correlation of {:.3f}; a profile has none"),
         "raw frames without noise reduction or sharpening; switch off long-exposure and high-ISO noise reduction",
     ),
-    "flicker": StatisticLimit(
-        0.005,
-        0.02,
-        "the mean differs by {value:.1%} between the frames",
+    "flicker": Limits(
+        *(0.005, 0.02, "the mean differs by {:.1%} between the frames"),
         "one exposure in steady light; correct level and exposure_s, or use a lamp that does not flicker",
     ),
-    "bands": StatisticLimit(
-        0.002,
-        0.01,
-        "rows change by {value:.2%} from frame to frame: the lamp flickers",
+    "bands": Limits(
+        *(0.002, 0.01, "rows change by {:.2%} from frame to frame: the lamp flickers"),
         "steady light, or exposures of many periods of the mains",
     ),
-    "vignetting": StatisticLimit(
-        0.2,
-        0.5,
-        "the darkest sixteenth of the frame has {value:.0%} less light than the brightest",
+    "vignetting": Limits(
+        *(0.2, 0.5, "the darkest sixteenth of the frame has {:.0%} less light than the brightest"),
         "even light; defocus, use a diffuser, or stop down",
     ),
 }
 """Limits of the statistics of one measurement, by name."""
+ALARM = alarm_limit(100 * len(LIMITS))
+"""Surprise beyond which a limit is exceeded, for up to a hundred measurements."""
 LEAST_DARK_STD_DN, LEAST_DARK_STD_8_BITS_DN = 0.4, 1.0
 """Least noise of darks without rounding, which hides the noise below; values of 8 bits are mostly rounding."""
+LEAST_OF_CODE = 100
+"""Mean number of values from which none is hardly by chance."""
 
 
 def place(frames: Sequence[Capture]) -> str:
@@ -84,57 +78,66 @@ def place(frames: Sequence[Capture]) -> str:
     return f"calibrate: {first.path} ({first.kind}, ISO {first.iso:g}{light}, {len(frames)} frames)"
 
 
-def _check(frames: Sequence[Capture], values: dict[str, float], notes: list[str]) -> None:
+def _exceeds(score: Score, limit: float) -> bool:
+    return limit < math.inf and score._replace(low=-limit, high=limit).surprise > ALARM
+
+
+def _check(frames: Sequence[Capture], scores: dict[str, Score], notes: list[str]) -> None:
     """Compare statistics with `LIMITS`: raise ConfigError, or add a note."""
-    for name, value in values.items():
-        limit = LIMITS[name]
-        text = f"{place(frames)}: {limit.meaning.format(value=value)}"
-        if value > limit.refused:
-            raise ConfigError(f"{text}; expected {limit.expected}")
-        if value > limit.doubtful:
+    for name, score in scores.items():
+        doubtful, refused, meaning, expected = LIMITS[name]
+        text = f"{place(frames)}: {meaning.format(score.total)}"
+        if _exceeds(score, refused):
+            raise ConfigError(f"{text}; expected {expected}")
+        if _exceeds(score, doubtful):
             notes.append(text)
 
 
 def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes: list[str]) -> None:
     """Refuse darks that are clipped, contain light or differ; warn of doubtful ones."""
-    variances = dark.frame_variances
-    noise = 7 * math.sqrt(6 / dark.sites)  # of the ratio of two of them
-    values = {
-        "light in darks": abs(float(dark.mean_dn.mean()) - sensor.black_dn) / sensor.span_dn,
-        "clipped black": clipped_share(dark),
-        "frames differ": float(variances.max() / max(variances.min(), 1e-9)) - noise,
+    variances, mean_variance = dark.frame_variances, float(dark.variance.mean()) / dark.sites
+    light = abs(float(dark.mean_dn.mean()) - sensor.black_dn) / sensor.span_dn
+    scores = {
+        "light in darks": Score(light, 1.0, mean_variance / sensor.span_dn**2),
+        "clipped black": clipped_black(dark),
+        "frames differ": Score(float(variances.max() / max(variances.min(), 1e-9)), 1.0, 6 / dark.sites),
     }
-    _check(frames, values | _pixel_statistics(dark), notes)
+    _check(frames, scores | _pixel_scores(dark), notes)
 
 
 def is_clipped(dark: Measured) -> bool:
     """True if black is clipped."""
-    return clipped_share(dark) > LIMITS["clipped black"].refused
+    return _exceeds(clipped_black(dark), LIMITS["clipped black"].refused)
 
 
-def clipped_share(dark: Measured) -> float:
-    """Return the share of the lowest value, 0 if the histogram falls to both sides alike."""
+def clipped_black(dark: Measured) -> Score:
+    """Score the share of the lowest value, 0 if the histogram falls to both sides alike."""
     shares = []
     for codes in dark.codes:
         used, peak = np.flatnonzero(codes), int(np.argmax(codes))
         is_skewed = int(used[-1]) - peak > 2 * (peak - int(used[0])) + 2
         shares.append(is_skewed * codes[used[0]] / float(codes.sum()))
-    return float(max(shares))
+    return Score(float(max(shares)), 1.0, float(max(shares)) / dark.sites / dark.count)
 
 
-def _pixel_statistics(measured: Measured) -> dict[str, float]:
-    """Return the share of missing values, and the largest correlation of neighbours beyond its own noise."""
-    noise = 6 / math.sqrt(4 * measured.sites) + 1 / min(measured.shape)
-    correlation = max(map(abs, measured.correlation.values()))
-    return {"missing codes": max(map(_gaps, measured.codes)), "neighbours": correlation - noise}
+def _pixel_scores(measured: Measured) -> dict[str, Score]:
+    """Score missing values, and the correlation of neighbours, which subtracted means of lines change by 1/length."""
+    correlation = measured.correlation
+    moved = min(abs(correlation.total), 1 / min(measured.shape))
+    correlation = correlation._replace(total=correlation.total - math.copysign(moved, correlation.total))
+    return {"missing codes": max(map(_missing_codes, measured.codes)), "neighbours": correlation}
 
 
-def _gaps(codes: np.ndarray) -> float:
-    """Return the share of values among the middle 68 % that never occur; hot pixels are rarer, and far away."""
+def _missing_codes(codes: np.ndarray) -> Score:
+    """Score the share of values among the middle 68 % that never occur; hot pixels are rarer, and far away."""
     total, below = float(codes.sum()), np.cumsum(codes)
     low, high = np.searchsorted(below, (0.16 * total, 0.84 * total))
     inner = codes[low : high + 1]
-    return float(np.mean(inner == 0)) if len(inner) >= 4 and total > 100 * len(inner) else 0.0
+    if len(inner) < 4 or total < LEAST_OF_CODE * len(inner):
+        return Score(0.0, 1.0, 0.0)
+    # a value that is expected n times is missing with the probability exp(-n)
+    step = 3 / LEAST_OF_CODE / len(inner)
+    return Score(float(np.mean(inner == 0)), 1.0, UNFORESEEN / len(inner), step=step)
 
 
 def check_dark_noise(frames: Sequence[Capture], sensor: Sensor, std_dn: float) -> None:
@@ -149,12 +152,21 @@ def check_dark_noise(frames: Sequence[Capture], sensor: Sensor, std_dn: float) -
 
 def check_flat(frames: Sequence[Capture], sensor: Sensor, flat: Measured, dark: Measured, notes: list[str]) -> None:
     """Refuse flats whose light changes in time or over the frame; warn of doubtful ones."""
-    signal, means = max(float(flat.mean_dn.mean() - dark.mean_dn.mean()), 1.0), flat.frame_means.mean(axis=1)
-    jitter = 4 * math.sqrt(max(float(dark.frame_means.mean(axis=1).var(ddof=1)), flat.total.mean() / flat.sites / 4))
-    darkest, brightest = (block - sensor.black_dn for block in flat.blocks)
-    values = {
-        "flicker": (float(np.ptp(means)) - jitter) / signal,
-        "bands": math.sqrt(max(flat.row[0] - dark.row[0] - 5 * flat.row[1], 0.0)) / signal,
-        "vignetting": 1 - darkest / brightest if brightest > 0 else 0.0,
+    signal = max(float(flat.mean_dn.mean() - dark.mean_dn.mean()), 1.0)
+    noise = float(flat.total.mean()) / flat.sites / signal**2  # of the mean of a plane
+    drift = float(dark.frame_means.mean(axis=1).var(ddof=1)) / signal**2
+    rows = max(flat.row[0] - dark.row[0], 0.0) / signal**2
+    bands = math.sqrt(rows)
+    scores = {
+        "flicker": Score(float(np.ptp(flat.frame_means.mean(axis=1))) / signal, 1.0, 2 * max(drift, noise / 4)),
+        "bands": Score(bands, 1.0, (flat.row[1] / signal**2 / 2 / bands) ** 2 if rows else 0.0),
+        "vignetting": Score(_vignetting(flat.shading - sensor.black_dn), 1.0, 8 * noise / flat.count),
     }
-    _check(frames, values | _pixel_statistics(flat), notes)
+    _check(frames, scores | _pixel_scores(flat), notes)
+
+
+def _vignetting(shading: Float) -> float:
+    """Return how much darker the darkest sixteenth of a frame is than the brightest."""
+    side = len(shading) // 4
+    blocks = shading.reshape(4, side, 4, side).mean(axis=(1, 3))
+    return 1 - float(blocks.min() / blocks.max()) if blocks.max() > 0 else 0.0

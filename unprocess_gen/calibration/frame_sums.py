@@ -8,7 +8,6 @@ and V of the mean of a frame. T = σ² + σ_row² + V and R = σ_row² + σ²/W 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,28 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float
-
-TILE = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""Places of the CFA tile; a plane is the set of all sites at one of them."""
-NEIGHBOURS = {
-    "adjacent sites": ((0, 1), (1, 0)),
-    "diagonal sites": ((1, 1), (1, -1)),
-    "neighbours": ((0, 2), (2, 0)),
-    "diagonal neighbours": ((2, 2), (2, -2)),
-}
-"""Distances of the sites of pairs in rows and columns, by the name of the check of their correlation."""
-
-
-def plane_names(pattern: str) -> list[str]:
-    """Names of the planes in the order of the tile: R, B, and Gr or Gb for green next to red or blue.
-
-    Without filters, row and column in the tile.
-    """
-    if pattern == "MONO":
-        return ["00", "01", "10", "11"]
-    rows = pattern[:2], pattern[2:]
-    return [colour if colour != "G" else "Gr" if "R" in row else "Gb" for row in rows for colour in row]
-
+from unprocess_gen.statistics.mosaics import TILE, neighbour_products
+from unprocess_gen.statistics.scores import Score
 
 WINDOW = 11
 """Side of the squares of sites of a plane whose mean is subtracted before fixed patterns are measured."""
@@ -53,6 +32,8 @@ ROBUST = 1.4826
 """Standard deviation of normal values over their median absolute deviation."""
 LARGEST_Z = 5.0
 """Bound of the normalised differences whose correlation is measured."""
+BLOCKS = 16
+"""Blocks of a frame across and down whose means are compared; a multiple of it in large frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +61,10 @@ class Measured:
     codes
         histogram of the values, [4, 65536]
     correlation
-        correlation of pairs of neighbours in a difference of two frames, by `NEIGHBOURS`
-    blocks
-        least and largest mean of a sixteenth of the frame, DN
-    full_share
-        share of values at or above white
-    row_profile, column_profile
+        correlation of pairs of neighbours in a difference of two frames, the largest of all distances
+    shading
+        means of blocks of the frame
+    row_offsets, column_offsets
         means of the rows of the first frame and of the columns of all frames, minus the means of the planes
     """
 
@@ -104,11 +83,10 @@ class Measured:
     fixed: Float
     fixed_error: Float
     codes: NDArray[np.int64]
-    correlation: dict[str, float]
-    blocks: tuple[float, float]
-    full_share: float
-    row_profile: Float
-    column_profile: Float
+    correlation: Score
+    shading: Float
+    row_offsets: Float
+    column_offsets: Float
 
     @property
     def sites(self) -> int:
@@ -119,12 +97,9 @@ class Measured:
 class FrameSums:
     """Sums over frames of equal light: of the values and of their squares, relative to the first frame."""
 
-    def __init__(self, white_dn: float) -> None:
-        self._white_dn = white_dn
-        self._first: NDArray[np.uint16] | None = None
-        self._pair: NDArray[np.int32] | None = None
-        self._sum: Any = None
-        self._squares: Any = None
+    def __init__(self) -> None:
+        self._first: Any = None
+        self._pair: Any = None
         self._rows, self._columns = list[Any](), list[Any]()
         self._variances = list[float]()
         self._codes = np.zeros((4, 2**16), np.int64)
@@ -132,8 +107,7 @@ class FrameSums:
     def add(self, pixels: NDArray[np.uint16]) -> None:
         """Add a frame, uint16 [H, W]."""
         planes = [pixels[y::2, x::2] for y, x in TILE]
-        for codes, plane in zip(self._codes, planes, strict=True):
-            codes += np.bincount(plane.reshape(-1), minlength=2**16)
+        self._codes += [np.bincount(plane.reshape(-1), minlength=2**16) for plane in planes]
         self._variances.append(float(np.mean(np.diff(pixels[::4, ::2].astype(np.float32), axis=1) ** 2)) / 2)
         self._rows.append([plane.mean(axis=1) for plane in planes])
         self._columns.append([plane.mean(axis=0) for plane in planes])
@@ -148,32 +122,25 @@ class FrameSums:
 
     def mean_frame(self) -> Float:
         """Return the mean of all frames, [H, W] DN."""
-        assert self._first is not None
         return np.asarray(self._first + self._sum / np.float64(len(self._rows)))
-
-    def column_offsets(self) -> Float:
-        """Return the mean of each column minus the mean of its plane, [4, W/2]; zeros if frames are too few for it."""
-        means = np.mean(self._columns, axis=0)
-        return np.asarray(means - means.mean(axis=1, keepdims=True))
 
     def measure(self) -> Measured:
         """Estimate the noise of the frames; two or more."""
         count, rows, columns = len(self._rows), np.array(self._rows), np.array(self._columns)
         height, width = rows.shape[2], columns.shape[2]
         means = rows.mean(axis=2)
-        own = (rows - means[..., None], columns - means[..., None])
+        own_rows, own_columns = rows - means[..., None], columns - means[..., None]
         mean_frame = self.mean_frame()
         variances = (self._squares - self._sum.astype(np.float64) ** 2 / count) / (count - 1)
         planes = [_plane(mean_frame[y::2, x::2], variances[y::2, x::2], count) for y, x in TILE]
         mean_dn, total, total_error, patterns, good = (np.array(values) for values in zip(*planes, strict=True))
-        drift = means.var(axis=0, ddof=1)
         row_variance = rows.var(axis=0, ddof=1).mean(axis=1)
         variance = (total - row_variance) * width / (width - 1)
-        error = np.hypot(total_error, row_variance * math.sqrt(2 / (height * (count - 1))))
-        noise = variance / width
-        row, correlation = _line_offsets(own[0], 2, float(noise.mean()) / 2)
-        column, _ = _line_offsets(own[1], 1, float(variance.mean()) / height / 2)
+        per_column = float(variance.mean()) / height
+        row, correlation = _line_offsets(own_rows, 2, float(variance.mean()) / width / 2)
+        column, _ = _line_offsets(own_columns, 1, per_column / 2)
         temporal = (variance * SMOOTH + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
+        offsets = own_columns.mean(axis=0)
         return Measured(
             count=count,
             shape=(height, width),
@@ -181,31 +148,20 @@ class FrameSums:
             frame_variances=np.array(self._variances),
             mean_dn=mean_dn,
             variance=variance,
-            error=error,
-            total=total - drift,
+            error=np.hypot(total_error, row_variance * math.sqrt(2 / (height * (count - 1)))),
+            total=total - means.var(axis=0, ddof=1),
             row=row,
             column=column,
-            fixed_column=_fixed_offsets(
-                own[1].mean(axis=0), float(variance.mean()) / height / count, max(column[0], 0.0) / count
-            ),
+            fixed_column=_fixed_offsets(offsets, per_column / count, max(column[0], 0.0) / count),
             row_correlation=correlation,
             fixed=(patterns - temporal) / SMOOTH,
             fixed_error=np.sqrt(2 / good) * patterns + total_error / count,
             codes=self._codes,
-            correlation=_correlations(self._pair),
-            blocks=_blocks(mean_frame),
-            full_share=float(self._codes[:, math.floor(self._white_dn) :].sum() / self._codes.sum()),
-            row_profile=own[0][0].reshape(2, 2, -1).mean(axis=1).T.ravel(),
-            column_profile=own[1].mean(axis=0).reshape(2, 2, -1).mean(axis=0).T.ravel(),
+            correlation=_correlation(self._pair),
+            shading=_block_means(mean_frame),
+            row_offsets=own_rows[0],
+            column_offsets=offsets,
         )
-
-
-def summed(frames: Iterable[NDArray[np.uint16]], white_dn: float) -> FrameSums:
-    """Return the sums of frames."""
-    sums = FrameSums(white_dn)
-    for pixels in frames:
-        sums.add(pixels)
-    return sums
 
 
 def high_passed(plane: Float) -> Float:
@@ -216,6 +172,12 @@ def high_passed(plane: Float) -> Float:
     return np.asarray((plane - uniform_filter(plane, WINDOW))[edge:-edge, edge:-edge])
 
 
+def robust_std(values: Any) -> tuple[Any, float]:
+    """Return the distances of values from their median, and their standard deviation without outliers."""
+    distances = np.abs(values - np.median(values))
+    return distances, ROBUST * float(np.median(distances))
+
+
 def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, float, float, float]:
     """Return mean, variance, its error, variance of the fixed pattern, and number, of sites that are no defects.
 
@@ -223,20 +185,15 @@ def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, flo
     """
     edge = WINDOW // 2
     pattern = high_passed(mean)
-    deviation = np.abs(pattern - np.median(pattern))
+    distance, std = robust_std(pattern)
     inner = variances[edge:-edge, edge:-edge]
-    is_far = deviation > FAR * ROBUST * max(float(np.median(deviation)), 0.1)
-    is_good = (~is_far | (deviation**2 < FIXED**2 / count * inner)) & (
+    is_far = distance > FAR * max(std, 0.1 * ROBUST)
+    is_good = (~is_far | (distance**2 < FIXED**2 / count * inner)) & (
         inner <= STRUCK**2 / count * max(np.median(inner), 1 / 12)
     )
-    sites = float(is_good.sum())
-    return (
-        float(mean[edge:-edge, edge:-edge][is_good].mean()),
-        float(inner[is_good].mean()),
-        float(inner[is_good].std()) / math.sqrt(sites),
-        float(pattern[is_good].var()),
-        sites,
-    )
+    sites, own = float(is_good.sum()), inner[is_good]
+    error = float(own.std()) / math.sqrt(sites)
+    return float(mean[edge:-edge, edge:-edge][is_good].mean()), float(own.mean()), error, pattern[is_good].var(), sites
 
 
 def _line_offsets(lines: Float, axis: int, noise: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -265,33 +222,23 @@ def _fixed_offsets(columns: Float, noise: float, temporal: float) -> tuple[float
     return variance - noise / 2 - temporal, variance * math.sqrt(3 / full.size)
 
 
-def _correlations(difference: NDArray[np.int32] | None) -> dict[str, float]:
-    """Return the correlations of pairs of neighbours in the difference of two frames, without offsets of lines."""
-    assert difference is not None
-    z = difference.astype(np.float32)
+def _correlation(difference: NDArray[np.int32]) -> Score:
+    """Score the largest correlation of neighbours in the difference of two frames, without offsets of lines."""
+    height, width = difference.shape
+    z = np.zeros((height, width + 2), np.float32)
     for y, x in TILE:
-        plane = z[y::2, x::2]
+        plane = difference[y::2, x::2].astype(np.float32)
         plane -= plane.mean(axis=1, keepdims=True)
         plane -= plane.mean(axis=0, keepdims=True)
-        plane /= max(float(np.median(np.abs(plane))) * ROBUST, 0.5)
-    z = np.clip(z, -LARGEST_Z, LARGEST_Z)
-    square = float((z * z).mean(dtype=np.float64)) or 1.0
-    result = {}
-    for name, distances in NEIGHBOURS.items():
-        products = [
-            float((z[dy:, max(dx, 0) : z.shape[1] + min(dx, 0)] * _shifted(z, dy, dx)).mean(dtype=np.float64))
-            for dy, dx in distances
-        ]
-        result[name] = max(products, key=abs) / square
-    return result
+        _, std = robust_std(plane)
+        z[y::2, x:width:2] = np.clip(plane / max(std, 0.5), -LARGEST_Z, LARGEST_Z)
+    square = max(float((z * z).sum(dtype=np.float64)), 1.0)
+    largest = max((product for products in neighbour_products(z).values() for product in products), key=abs)
+    return Score(largest / square, 1.0, 1 / difference.size, step=LARGEST_Z**2 / square)
 
 
-def _shifted(z: Any, dy: int, dx: int) -> Any:
-    return z[: z.shape[0] - dy, max(-dx, 0) : z.shape[1] - max(dx, 0)]
-
-
-def _blocks(frame: Float) -> tuple[float, float]:
-    """Return the least and the largest mean of a sixteenth of a frame."""
-    height, width = (length // 8 * 2 for length in frame.shape)
-    blocks = frame[: height * 4, : width * 4].reshape(4, height, 4, width).mean(axis=(1, 3))
-    return float(blocks.min()), float(blocks.max())
+def _block_means(frame: Float) -> Float:
+    """Return the means of blocks of a frame of even sides."""
+    blocks = BLOCKS * min(max(min(frame.shape) // (8 * BLOCKS), 1), 4)
+    height, width = (length // (2 * blocks) * 2 for length in frame.shape)
+    return np.asarray(frame[: blocks * height, : blocks * width].reshape(blocks, height, blocks, width).mean((1, 3)))

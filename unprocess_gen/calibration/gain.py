@@ -11,10 +11,12 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from unprocess_gen.core.types import Float
+from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 RANGES = (0.1, 0.3)
 """Largest signals of the fits, as fractions of white above black."""
@@ -22,8 +24,6 @@ EMVA_RANGE = 0.7
 """Largest signal of EMVA 1288's fit, as a fraction of that at the largest variance."""
 SIGNIFICANT = 3.0
 """Standard errors from which a difference is systematic."""
-NORMAL_95 = 1.96
-"""Half the 95 % interval of a normal distribution, in standard errors."""
 UNSEEN_CURVATURE = 0.015
 """Relative systematic error of a gain from too few levels to show it. Real sensors: EMVA 1288 reference set 001."""
 
@@ -44,6 +44,16 @@ class Estimate:
     def scaled(self, factor: float) -> Estimate:
         """Return the number in other units."""
         return Estimate(self.value * factor, self.low * factor, self.high * factor)
+
+    def times(self, other: Estimate) -> Estimate:
+        """Return the product with an independent number."""
+        value, ends = self.value * other.value, ((self.low, other.low), (self.high, other.high))
+        below, above = (math.hypot(own / self.value - 1, end / other.value - 1) * value for own, end in ends)
+        return Estimate(value, value - below, value + above)
+
+    def over(self, other: Estimate) -> Estimate:
+        """Return the ratio to an independent number."""
+        return self.times(estimate(1 / other.value, other.error / other.value**2))
 
 
 def estimate(value: float, error: float, least: float = -math.inf) -> Estimate:
@@ -66,11 +76,10 @@ def combined(estimates: Sequence[Estimate]) -> Estimate:
     return estimate(mean, math.sqrt(max(excess, 1.0) if excess > 4 else 1.0) / math.sqrt(float(weights.sum())))
 
 
-def weighted_slope(x: Float, y: Float, errors: Float) -> tuple[float, float]:
-    """Return the slope of a line through values with standard errors, and its standard error."""
-    design = np.stack([x, np.ones_like(x)])
-    covariance = np.linalg.inv((design / errors**2) @ design.T)
-    return float((covariance @ design / errors**2 @ y)[0]), math.sqrt(covariance[0, 0])
+def weighted_slope(x: Float, y: Float, errors: Float) -> Estimate:
+    """Return the slope of a line through values with standard errors."""
+    slopes, _ = influence(np.stack([x, np.ones_like(x)]), 1 / errors**2)
+    return estimate(float(slopes @ y), float(np.linalg.norm(slopes * errors)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,107 +114,83 @@ class Transfer:
         return np.asarray(np.diag(self.error**2) + same * np.outer(self.dark_error, self.dark_error))
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """Gain of one range with or without q: value, standard error, q (per DN), χ² and its degrees of freedom."""
+class Fit(NamedTuple):
+    """Gain of a plane by one range, with or without q: value, standard error, χ² and its degrees of freedom."""
 
     gain: float
     error: float
-    q: float
     chi2: float
     degrees: int
 
 
 def fit_curve(points: Transfer, with_q: bool) -> Fit | None:
     """Fit K, and q if wanted, by generalised least squares; None for too few points."""
-    design = np.stack([points.signal, points.signal**2])[: 1 + with_q].T
-    degrees = len(points.signal) - design.shape[1]
+    design = np.stack([points.signal, points.signal**2])[: 1 + with_q]
+    degrees = len(points.signal) - len(design)
     if degrees < (1 if with_q else 0) or not len(points.signal):
         return None
-    inverse = np.linalg.inv(points.covariance)
-    covariance = np.linalg.inv(design.T @ inverse @ design)
-    numbers = covariance @ design.T @ inverse @ points.variance
-    residual = points.variance - design @ numbers
-    q = float(numbers[1] / numbers[0]) if with_q else 0.0
-    return Fit(float(numbers[0]), math.sqrt(covariance[0, 0]), q, float(residual @ inverse @ residual), degrees)
+    covariance, precision = points.covariance, np.linalg.inv(points.covariance)
+    by_point = influence(design, precision)
+    numbers = by_point @ points.variance
+    residual = points.variance - numbers @ design
+    error = math.sqrt(float(by_point[0] @ covariance @ by_point[0]))
+    return Fit(float(numbers[0]), error, float(residual @ precision @ residual), degrees)
 
 
-@dataclass(frozen=True, slots=True)
-class Gain:
-    """Fitted gains of all planes and of the sensor; q and χ² belong to the chosen fit, means of the planes."""
+class JointFit(NamedTuple):
+    """Fits of all planes by one rule: their mean, its error, and χ² over its degrees of freedom."""
 
-    sensor: Estimate
-    planes: list[Estimate]
-    q: float
+    planes: list[Fit]
+    gain: float
+    error: float
     chi2: float
-    is_systematic: bool
-    has_colours: bool
+    degrees: int
+
+    @property
+    def interval(self) -> Estimate:
+        """Mean with an interval that residuals beyond the noise widen."""
+        return estimate(self.gain, self.error * math.sqrt(max(self.chi2, 1.0)))
 
 
-def fit_gain(curves: Sequence[Transfer], span_dn: float) -> Gain:
-    """Fit the gain of each plane and of all planes."""
-    ranges = [*RANGES, max(float(curve.signal.max()) for curve in curves) / span_dn]
-    if sum(len(curve.upto(RANGES[-1] * span_dn).signal) for curve in curves) >= 3 * len(curves):
-        ranges.pop()
-    by_kind = {}
-    for share, with_q in itertools.product(ranges, (False, True)):
-        fits = [fit_curve(curve.upto(share * span_dn), with_q) for curve in curves]
-        if all(fit is not None for fit in fits):
-            by_kind[share, with_q] = [fit for fit in fits if fit is not None]
-    base = by_kind[ranges[-1], False]
-    means = {kind: _mean(fits) for kind, fits in by_kind.items()}
-    value, error = means[ranges[-1], False]
-    differences = [
-        (other - value, math.sqrt(max(own**2 - error**2, 0.0))) for kind, (other, own) in means.items() if own > error
-    ]
-    is_systematic = any(abs(difference) > SIGNIFICANT * spread for difference, spread in differences)
-    is_systematic |= _chi2(base) > 1 + SIGNIFICANT * math.sqrt(2 / max(sum(fit.degrees for fit in base), 1))
-    low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
-    chosen = base
+def _joint_fit(curves: Sequence[Transfer], limit_dn: float, with_q: bool) -> JointFit | None:
+    fits = [fit for curve in curves if (fit := fit_curve(curve.upto(limit_dn), with_q)) is not None]
+    if len(fits) < len(curves):
+        return None
+    gains, errors, chi2, degrees = np.array(fits).T
+    weights, freedom = errors**-2, int(degrees.sum())
+    mean, error = float(weights @ gains / weights.sum()), float(weights.sum() ** -0.5)
+    return JointFit(fits, mean, error, float(chi2.sum()) / max(freedom, 1), freedom)
+
+
+def fit_gain(curves: Sequence[Transfer], span_dn: float) -> tuple[list[Estimate], bool]:
+    """Fit the gain of the sensor, then of each plane; True if the gains of the planes differ."""
+    few = sum(len(curve.upto(RANGES[-1] * span_dn).signal) for curve in curves) < 3 * len(curves)
+    ranges = [*RANGES, *[max(float(curve.signal.max()) for curve in curves) / span_dn] * few]
+    fits = {
+        (share, with_q): joint
+        for share, with_q in itertools.product(ranges, (False, True))
+        if (joint := _joint_fit(curves, share * span_dn, with_q)) is not None
+    }
+    chosen = base = fits[ranges[-1], False]
+    low, high = base.gain - NORMAL_95 * base.error, base.gain + NORMAL_95 * base.error
+    is_systematic = base.chi2 > 1 + SIGNIFICANT * math.sqrt(2 / max(base.degrees, 1))
+    for other in fits.values():
+        own = math.sqrt(max(other.error**2 - base.error**2, 0.0))  # the fits share the points of the smaller range
+        is_systematic |= other.error > base.error and abs(other.gain - base.gain) > SIGNIFICANT * own
     if is_systematic:
-        chosen = by_kind.get((ranges[-1], True), base)
-        value = _mean(chosen)[0]
-        # residuals beyond the noise are systematic too
-        inflated = {kind: _mean(fits)[1] * math.sqrt(max(_chi2(fits), 1.0)) for kind, fits in by_kind.items()}
-        low = min(means[kind][0] - NORMAL_95 * inflated[kind] for kind in means)
-        high = max(means[kind][0] + NORMAL_95 * inflated[kind] for kind in means)
-    if len(by_kind) == 1:
-        low, high = low - UNSEEN_CURVATURE * value, high + UNSEEN_CURVATURE * value
-    sensor = Estimate(value, low, high)
-    planes = [
-        Estimate(fit.gain, fit.gain - (value - low) * fit.error / error, fit.gain + (high - value) * fit.error / error)
-        if not is_systematic and len(by_kind) > 1
-        else Estimate(fit.gain, *_widened(fit, value, low, high))
-        for fit in chosen
-    ]
-    q, chi2 = float(np.mean([fit.q for fit in chosen])), _chi2(chosen)
-    return Gain(sensor, planes, q, chi2, is_systematic, _have_colours(chosen))
+        chosen = fits.get((ranges[-1], True), base)
+        low, high = min(fit.interval.low for fit in fits.values()), max(fit.interval.high for fit in fits.values())
+    if len(fits) == 1:
+        low, high = low - UNSEEN_CURVATURE * chosen.gain, high + UNSEEN_CURVATURE * chosen.gain
+    sensor, planes = Estimate(chosen.gain, low, high), [estimate(fit.gain, fit.error) for fit in chosen.planes]
+    if is_systematic or len(fits) == 1:
+        planes = [plane.times(sensor.scaled(1 / chosen.gain)) for plane in planes]
+    return [sensor, *planes], _have_colours(chosen)
 
 
-def _mean(fits: Sequence[Fit]) -> tuple[float, float]:
-    """Return the mean gain of the planes, weighted by their errors, and its standard error."""
-    weights = np.array([1 / fit.error**2 for fit in fits])
-    return float(weights @ [fit.gain for fit in fits] / weights.sum()), float(weights.sum() ** -0.5)
-
-
-def _chi2(fits: Sequence[Fit]) -> float:
-    """Return χ² over its degrees of freedom."""
-    return sum(fit.chi2 for fit in fits) / max(sum(fit.degrees for fit in fits), 1)
-
-
-def _widened(fit: Fit, value: float, low: float, high: float) -> tuple[float, float]:
-    """Return the interval of a plane: its statistical error, and the relative interval of the sensor."""
-    return (
-        fit.gain - math.hypot(NORMAL_95 * fit.error, (value - low) / value * fit.gain),
-        fit.gain + math.hypot(NORMAL_95 * fit.error, (high - value) / value * fit.gain),
-    )
-
-
-def _have_colours(fits: Sequence[Fit]) -> bool:
+def _have_colours(chosen: JointFit) -> bool:
     """True if the gains of planes differ by more than their errors, and by more than 0.3 %."""
-    value, _ = _mean(fits)
-    far = [abs(fit.gain - value) for fit in fits]
-    return any(distance > max(4 * fit.error, 0.003 * value) for distance, fit in zip(far, fits, strict=True))
+    return any(abs(fit.gain - chosen.gain) > max(4 * fit.error, 0.003 * chosen.gain) for fit in chosen.planes)
 
 
 def emva_gain(curve: Transfer) -> float:

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.calibration.gain import NORMAL_95, SIGNIFICANT, Estimate
+from unprocess_gen.calibration.gain import SIGNIFICANT, Estimate
+from unprocess_gen.statistics.scores import NORMAL_95
 
 MODE_RATIO = 0.85
 """Ratio of read noise to the least read noise of a gain mode, below which it belongs to another mode."""

@@ -3,39 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from unprocess_gen.calibration import checks
-from unprocess_gen.calibration.captures import Capture, CaptureSet, Sensor, with_measured_levels
-from unprocess_gen.calibration.frame_sums import (
-    FAR,
-    ROBUST,
-    SMOOTH,
-    TILE,
-    WINDOW,
-    FrameSums,
-    Measured,
-    high_passed,
-    summed,
-)
-from unprocess_gen.calibration.gain import (
-    NORMAL_95,
-    Estimate,
-    Gain,
-    Transfer,
-    combined,
-    emva_gain,
-    estimate,
-    fit_gain,
-    root_estimate,
-)
+from unprocess_gen.calibration.captures import Capture, CaptureSet, Sensor
+from unprocess_gen.calibration.frame_sums import FAR, SMOOTH, WINDOW, FrameSums, Measured, high_passed, robust_std
+from unprocess_gen.calibration.gain import Estimate, Transfer, combined, emva_gain, estimate, fit_gain, root_estimate
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fit_shape, histograms, joined_histogram
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
+from unprocess_gen.statistics.mosaics import TILE
 
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""
@@ -60,18 +40,12 @@ DEAD_RESPONSE, DEAD_SIGNAL = 0.2, 0.05
 
 @dataclass(frozen=True, slots=True)
 class Dark:
-    """Darks of one exposure: frames, noise, mean by block of sites, and high values of their fixed pattern.
-
-    ``hot_white_dn`` is the value of that pattern at white.
-    """
+    """Darks of one exposure: frames, noise, and the values of their fixed pattern above a threshold, in DN."""
 
     frames: list[Capture]
     measured: Measured
-    columns: Float
-    shading: Float
     hot_dn: Float
     hot_threshold_dn: float
-    hot_white_dn: float
 
     @property
     def exposure_s(self) -> float:
@@ -84,6 +58,7 @@ class Flat:
     """Flats of one level: frames, noise, number of the darks of the nearest exposure, and values of dead pixels, DN.
 
     ``signals_dn`` are the means of the planes minus the means of the darks; light is rarely neutral in raw values.
+    ``is_bright`` if it shows dead pixels, ``is_full`` if values reach white.
     """
 
     frames: list[Capture]
@@ -91,6 +66,7 @@ class Flat:
     dark: int
     dead_dn: Float
     is_bright: bool
+    is_full: bool
     signals_dn: Float
 
     @property
@@ -101,34 +77,28 @@ class Flat:
 
 @dataclass(frozen=True, slots=True)
 class IsoResult:
-    """Measured noise of one ISO; lists are by plane of `TILE`, and `black` ends with that of all planes."""
+    """Measured noise of one ISO.
+
+    ``numbers`` are the estimates by name: of the sensor, then of each plane of `TILE` if planes may differ. ``shapes``
+    are in the same order. ``dark`` are the darks from which read noise and offsets are measured.
+    """
 
     iso: float
-    gain: Gain
-    emva_gain: float
+    numbers: dict[str, list[Estimate]]
+    has_colours: bool
     curves: list[Transfer]
     darks: list[Dark]
+    dark: Dark
     flats: list[Flat]
-    reference: int
-    read: Estimate
-    reads: list[Estimate]
-    shape: ReadShape
     shapes: list[ReadShape]
     histogram: Histogram
-    row: Estimate
-    row_correlation: Estimate
-    column: Estimate
-    column_temporal: Estimate
-    black: list[Estimate]
-    dsnu_dn: Estimate
     prnu_squares: list[tuple[float, float]]
-    full_well_dn: Estimate | None = None
-    notes: list[str] = field(default_factory=list)
+    full_well_dn: Estimate | None
+    notes: list[str]
 
-    @property
-    def dark(self) -> Dark:
-        """Darks from which read noise and offsets are measured."""
-        return self.darks[self.reference]
+    def __getitem__(self, name: str) -> Estimate:
+        """Return an estimate of the sensor."""
+        return self.numbers[name][0]
 
 
 def measure_iso(
@@ -139,144 +109,111 @@ def measure_iso(
     With a ``known`` gain, only darks are measured.
     """
     sensor, notes = captures.sensor, list[str]()
-    darks = measure_darks(captures, iso, notes, watch)
-    reference = max(range(len(darks)), key=lambda number: (darks[number].measured.count, -number))
-    flats = list[Flat]()
+    darks = _darks(captures, iso, notes, watch)
+    dark = max(darks, key=lambda dark: dark.measured.count)
+    flats = _flats(captures, iso, darks, watch, notes) if known is None else []
     if known is None:
-        flats = _flats(captures, iso, darks, watch, notes)
         _check_levels(iso, flats, sensor, quick)
-    shapes, histogram = _shapes(darks[reference], watch)
-    checks.check_dark_noise(darks[reference].frames, sensor, _rounded_std(darks[reference].measured, shapes[0]))
+    shapes, histogram = _shapes(dark, watch)
+    checks.check_dark_noise(dark.frames, sensor, _rounded_std(dark.measured, shapes[0]))
     curves = [_curve(plane, darks, usable(flats), shapes[0]) for plane in range(4)] if flats else []
-    gain = Gain(known, [], 0.0, 0.0, False, False) if known else fit_gain(curves, sensor.span_dn)
+    gains, has_colours = ([known], False) if known else fit_gain(curves, sensor.span_dn)
+    numbers = {"dn_per_e": gains}
+    if curves:
+        value = float(np.mean([emva_gain(curve) for curve in curves]))
+        numbers["dn_per_e_emva1288"] = [estimate(value, gains[0].error)]
     return IsoResult(
         iso=iso,
-        gain=gain,
-        emva_gain=float(np.mean([emva_gain(curve) for curve in curves])) if curves else math.nan,
+        numbers=numbers | _dark_numbers(dark.measured, sensor, shapes),
+        has_colours=has_colours,
         curves=curves,
         darks=darks,
+        dark=dark,
         flats=flats,
-        reference=reference,
-        shape=shapes[0],
-        shapes=shapes[1:],
+        shapes=shapes,
         histogram=histogram,
         prnu_squares=_prnu_squares(usable(flats), darks, watch) if flats else [],
-        full_well_dn=_full_well(flats, sensor, gain) if flats else None,
+        full_well_dn=_full_well(flats, sensor, gains, has_colours) if flats else None,
         notes=notes,
-        **_dark_estimates(darks[reference], sensor, shapes),
     )
 
 
-def measure_darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> list[Dark]:
+def _darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> list[Dark]:
     """Measure the darks of one ISO, in ascending order of exposures; ConfigError if there are none."""
     darks = list[Dark]()
     for frames in _groups(captures, "dark", iso, notes):
-        dark = _dark(frames, captures.sensor, watch)
-        moment = max(float(dark.measured.variance.mean()) - ROUNDING_DN2, 0.0)
+        sums = _summed(frames, captures.sensor, watch)
+        measured = sums.measure()
+        moment = max(float(measured.variance.mean()) - ROUNDING_DN2, 0.0)
         if captures.sensor.bits <= 8 or moment < LEAST_FITTED_DN2:
             checks.check_dark_noise(frames, captures.sensor, math.sqrt(moment))
-        if darks and checks.is_clipped(dark.measured):
+        if darks and checks.is_clipped(measured):
             notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
             continue
-        checks.check_dark(frames, captures.sensor, dark.measured, notes)
-        darks.append(dark)
+        checks.check_dark(frames, captures.sensor, measured, notes)
+        patterns = [high_passed(plane) for plane in _planes(sums.mean_frame())]
+        threshold = FAR * max(*(robust_std(pattern)[1] for pattern in patterns), 0.05)
+        hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
+        darks.append(Dark(frames, measured, hot / SMOOTH, threshold / SMOOTH))
     if not darks:
         raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
     return darks
 
 
-def _groups(captures: CaptureSet, kind: str, iso: float, notes: list[str]) -> list[list[Capture]]:
-    """Return the measurements of a kind; single frames are left out with a note."""
-    groups = []
+def _groups(captures: CaptureSet, kind: str, iso: float, notes: list[str]) -> Iterator[list[Capture]]:
+    """Yield the measurements of a kind; single frames are left out with a note."""
     for frames in captures.groups(kind, iso):
         if len(frames) < LEAST_FRAMES:
             notes.append(f"{checks.place(frames)}: one frame shows no noise, and is left out")
         else:
-            groups.append(frames)
-    return groups
+            yield frames
 
 
-def _add(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSums:
+def _summed(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSums:
     """Sum frames; ConfigError names one of another size."""
-
-    def pixels() -> Iterable[Any]:
-        for frame in watch(frames):
-            mosaic = frame.pixels()
-            if mosaic.shape != sensor.shape:
-                raise ConfigError(
-                    f"calibrate: {frame.path}: has {mosaic.shape[1]} x {mosaic.shape[0]} pixels; expected "
-                    f"{sensor.shape[1]} x {sensor.shape[0]}, as the first frame has"
-                )
-            if int(mosaic.max()) >= 2**sensor.bits:
-                raise ConfigError(
-                    f"calibrate: {frame.path}: has values up to {mosaic.max()} DN; expected {sensor.bits} bits; "
-                    "correct bits in captures.csv"
-                )
-            yield mosaic
-
-    return summed(pixels(), sensor.white_dn)
+    sums = FrameSums()
+    for frame in watch(frames):
+        mosaic = frame.pixels()
+        if mosaic.shape != sensor.shape:
+            raise ConfigError(
+                f"calibrate: {frame.path}: has {mosaic.shape[1]} x {mosaic.shape[0]} pixels; expected "
+                f"{sensor.shape[1]} x {sensor.shape[0]}, as the first frame has"
+            )
+        if int(mosaic.max()) >= 2**sensor.bits:
+            raise ConfigError(
+                f"calibrate: {frame.path}: has values up to {mosaic.max()} DN; expected {sensor.bits} bits; "
+                "correct bits in captures.csv"
+            )
+        sums.add(mosaic)
+    return sums
 
 
-def _dark(frames: list[Capture], sensor: Sensor, watch: Watch) -> Dark:
-    sums = _add(frames, sensor, watch)
-    measured = sums.measure()
-    mean = sums.mean_frame()
-    patterns = [high_passed(mean[y::2, x::2]) for y, x in TILE]
-    spread = [ROBUST * float(np.median(np.abs(pattern - np.median(pattern)))) for pattern in patterns]
-    threshold = FAR * max(*spread, 0.05)
-    hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
-    white_dn = sensor.white_dn - float(measured.mean_dn.max())
-    return Dark(frames, measured, sums.column_offsets(), _block_means(mean), hot / SMOOTH, threshold / SMOOTH, white_dn)
-
-
-def _block_means(frame: Float) -> Float:
-    """Return the means of up to 64 x 64 blocks of a frame."""
-    side = max(2, min(frame.shape) // 64 * 2)
-    height, width = (length // side for length in frame.shape)
-    return np.asarray(frame[: height * side, : width * side].reshape(height, side, width, side).mean(axis=(1, 3)))
+def _planes(mosaic: Float) -> list[Float]:
+    return [mosaic[y::2, x::2] for y, x in TILE]
 
 
 def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch, notes: list[str]) -> list[Flat]:
     """Measure the levels that are not saturated, in ascending order."""
     sensor, flats = captures.sensor, []
-    for frames in _levels(captures, iso, notes):
-        sums = _add(frames, sensor, watch)
+    for frames in _groups(captures, "flat", iso, notes):
+        sums = _summed(frames, sensor, watch)
         measured = sums.measure()
         seconds = frames[0].exposure_s or 0.0
         nearest = min(range(len(darks)), key=lambda number: abs(darks[number].exposure_s - seconds))
         dark = darks[nearest].measured
         signals = measured.mean_dn - dark.mean_dn
-        if measured.full_share > FULL_SHARE:
-            notes.append(
-                f"{checks.place(frames)}: {measured.full_share:.2%} of the values are at white; left out of fits"
-            )
+        full_share = float(measured.codes[:, int(sensor.white_dn) :].sum() / measured.codes.sum())
+        if full_share > FULL_SHARE:
+            notes.append(f"{checks.place(frames)}: {full_share:.2%} of the values are at white; left out of fits")
         else:
             checks.check_flat(frames, sensor, measured, dark, notes)
         dead, is_bright = np.zeros(0), DEAD_SIGNAL * sensor.span_dn < signals.min()
         if is_bright:
-            mean, limits = sums.mean_frame(), dark.mean_dn + DEAD_RESPONSE * signals
-            planes = [mean[y::2, x::2] for y, x in TILE]
-            dead = np.concatenate([plane[plane < limit] for plane, limit in zip(planes, limits, strict=True)])
-        flats.append(Flat(frames, measured, nearest, dead, is_bright, signals))
+            limits = dark.mean_dn + DEAD_RESPONSE * signals
+            planes = zip(_planes(sums.mean_frame()), limits, strict=True)
+            dead = np.concatenate([plane[plane < limit] for plane, limit in planes])
+        flats.append(Flat(frames, measured, nearest, dead, is_bright, full_share > FULL_SHARE, signals))
     return sorted(flats, key=lambda flat: flat.signal_dn)
-
-
-def _levels(captures: CaptureSet, iso: float, notes: list[str]) -> Iterable[list[Capture]]:
-    """Return the frames of each level; frames without a stated level are grouped by exposure and mean."""
-    groups: list[list[Capture]] = []
-    for frames in captures.groups("flat", iso):
-        if frames[0].level or len(frames) <= LEAST_FRAMES:
-            groups.append(frames)
-            continue
-        signals = {frame.path: float(frame.pixels().mean()) - captures.sensor.black_dn for frame in frames}
-        named = with_measured_levels(frames, signals)
-        levels = sorted({frame.level for frame in named})
-        groups += [[frame for frame in named if frame.level == level] for level in levels]
-    for frames in groups:
-        if len(frames) < LEAST_FRAMES:
-            notes.append(f"{checks.place(frames)}: one frame shows no noise, and is left out")
-        else:
-            yield frames
 
 
 def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor, quick: bool) -> None:
@@ -304,7 +241,7 @@ def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor, quick: bool
 def _shapes(dark: Dark, watch: Watch) -> tuple[list[ReadShape], Histogram]:
     """Fit the distribution of the read noise of all planes, then of each plane."""
     std = math.sqrt(float(dark.measured.variance.mean()))
-    counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.columns, std)
+    counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.measured.column_offsets, std)
     together = joined_histogram(counts)
     first = fit_shape(together)
     return [first, *(fit_shape(histogram, first) for histogram in counts)], together
@@ -334,55 +271,52 @@ def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: Read
     )
 
 
-def _dark_estimates(dark: Dark, sensor: Sensor, shapes: Sequence[ReadShape]) -> dict[str, Any]:
-    """Return the estimates of an `IsoResult` that darks give, by field."""
-    measured, columns = dark.measured, dark.measured.column
+def _dark_numbers(measured: Measured, sensor: Sensor, shapes: Sequence[ReadShape]) -> dict[str, list[Estimate]]:
+    """Return the estimates that darks give."""
+    columns, fixed_column = measured.column, measured.fixed_column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
-    variances = [_variance(measured, plane, shapes[0]) - ROUNDING_DN2 - temporal for plane in range(4)]
-    reads = [
-        root_estimate(variance, math.hypot(float(error), columns[1] if temporal else 0.0))
-        for variance, error in zip(variances, measured.error, strict=True)
-    ]
-    read = root_estimate(float(np.mean(variances)), float(np.linalg.norm(measured.error)) / 4)
-    row, correlation = root_estimate(*measured.row), measured.row_correlation
+    variances = np.array([_variance(measured, plane, shapes[0]) - ROUNDING_DN2 - temporal for plane in range(4)])
+    errors = np.hypot(measured.error, columns[1] if temporal else 0.0)
+    row, (correlation, error) = root_estimate(*measured.row), measured.row_correlation
+    dsnu = float((measured.fixed - max(fixed_column[0], 0.0)).mean())
     return {
-        "read": read,
-        "reads": reads,
-        "row": row,
-        "row_correlation": estimate(correlation[0] if row.value else 0.0, correlation[1] if row.value else 1.0),
-        "column": root_estimate(*measured.fixed_column),
-        "column_temporal": root_estimate(*columns),
-        "black": [
+        "read_std_dn": [
+            root_estimate(float(variances.mean()), float(np.linalg.norm(measured.error)) / 4),
+            *map(root_estimate, variances.tolist(), errors.tolist()),
+        ],
+        "read_shape": [shape.interval for shape in shapes],
+        "row_std_dn": [row],
+        "row_correlation": [estimate(correlation, error) if row.value else estimate(0.0, 1.0)],
+        "column_std_dn": [root_estimate(*fixed_column)],
+        "column_temporal_std_dn": [root_estimate(*columns)],
+        "dsnu_std_dn": [root_estimate(dsnu, float(np.linalg.norm(measured.fixed_error)) / 4)],
+        "black_error_dn": [
             estimate(float(mean) - sensor.black_dn, float(error))
             for mean, error in zip(_with_mean(measured.mean_dn), _black_errors(measured, variances), strict=True)
         ],
-        "dsnu_dn": root_estimate(
-            float((measured.fixed - max(measured.fixed_column[0], 0.0)).mean()),
-            float(np.linalg.norm(measured.fixed_error)) / 4,
-        ),
     }
 
 
 def _with_mean(planes: Float) -> Float:
-    """Numbers of the planes, and their mean."""
-    return np.append(planes, planes.mean(axis=-1, keepdims=True), axis=-1)
+    """Mean of the numbers of the planes, and these numbers."""
+    return np.append(planes.mean(axis=-1, keepdims=True), planes, axis=-1)
 
 
-def _black_errors(measured: Measured, variances: Sequence[float]) -> Float:
-    """Standard errors of the black of each plane, and of all; two planes share the offset of a line."""
-    height, width = np.outer(measured.shape, [1, 1, 1, 1, 2])
-    sites = np.array([1, 1, 1, 1, 4]) * measured.sites
+def _black_errors(measured: Measured, variances: Float) -> Float:
+    """Standard errors of the black of all planes, and of each; two planes share the offset of a line."""
+    height, width = np.outer(measured.shape, [2, 1, 1, 1, 1])
+    sites = np.array([4, 1, 1, 1, 1]) * measured.sites
     drift = _with_mean(measured.frame_means).var(axis=0, ddof=1) / measured.count
     per_line = max(measured.fixed_column[0], 0.0) / width + max(measured.fixed.mean(), 0.0) / sites
     own = (_with_mean(measured.variance) / sites + max(measured.row[0], 0.0) / height) / measured.count
-    ripple = math.exp(-2 * math.pi**2 * float(np.mean(variances))) / math.pi
+    ripple = math.exp(-2 * math.pi**2 * float(variances.mean())) / math.pi
     drifts = drift > own * (1 + 4 * math.sqrt(2 / (measured.count - 1)))  # the black level changes between frames
     return np.asarray(np.sqrt(np.where(drifts, drift, own) + per_line + ripple**2))
 
 
 def usable(flats: Sequence[Flat]) -> list[Flat]:
     """Return the levels below saturation: not at white, and no plane beyond its largest variance."""
-    below = [flat for flat in flats if flat.measured.full_share <= FULL_SHARE]
+    below = [flat for flat in flats if not flat.is_full]
     variances = np.array([flat.measured.variance for flat in below]).reshape(-1, 4)
     is_rising = variances > variances.max(axis=0, initial=0) * STILL_RISING
     is_rising |= np.arange(len(below))[:, None] <= np.argmax(np.vstack([variances, np.zeros(4)]), axis=0)
@@ -406,8 +340,8 @@ def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) ->
         share = counts * np.square(weights) / scale**2
         rows = share @ [max(flat.measured.row[0], 0.0) for flat in flats] * (1 - 1 / WINDOW)
         pattern = high_passed(total[y::2, x::2] / scale)
-        deviation = np.abs(pattern - np.median(pattern))
-        pattern = pattern[deviation <= FAR * ROBUST * np.median(deviation)]
+        distance, std = robust_std(pattern)
+        pattern = pattern[distance <= FAR * std]
         noise = share @ [flat.measured.variance[plane] for flat in flats]
         dark_factor = float(counts @ weights / scale) ** 2
         dark = darks[flats[-1].dark].measured
@@ -417,14 +351,14 @@ def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) ->
     return squares
 
 
-def _full_well(flats: Sequence[Flat], sensor: Sensor, gain: Gain) -> Estimate | None:
+def _full_well(flats: Sequence[Flat], sensor: Sensor, gains: Sequence[Estimate], has_colours: bool) -> Estimate | None:
     """Return the signal of full pixels, DN: the largest mean of the planes whose variance has fallen.
 
     None if the converter ends first, or no level is that bright. If only some planes are full, the signal is scaled
     from their gain to the gain of the sensor.
     """
     chosen = usable(flats)
-    beyond = [flat for flat in flats if flat not in chosen and flat.measured.full_share <= FULL_SHARE]
+    beyond = [flat for flat in flats if flat not in chosen and not flat.is_full]
     if not beyond:
         return None
     variances = np.array([flat.measured.variance for flat in (*chosen, *beyond)])
@@ -434,9 +368,8 @@ def _full_well(flats: Sequence[Flat], sensor: Sensor, gain: Gain) -> Estimate | 
     if level > LARGEST_WELL * sensor.span_dn:
         return None
     is_flat = bool((variances[-1] < variances[len(chosen) - 1] / 4)[planes].all())  # all their pixels are full
-    low, high = (0.995, 1.005) if is_flat else (below / level, 1.1)
-    if not gain.has_colours or planes.all():
-        return Estimate(level, level * low, level * high)
-    own = combined([plane for plane, is_in in zip(gain.planes, planes, strict=True) if is_in])
-    level, error = level * gain.sensor.value / own.value, NORMAL_95 * own.error / own.value
-    return Estimate(level, level * (1 - math.hypot(1 - low, error)), level * (1 + math.hypot(high - 1, error)))
+    full = Estimate(level, level * 0.995, level * 1.005) if is_flat else Estimate(level, below, level * 1.1)
+    if not has_colours or planes.all():
+        return full
+    own = combined([gain for gain, is_in in zip(gains[1:], planes, strict=True) if is_in])
+    return full.over(own).scaled(gains[0].value)

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from unprocess_gen.calibration.body import BodyResult
+from unprocess_gen.calibration.body import Body
 from unprocess_gen.calibration.captures import CaptureSet, Sensor
-from unprocess_gen.calibration.frame_sums import plane_names
 from unprocess_gen.calibration.gain import Estimate, estimate
 from unprocess_gen.calibration.iso_laws import (
     DIGITS,
@@ -26,19 +25,36 @@ from unprocess_gen.calibration.iso_laws import (
 )
 from unprocess_gen.calibration.measure import IsoResult
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
+from unprocess_gen.simulation.reference.cfa import MONO
+from unprocess_gen.statistics.mosaics import plane_names
 
 MARK = "by gen-dataset calibrate"
 """Part of the first line of a profile, by which a later run recognises it."""
 
 
+UNITS = {
+    "dn_per_e": "DN/e",
+    "dn_per_e_emva1288": "DN/e",
+    "b_dn2": "DN²",
+    "dark_e_per_s": "e/s",
+    "hot_pixel_e_per_s": "e/s",
+    "dark_doubling_c": "degrees Celsius",
+}
+"""Units of numbers; others are in DN or in electrons as their names end, or without a unit."""
+
+
 class NamedNumber(NamedTuple):
-    """An estimate of the list: name, ISO and site (None for all), number (None if captures do not show it), unit."""
+    """An estimate of the list: name, ISO and site (None for all), number (None if captures do not show it)."""
 
     name: str
     iso: float | None
     site: str | None
     number: Estimate | None
-    unit: str
+
+    @property
+    def unit(self) -> str:
+        """Unit, empty for a number without one."""
+        return UNITS.get(self.name, {"dn": "DN", "e": "e"}.get(self.name.rpartition("_")[2], ""))
 
 
 class KnownGain(NamedTuple):
@@ -55,7 +71,7 @@ class Calibration:
 
     captures: CaptureSet
     isos: list[IsoResult]
-    body: BodyResult
+    body: Body
     notes: list[str]
     known: KnownGain | None = None
 
@@ -67,53 +83,26 @@ class Calibration:
 
 def site_names(sensor: Sensor) -> list[str]:
     """Return the names of the planes of a sensor; none for a monochrome one, whose sites are equal."""
-    return [] if sensor.pattern == "MONO" else plane_names(sensor.pattern)
+    return [] if sensor.pattern == MONO else plane_names(sensor.pattern)
 
 
 def estimates(calibration: Calibration) -> list[NamedNumber]:
-    """Return the list of all estimates."""
+    """Return the list of all estimates: those of the body, then those of each ISO."""
     sites, known = site_names(calibration.sensor), calibration.known
-    by_iso = [_iso_estimates(result, known, sites) for result in calibration.isos]
-    return [*_body_estimates(calibration), *(entry for entries in by_iso for entry in entries)]
+    listed = list(_named(calibration.body.numbers, None, sites))
+    for result in calibration.isos:
+        gain = {"dn_per_e": [known.by_iso[result.iso]]} if known and result.iso in known.by_iso else {}
+        listed += _named(result.numbers | gain, result.iso, sites)
+    return listed
 
 
-def _iso_estimates(result: IsoResult, known: KnownGain | None, sites: Sequence[str]) -> Iterator[NamedNumber]:
-    """Yield the estimates of one ISO."""
-    iso, shape = result.iso, result.shape
-    gain = known.by_iso.get(iso, result.gain.sensor) if known else result.gain.sensor
-    yield NamedNumber("dn_per_e", iso, None, gain, "DN/e")
-    if result.curves:
-        yield NamedNumber("dn_per_e_emva1288", iso, None, estimate(result.emva_gain, result.gain.sensor.error), "DN/e")
-    yield NamedNumber("read_std_dn", iso, None, result.read, "DN")
-    yield NamedNumber("read_shape", iso, None, shape.interval, "")
-    yield NamedNumber("row_std_dn", iso, None, result.row, "DN")
-    yield NamedNumber("row_correlation", iso, None, result.row_correlation, "")
-    yield NamedNumber("column_std_dn", iso, None, result.column, "DN")
-    yield NamedNumber("column_temporal_std_dn", iso, None, result.column_temporal, "DN")
-    yield NamedNumber("dsnu_std_dn", iso, None, result.dsnu_dn, "DN")
-    yield NamedNumber("black_error_dn", iso, None, result.black[-1], "DN")
-    for site, gain in zip(sites, result.gain.planes, strict=False):
-        yield NamedNumber("dn_per_e", iso, site, gain, "DN/e")
-    for site, read, plane_shape, error in zip(sites, result.reads, result.shapes, result.black, strict=False):
-        yield NamedNumber("read_std_dn", iso, site, read, "DN")
-        yield NamedNumber("read_shape", iso, site, plane_shape.interval, "")
-        yield NamedNumber("black_error_dn", iso, site, error, "DN")
-
-
-def _body_estimates(calibration: Calibration) -> Iterator[NamedNumber]:
-    """Yield the estimates that do not depend on ISO."""
-    body = calibration.body
-    yield NamedNumber("prnu_std", None, None, body.prnu, "")
-    for site, prnu in zip(site_names(calibration.sensor), body.prnus, strict=False):
-        yield NamedNumber("prnu_std", None, site, prnu, "")
-    yield NamedNumber("dsnu_std_e", None, None, body.dsnu_e, "e")
-    yield NamedNumber("dark_e_per_s", None, None, body.dark_e_per_s, "e/s")
-    yield NamedNumber("dark_doubling_c", None, None, body.dark_doubling_c, "degrees Celsius")
-    yield NamedNumber("hot_pixel_share", None, None, body.hot_share, "")
-    yield NamedNumber("hot_pixel_e_per_s", None, None, body.hot_e_per_s, "e/s")
-    yield NamedNumber("dead_pixel_share", None, None, body.dead_share, "")
-    yield NamedNumber("dead_pixel_level", None, None, body.dead_level, "")
-    yield NamedNumber("full_well_e", None, None, body.full_well_e, "e")
+def _named(
+    numbers: Mapping[str, Sequence[Estimate | None]], iso: float | None, sites: Sequence[str]
+) -> Iterator[NamedNumber]:
+    """Yield estimates of the sensor, then of its sites."""
+    for name, (sensor, *planes) in numbers.items():
+        yield NamedNumber(name, iso, None, sensor)
+        yield from (NamedNumber(name, iso, site, plane) for site, plane in zip(sites, planes, strict=False))
 
 
 def estimates_json(named: Sequence[NamedNumber], digits: int = DIGITS) -> str:
@@ -142,11 +131,10 @@ UNKNOWN_REASONS = {
 
 def unknown_numbers(calibration: Calibration) -> list[str]:
     """Return a note for each number that is null."""
-    known = {entry.name: entry.number for entry in _body_estimates(calibration) if entry.site is None}
     return [
         f"{name} is null: the captures do not show it; {advice}"
         for name, advice in UNKNOWN_REASONS.items()
-        if known[name] is None
+        if calibration.body[name] is None
     ]
 
 
@@ -181,8 +169,8 @@ def measured_yaml(calibration: Calibration, name: str, two_parameter: bool) -> s
     """Return the noise profile of measured frames."""
     profile, isos = profile_head(name, calibration.sensor), [result.iso for result in calibration.isos]
     if two_parameter and len(isos) == 1:
-        result = calibration.isos[0]
-        numbers = {"a": result.gain.sensor, "b": dark_variance(result)}
+        (result,) = calibration.isos
+        numbers = {"a": result["dn_per_e"], "b": dark_variance(result)}
         profile |= {key: rounded(number.value) for key, number in numbers.items()} | {"negative_variance": "refuse"}
     else:
         branches = [[calibration.isos[place] for place in places] for places in iso_branches(calibration.isos)]
@@ -197,43 +185,40 @@ def measured_yaml(calibration: Calibration, name: str, two_parameter: bool) -> s
 
 def iso_branches(results: Sequence[IsoResult]) -> list[list[int]]:
     """Return the places of the ISOs of each branch."""
-    isos, reads = [result.iso for result in results], [result.read for result in results]
-    return joined_branches(isos, [result.gain.sensor for result in results], modes(isos, reads))
+    isos = [result.iso for result in results]
+    gains, reads = ([result[name] for result in results] for name in ("dn_per_e", "read_std_dn"))
+    return joined_branches(isos, gains, modes(isos, reads))
 
 
 def dark_variance(result: IsoResult) -> Estimate:
     """Return the variance of a site without light, DN², all dark noise but rounding."""
-    others = (result.row, result.column, result.column_temporal, result.dsnu_dn)
-    value = result.read.value**2 + sum(number.value**2 for number in others)
-    error = 2 * math.sqrt(sum((number.value * number.error) ** 2 for number in (result.read, *others)))
-    return estimate(value, error, 0.0)
+    names = ("read_std_dn", "row_std_dn", "column_std_dn", "column_temporal_std_dn", "dsnu_std_dn")
+    stds = [result[name] for name in names]
+    error = 2 * math.sqrt(sum((std.value * std.error) ** 2 for std in stds))
+    return estimate(sum(std.value**2 for std in stds), error, 0.0)
 
 
 def _branch(results: Sequence[IsoResult], sensor: Sensor, two_parameter: bool) -> dict[str, Any]:
     """Return a branch; the keys of two numbers are gain, and noise without light."""
-    isos, reads = [result.iso for result in results], [result.read for result in results]
-    gains = [result.gain.sensor for result in results]
+    isos, gains = [result.iso for result in results], [result["dn_per_e"] for result in results]
     branch = {"iso": [isos[0], isos[-1]], "dn_per_e": gain_law(isos, gains), "read_law": "gaussian"}
     if two_parameter:
         variances = [dark_variance(result) for result in results]
         reads = [estimate(math.sqrt(b.value), b.error / 2 / math.sqrt(b.value)) for b in variances]
         return branch | {"read_std_dn": std_law(isos, reads)}
-    if any(result.shape.is_tukey for result in results):
-        shapes = [result.shape.shape if result.shape.is_tukey else NORMAL_SHAPE for result in results]
-        branch |= {"read_law": "tukey_lambda", "read_shape": shape_law(isos, shapes)}
-    branch["read_std_dn"] = std_law(isos, reads)
-    branch["row_std_dn"] = std_law(isos, [result.row for result in results])
-    branch["column_std_dn"] = std_law(isos, [result.column for result in results])
-    if (temporal := max(result.column_temporal.value for result in results)) > 0:  # the key takes no table
+    shapes = [result.shapes[0] for result in results]
+    if any(shape.is_tukey for shape in shapes):
+        values = [shape.shape if shape.is_tukey else NORMAL_SHAPE for shape in shapes]
+        branch |= {"read_law": "tukey_lambda", "read_shape": shape_law(isos, values)}
+    for name in ("read_std_dn", "row_std_dn", "column_std_dn"):
+        branch[name] = std_law(isos, [result[name] for result in results])
+    if (temporal := max(result["column_temporal_std_dn"].value for result in results)) > 0:  # the key takes no table
         branch["column_temporal_std_dn"] = rounded(temporal)
-    blacks = [_by_colour([number.value for number in result.black], sensor) for result in results]
-    return branch | {"black_error_dn": black_law(isos, blacks, bool(site_names(sensor)))}
-
-
-def _by_colour(values: Sequence[float], sensor: Sensor) -> list[float]:
-    """Return the values of planes as R, G1, B, G2; for a monochrome sensor the last one, of all planes."""
     names = site_names(sensor)
-    return [values[names.index(name)] for name in ("R", "Gr", "B", "Gb")] if names else [values[-1]]
+    # of red, both greens and blue; a monochrome sensor has one
+    places = [1 + names.index(name) for name in ("R", "Gr", "B", "Gb")] if names else [0]
+    blacks = [[result.numbers["black_error_dn"][place].value for place in places] for result in results]
+    return branch | {"black_error_dn": black_law(isos, blacks, bool(names))}
 
 
 WITH_DEFAULTS = ("dark_doubling_c", "dead_pixel_level", "dsnu_std_e", "hot_pixel_e_per_s")
@@ -242,29 +227,28 @@ WITH_DEFAULTS = ("dark_doubling_c", "dead_pixel_level", "dsnu_std_e", "hot_pixel
 
 def _common_keys(calibration: Calibration) -> dict[str, Any]:
     """Return the keys that do not depend on ISO; null for numbers that the captures do not show."""
-    known = {entry.name: entry.number for entry in _body_estimates(calibration) if entry.site is None}
     keys: dict[str, Any] = {} if (gains := _gains_by_colour(calibration)) is None else {"gain_by_colour": gains}
-    correlations = [result.row_correlation for result in calibration.isos]
+    correlations = [result["row_correlation"] for result in calibration.isos]
     row = max(correlations, key=lambda number: abs(number.value) / max(number.error, 1e-9))
     if abs(row.value) > 4 * row.error and abs(row.value) > 0.02:
         keys["row_correlation"] = rounded(max(min(row.value, 0.95), -0.95))
-    for name, number in known.items():
+    for name, (number, *_) in calibration.body.numbers.items():
         if number is not None or name not in WITH_DEFAULTS:
             keys[name] = None if number is None else rounded(number.value)
-    if known["dark_e_per_s"] is not None:
-        keys["dark_reference_c"] = calibration.body.dark_reference_c or ASSUMED_C
+    if calibration.body["dark_e_per_s"] is not None:
+        keys["dark_reference_c"] = calibration.body.reference_c or ASSUMED_C
     return keys
 
 
 def _gains_by_colour(calibration: Calibration) -> list[float] | None:
     """Return the gains of red, green and blue relative to the sensor's, if they differ at most ISOs."""
     names = site_names(calibration.sensor)
-    differing = [result.gain for result in calibration.isos if result.gain.has_colours]
+    differing = [result.numbers["dn_per_e"] for result in calibration.isos if result.has_colours]
     if not names or 2 * len(differing) <= len(calibration.isos):
         return None
-    relative = [[plane.value / gain.sensor.value for plane in gain.planes] for gain in differing]
-    by_name = dict(zip(names, (sum(values) / len(values) for values in zip(*relative, strict=True)), strict=True))
-    return [rounded(by_name["R"]), rounded((by_name["Gr"] + by_name["Gb"]) / 2), rounded(by_name["B"])]
+    relative = [[plane.value / sensor.value for plane in planes] for sensor, *planes in differing]
+    means = dict(zip(names, (sum(values) / len(values) for values in zip(*relative, strict=True)), strict=True))
+    return [rounded(means["R"]), rounded((means["Gr"] + means["Gb"]) / 2), rounded(means["B"])]
 
 
 ABSOLUTE = ("black_error_dn", "read_shape", "row_correlation")

@@ -8,16 +8,17 @@ widens the histogram of r.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.calibration.frame_sums import TILE
-from unprocess_gen.calibration.gain import NORMAL_95, Estimate
+from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.core.types import Float
+from unprocess_gen.statistics.mosaics import TILE
+from unprocess_gen.statistics.scores import NORMAL_95
 
 NORMAL_SHAPE = 0.1349
 """Shape at which Tukey's lambda is nearest to the normal distribution."""
@@ -25,7 +26,7 @@ LEAST_SHAPE, LARGEST_SHAPE = -0.449, 2.0
 PARTS, REACH = 16, 8
 """Bins of a standard deviation, and half the range in standard deviations; values beyond are in the last bins."""
 STEPS = np.array([2e-3, 1e-2])
-"""Steps in the logarithm of the standard deviation and in λ between which the likelihood is a parabola."""
+"""Steps in the logarithm of the standard deviation and in λ over which probabilities change linearly."""
 FLOOR = 1e-9
 """Probability of values that no distribution explains, such as defects."""
 ROW_FACTOR = 2.0
@@ -76,9 +77,8 @@ def histograms(frames: Iterable[NDArray[np.uint16]], columns: Float, std_dn: flo
         planes = np.stack([pixels[y::2, x::2] for y, x in TILE]).astype(np.float32)
         rows = planes.mean(axis=2, keepdims=True, dtype=np.float64)
         levels = rows.mean(axis=1, keepdims=True)
-        offsets = (
-            (rows - levels).reshape(2, 2, -1, 1).mean(axis=1).repeat(2, axis=0)
-        )  # planes of a row share its offset
+        # planes of a row share its offset
+        offsets = (rows - levels).reshape(2, 2, -1, 1).mean(axis=1).repeat(2, axis=0)
         rest = planes - (levels + offsets + columns[:, None, :]).astype(np.float32)
         places = np.clip(np.rint(rest / np.float32(width)), -half, half).astype(np.int32) + half
         counts += [np.bincount(place.ravel(), minlength=2 * half + 1) for place in places]
@@ -90,35 +90,39 @@ def joined_histogram(parts: Sequence[Histogram]) -> Histogram:
     return Histogram(np.sum([part.counts for part in parts], axis=0), parts[0].width, parts[0].sites)
 
 
-def probabilities(values: Float, std: float, shape: float | None) -> Float:
-    """Return P(r) of Tukey's lambda, or without a shape of a normal distribution."""
+def cumulative(std: float, shape: float | None) -> Callable[[Float], Float]:
+    """Return F of Tukey's lambda, or without a shape of a normal distribution."""
     from scipy.special import ndtr, tklmbda
 
     if shape is None:
-        return np.asarray(ndtr((values + 0.5) / std) - ndtr((values - 0.5) / std))
+        return lambda values: np.asarray(ndtr(values / std))
     scale = float(tukey_std(shape)) / std
-    return np.asarray(tklmbda((values + 0.5) * scale, shape) - tklmbda((values - 0.5) * scale, shape))
+    return lambda values: np.asarray(tklmbda(values * scale, shape))
+
+
+def probabilities(values: Float, std: float, shape: float | None) -> Float:
+    """Return P(r)."""
+    below = cumulative(std, shape)
+    return np.asarray(below(values + 0.5) - below(values - 0.5))
 
 
 def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape:
     """Fit a normal distribution and Tukey's lambda to a histogram."""
     from scipy.optimize import minimize, minimize_scalar
-    from scipy.special import ndtr, tklmbda
 
-    used = histogram.counts > 0
-    counts, values, end = histogram.counts[used], histogram.centres[used], float(histogram.centres[-1])
+    counts, values = histogram.counts, histogram.centres
+    is_end = np.abs(values) == values[-1]
+
+    def likelihoods(log_std: float, shape: float | None = None) -> Float:
+        std = math.exp(log_std)
+        tail = cumulative(std, shape)(values[:1])
+        return np.maximum(np.where(is_end, tail, probabilities(values, std, shape)), FLOOR)
 
     def surprise(log_std: float, shape: float | None = None) -> float:
         """Return the negative logarithm of the likelihood."""
-        std = math.exp(log_std)
-        if shape is None:
-            tail = ndtr(-end / std)
-        elif LEAST_SHAPE < shape < LARGEST_SHAPE:
-            tail = tklmbda(-end / std * float(tukey_std(shape)), shape)
-        else:
+        if shape is not None and not LEAST_SHAPE < shape < LARGEST_SHAPE:
             return math.inf
-        likelihoods = np.where(np.abs(values) < end, probabilities(values, std, shape), tail)
-        return -float(counts @ np.log(np.maximum(likelihoods, FLOOR)))
+        return -float(counts @ np.log(likelihoods(log_std, shape)))
 
     first = math.log(math.sqrt(float(counts @ values**2 / counts.sum())))
     normal = minimize_scalar(surprise, bounds=(first - 1, first + 1), method="bounded", options={"xatol": 1e-6})
@@ -133,9 +137,11 @@ def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape
         for begin in starts
     ]
     best = min(results, key=lambda result: float(result.fun))
-    around = np.array([(first, second) for first in (-1, 0, 1) for second in (-1, 0, 1)])
-    heights = [surprise(*(best.x + STEPS * place).tolist()) for place in around]
-    error = _error_of_shape(around, np.array(heights))
+    # Fisher's information of both numbers
+    steps, expected = np.diag(STEPS), counts.sum() * np.where(is_end, 1.0, histogram.width) * likelihoods(*best.x)
+    slopes = [(likelihoods(*(best.x + step)) - likelihoods(*(best.x - step))) / 2 / step.sum() for step in steps]
+    relative = np.stack(slopes) / likelihoods(*best.x)
+    error = math.sqrt(np.linalg.inv(relative * expected @ relative.T)[1, 1])
     pull = float(best.x[1] - NORMAL_SHAPE) / histogram.sites
     systematic = abs(pull) * (1 if pull < 0 else 4) + _rounding_error(math.exp(best.x[0]), best.x[1])
     shape, half = float(best.x[1]) + ROW_FACTOR * pull, math.hypot(NORMAL_95 * error, systematic)
@@ -149,14 +155,3 @@ def _rounding_error(std: float, shape: float) -> float:
     lattice = np.arange(-REACH, REACH, dtype=np.float64) + 0.25
     off = float(lattice @ probabilities(lattice, std, shape))
     return 2 * (off / std) ** 2
-
-
-def _error_of_shape(places: Float, heights: Float) -> float:
-    """Return the standard error of λ from the parabola through the likelihood around its maximum."""
-    y, x = places.T
-    if not np.all(np.isfinite(heights)):
-        return math.inf
-    parabola = np.linalg.lstsq(np.stack([x**0, y, x, y * y, x * x, x * y]).T, heights, rcond=None)[0]
-    own, other, mixed = 2 * parabola[3], 2 * parabola[4], parabola[5]
-    determinant = own * other - mixed * mixed
-    return float(STEPS[1] * math.sqrt(own / determinant)) if min(own, determinant) > 0 else math.inf

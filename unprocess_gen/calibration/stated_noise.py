@@ -7,19 +7,18 @@ one gain mode a is interpolated; nothing is extrapolated.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from unprocess_gen.calibration.captures import Sensor
+from unprocess_gen.calibration.captures import Sensor, common, joined_sha256
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.iso_laws import Precision, gain_law, joined_branches, rounded, std_law
 from unprocess_gen.calibration.profile import MARK, NamedNumber, profile_head, profile_yaml, provenance
-from unprocess_gen.core.errors import ConfigError, MachineError
-from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.sources.raw.metadata import RawMetadata, read_tags
 
@@ -43,9 +42,10 @@ class StatedIso(NamedTuple):
 
 
 class StatedNoise(NamedTuple):
-    """Variances that the files of a folder state, in ascending order of ISO."""
+    """Variances that the files of a folder state, in ascending order of ISO; places of the ISOs of each gain mode."""
 
     isos: list[StatedIso]
+    modes: list[list[int]]
     sensor: Sensor
     camera: str
     sha256: str
@@ -59,35 +59,27 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     Raises ConfigError or MachineError.
     """
     files = [folder] if folder.is_file() else sorted(path for path in folder.rglob("*") if is_raw(path))
-    try:
+    with machine_errors(folder):
         facts = {path: read_tags(path, "calibrate") for path in files}
         stated = {path: tags for path, tags in facts.items() if tags.noise_profile is not None}
-        digests = sorted(file_sha256(path) for path in stated)
-    except OSError as error:
-        raise MachineError(f"{error.filename or folder}: cannot be read ({error.strerror or error})") from error
+        sha256 = joined_sha256(map(file_sha256, stated))
     if not stated:
         problem = f"none of {len(files)} raw files has a NoiseProfile tag"
         raise ConfigError(f"calibrate: {folder}: {problem}; expected DNG files, such as those of Adobe's DNG Converter")
     notes = []
     if without := [path for path in files if path not in stated]:
         notes.append(f"{without[0]}: has no NoiseProfile tag; left out ({len(without)} of {len(files)} raw files)")
-    first, *others = stated
-    for path in others:
-        for name in ("model", "black_dn", "white_dn"):
-            own, expected = getattr(stated[path], name), getattr(stated[first], name)
-            if own != expected:
-                raise ConfigError(f"calibrate: {path}: {name}={own}: {first.name} has {expected}; expected one camera")
+    model, *_ = [common(stated, name) for name in ("model", "black_dn", "white_dn")]
     isos = _by_iso([_stated_iso(path, tags) for path, tags in stated.items()])
-    _check_law(isos)
-    black, white = _levels(first, stated[first])
-    sensor = Sensor(int(white).bit_length(), round(black), round(white), stated[first].pattern or "RGGB", (0, 0))
-    sha256 = hashlib.sha256("\n".join(digests).encode()).hexdigest()
+    first, tags = next(iter(stated.items()))
+    black, white = _levels(first, tags)
+    sensor = Sensor(int(white).bit_length(), round(black), round(white), tags.pattern or "RGGB", (0, 0))
     if (spread := max(_spreads(isos).values())) > SAME:
         notes.append(
             f"NoiseProfile: the planes differ by up to {spread:.1%}; the profile has the variance of green, and the "
             "gains of red and blue relative to it"
         )
-    return StatedNoise(isos, sensor, stated[first].model or "an unknown camera", sha256, len(stated), notes)
+    return StatedNoise(isos, _modes(isos), sensor, model or "an unknown camera", sha256, len(stated), notes)
 
 
 def is_raw(path: Path) -> bool:
@@ -138,26 +130,22 @@ def _by_iso(stated: Sequence[StatedIso]) -> list[StatedIso]:
     return list(result.values())
 
 
-def _check_law(isos: Sequence[StatedIso]) -> None:
-    """Refuse variances that no sensor has: they rise with ISO, except without light where the gain mode changes."""
-    falls = []
-    for low, high in pairwise(isos):
+def _modes(isos: Sequence[StatedIso]) -> list[list[int]]:
+    """Return the places of the ISOs of each gain mode, which begins where the variance without light falls.
+
+    ConfigError for variances that no sensor has: all others rise with ISO.
+    """
+    modes, falls = [[0]], list[int]()
+    for place, (low, high) in enumerate(pairwise(isos), start=1):
         where = f"calibrate: {high.path}: NoiseProfile at ISO {high.iso:g}"
         expected = f"than at ISO {low.iso:g} ({low.path.name}); expected a rise with ISO; remove the wrong file"
         for name, before, after in zip(COLOUR_NAMES, low.a, high.a, strict=True):
             if after <= before * (1 + SAME):
                 raise ConfigError(f"{where}: the variance of {name} has no larger slope {expected}")
-        if high.b[1] < low.b[1] * (1 - SAME):
-            falls.append(high.iso)
-            if len(falls) > MOST_SWITCHES or low.iso in falls:
-                raise ConfigError(f"{where}: again less variance without light {expected}")
-
-
-def _modes(isos: Sequence[StatedIso]) -> list[list[int]]:
-    """Return the places of the ISOs of each gain mode; the variance without light falls where a mode begins."""
-    modes = [[0]]
-    for place, (before, after) in enumerate(pairwise(isos), start=1):
-        if after.b[1] < before.b[1] * (1 - SAME) or (after.b[1] > 0) != (before.b[1] > 0):
+        falls += [place] * (high.b[1] < low.b[1] * (1 - SAME))
+        if len(falls) > MOST_SWITCHES or falls[-2:] == [place - 1, place]:
+            raise ConfigError(f"{where}: again less variance without light {expected}")
+        if place in falls or (high.b[1] > 0) != (low.b[1] > 0):
             modes.append([])
         modes[-1].append(place)
     return modes
@@ -165,6 +153,11 @@ def _modes(isos: Sequence[StatedIso]) -> list[list[int]]:
 
 def _exact(value: float) -> Estimate:
     return Estimate(value, value, value)
+
+
+def unknown(value: float) -> Estimate:
+    """Return a number of which no error is known."""
+    return Estimate(value, -math.inf, math.inf)
 
 
 def _spreads(isos: Sequence[StatedIso]) -> dict[str, float]:
@@ -180,12 +173,9 @@ def stated_estimates(stated: StatedNoise) -> list[NamedNumber]:
     named = []
     for iso, a, b, _ in stated.isos:
         for site, plane in ((None, 1), ("R", 0), ("Gr", 1), ("Gb", 1), ("B", 2)):
-            numbers = {"dn_per_e": (a, "DN/e"), "b_dn2": (b, "DN²")}
-            named += [
-                NamedNumber(name, iso, site, Estimate(values[plane], -math.inf, math.inf), unit)
-                for name, (values, unit) in numbers.items()
-            ]
-        named.append(NamedNumber("read_std_dn", iso, None, Estimate(math.sqrt(b[1]), -math.inf, math.inf), "DN"))
+            named += [NamedNumber("dn_per_e", iso, site, unknown(a[plane]))]
+            named += [NamedNumber("b_dn2", iso, site, unknown(b[plane]))]
+        named.append(NamedNumber("read_std_dn", iso, None, unknown(math.sqrt(b[1]))))
     return named
 
 
@@ -194,7 +184,7 @@ def stated_yaml(stated: StatedNoise, name: str) -> str:
     isos, profile = [record.iso for record in stated.isos], profile_head(name, stated.sensor)
     gains = [_exact(record.a[1]) for record in stated.isos]
     profile["branches"] = []
-    for places in joined_branches(isos, gains, _modes(stated.isos), TAG_PRECISION):
+    for places in joined_branches(isos, gains, stated.modes, TAG_PRECISION):
         own = [isos[place] for place in places]
         gain = gain_law(own, [gains[place] for place in places], TAG_PRECISION)
         read = std_law(own, [_exact(math.sqrt(stated.isos[place].b[1])) for place in places], TAG_PRECISION)

@@ -75,12 +75,12 @@ def _measured(folder: Path, to: Path, call: Call) -> int:
     _report_notes(calibration.notes)
     measure.write_profile(calibration, to, "two_parameter" in call.values)
     for result in calibration.isos:
-        gain, read = result.gain.sensor, result.read
+        gain, read, row = (result[name] for name in ("dn_per_e", "read_std_dn", "row_std_dn"))
         interval = f"{short_number(gain.low, 4)} to {short_number(gain.high, 4)}"
         print_result(
             f"ISO {result.iso:g}: {short_number(gain.value, 4)} DN per electron "
             f"({calibration.known.source if calibration.known else interval}), "
-            f"read noise {short_number(read.value, 4)} DN, row noise {short_number(result.row.value, 3)} DN"
+            f"read noise {short_number(read.value, 4)} DN, row noise {short_number(row.value, 3)} DN"
         )
     if page is not None:
         write_page(calibration, to.stem, f"gen-dataset calibrate {folder} --to {to}", page)

@@ -31,10 +31,13 @@ def parse_record(content: bytes | str, kind: type[Record]) -> Record:
     return check_record(parse_json(content), kind)
 
 
-def check_record(value: Any, kind: type[Record]) -> Record:
-    """Convert a parsed JSON value to a typed record; ValueError names key and expectation."""
+def check_record(value: Any, kind: type[Record], strict: bool = True) -> Record:
+    """Convert a parsed JSON value to a typed record; ValueError names key and expectation.
+
+    Without ``strict``, texts are read as numbers.
+    """
     try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(value, kind, strict=strict)
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
         problem = problem[0].lower() + problem[1:]

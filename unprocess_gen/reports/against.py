@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from unprocess_gen.calibration.calibrate import measure_all
 from unprocess_gen.calibration.captures import Sensor, read_captures
-from unprocess_gen.calibration.gain import NORMAL_95, Estimate
+from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.measure import Watch
 from unprocess_gen.calibration.profile import (
     ABSOLUTE,
@@ -38,9 +38,8 @@ from unprocess_gen.planning.draws import DRAW_COUNT
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.plan import TwoNumberLevel
 from unprocess_gen.reports.formatting import short_number
-from unprocess_gen.reports.noise_check.checks import FALSE_ALARM
-from unprocess_gen.reports.noise_check.scores import Score
 from unprocess_gen.simulation.effects import Physics, profile_keys
+from unprocess_gen.statistics.scores import NORMAL_95, Score, alarm_limit
 
 EFFECT_OF_NUMBER = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
 """Effect of each number that is compared, by its name in the list of estimates."""
@@ -64,10 +63,10 @@ class Comparison(NamedTuple):
     verdict: str
 
     def __str__(self) -> str:
-        name, iso, site, number, unit = self.measured
+        name, iso, site, number = self.measured
         assert number is not None and self.profile is not None
         place = "".join([f"ISO {iso:g}: " if iso else "", f"site {site}: " if site else ""])
-        unit = unit and f" {unit}"
+        unit = self.measured.unit and f" {self.measured.unit}"
         text = f"{place}{name} of the frames is {short_number(number.value, 4)}{unit}"
         text += f" ({short_number(number.low, 4)} to {short_number(number.high, 4)})"
         if self.verdict == LACKS:
@@ -88,12 +87,12 @@ class Comparison(NamedTuple):
     @property
     def cells(self) -> list[str]:
         """Cells of the line in the list."""
-        name, iso, site, number, unit = self.measured
+        name, iso, site, number = self.measured
         number = number or Estimate(math.nan, math.nan, math.nan)
         values = [number.value, number.low, number.high, math.nan if self.profile is None else self.profile]
         values += [math.nan] * 2 if self.verdict == NOT_COMPARED else [self.percent, self.score.errors]
         numbers = [f"{value:.7g}" if math.isfinite(value) else "" for value in values]
-        return [name, "" if iso is None else f"{iso:g}", site or "", unit, *numbers, self.verdict]
+        return [name, "" if iso is None else f"{iso:g}", site or "", self.measured.unit, *numbers, self.verdict]
 
 
 class Comparisons(NamedTuple):
@@ -136,11 +135,11 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
 
 def _compared(calibration: Calibration, profile: Profile, known: dict[float, Estimate]) -> Iterator[Comparison]:
     """Yield the comparison of each estimate."""
-    celsius, isos = calibration.body.dark_reference_c, calibration.captures.isos
-    variances = [NamedNumber("b_dn2", result.iso, None, dark_variance(result), "DN²") for result in calibration.isos]
+    celsius, isos = calibration.body.reference_c, calibration.captures.isos
+    variances = [NamedNumber("b_dn2", result.iso, None, dark_variance(result)) for result in calibration.isos]
     listed = [estimate for estimate in [*estimates(calibration), *variances] if estimate.name in EFFECT_OF_NUMBER]
-    limit, sites = math.log(2 * len(listed) / FALSE_ALARM), site_names(calibration.sensor)
-    tukey = {result.iso: [shape.is_tukey for shape in [result.shape, *result.shapes]] for result in calibration.isos}
+    limit, sites = alarm_limit(len(listed)), site_names(calibration.sensor)
+    tukey = {result.iso: [shape.is_tukey for shape in result.shapes] for result in calibration.isos}
     for estimate in listed:
         numbers = profile.numbers(estimate.iso or isos[0], celsius)
         place = 1 + sites.index(estimate.site) if estimate.site else 0

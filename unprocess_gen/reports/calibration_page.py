@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,10 +20,12 @@ from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.output_paths import check_output_file
+from unprocess_gen.core.types import Float
 from unprocess_gen.planning.noise_profile import evaluate
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import require_libraries
+from unprocess_gen.statistics.scores import NORMAL_95
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,41 +63,37 @@ def write_page(calibration: Calibration, name: str, command: str, page: Path) ->
 
 def _table(named: list[NamedNumber]) -> PageTable:
     """Return the estimates of all sites together as a table."""
-    lines = [
-        (
-            name,
-            "" if iso is None else f"{iso:g}",
-            *(["–"] * 3 if number is None else [short_number(getattr(number, end), 4) for end in ENDS]),
-            unit,
-        )
-        for name, iso, site, number, unit in named
-        if site is None
-    ]
+    lines = []
+    for entry in (entry for entry in named if entry.site is None):
+        ends = [short_number(getattr(entry.number, end), 4) if entry.number else "–" for end in ENDS]
+        lines.append((entry.name, f"{entry.iso:g}" if entry.iso else "", *ends, entry.unit))
     return PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4))
 
 
 def _sensors(calibration: Calibration, name: str) -> PageTable:
     """Return gain and read noise of this sensor and of the built-in profiles, in electrons."""
-    lines = []
+    span_dn, lines = calibration.sensor.span_dn, []
     for result in calibration.isos:
-        gain = result.gain.sensor.value
-        electrons = [short_number(value / gain, 3) for value in (result.read.value, result.row.value)]
-        full = short_number(calibration.sensor.span_dn / gain, 3)
-        lines.append((f"{name}, measured", f"{result.iso:g}", short_number(gain, 3), *electrons, full))
-    isos = {result.iso for result in calibration.isos}
+        gain, *stds = (result[key].value for key in ("dn_per_e", "read_std_dn", "row_std_dn"))
+        lines.append(_sensor_line(f"{name}, measured", result.iso, gain, (*stds, span_dn)))
     for option in group_options("noise"):
         if "branches:" not in (conf_dir() / "noise" / f"{option}.yaml").read_text(encoding="utf-8"):
             continue  # two numbers, which may depend on the sensor
         noise = read_option("noise", option)
-        span = noise.white_level_dn - noise.black_level_dn
-        for branch in noise.branches:
-            for iso in sorted(iso for iso in isos if branch.iso[0] <= iso <= branch.iso[1]):
+        span_dn = noise.white_level_dn - noise.black_level_dn
+        for branch, iso in itertools.product(noise.branches, calibration.captures.isos):
+            if branch.iso[0] <= iso <= branch.iso[1]:
                 gain = evaluate(branch.dn_per_e, iso=iso)
-                stds = (evaluate(getattr(branch, key), iso=iso, gain=gain) for key in ("read_std_dn", "row_std_dn"))
-                electrons = [short_number(std / gain, 3) for std in stds]
-                lines.append((option, f"{iso:g}", short_number(gain, 3), *electrons, short_number(span / gain, 3)))
+                laws = (branch.read_std_dn, branch.row_std_dn)
+                stds = [evaluate(law, iso=iso, gain=gain) for law in laws]
+                lines.append(_sensor_line(option, iso, gain, (*stds, span_dn)))
     headings = ("sensor", "ISO", "DN per electron", "read noise (e)", "row noise (e)", "electrons at white")
     return PageTable(headings, lines, numeric=(1, 2, 3, 4, 5))
+
+
+def _sensor_line(name: str, iso: float, gain: float, numbers_dn: Iterable[float]) -> tuple[str, ...]:
+    electrons = (short_number(number / gain, 3) for number in numbers_dn)
+    return name, f"{iso:g}", short_number(gain, 3), *electrons
 
 
 # ------------------------------------------------------------------------------------------------------------- figures
@@ -109,32 +109,35 @@ def _drawn(result: IsoResult, sites: list[str]) -> bytes:
     """Draw the photon transfer curve with residuals, the histogram, spectra, and the map of the darks, of one ISO."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(14, 8), layout="constrained")
+    figure, measured = Figure(figsize=(14, 8), layout="constrained"), result.dark.measured
     axes = figure.subplots(2, 3)
     _draw_transfer(axes[0, 0], axes[1, 0], result, sites)
     _draw_histogram(axes[0, 1], result)
-    for axis, profile, kind in (
-        (axes[1, 1], result.dark.measured.row_profile, "rows of a dark"),
-        (axes[1, 2], result.dark.measured.column_profile, "columns of the mean dark"),
-    ):
-        power = np.abs(np.fft.rfft(profile - profile.mean()))[1:-1] ** 2 / len(profile)
-        axis.loglog(np.arange(1, len(power) + 1) / len(profile), power, linewidth=0.6, color=COLOURS[""])
-        axis.set(title=f"spectrum of the {kind}", xlabel="periods per line", ylabel="power (DN²)")
-    shading = result.dark.shading
-    image = axes[0, 2].imshow(shading - np.median(shading), cmap="RdBu_r")
+    _draw_spectrum(axes[1, 1], "rows of a dark", measured.row_offsets.reshape(2, 2, -1).mean(axis=1))
+    _draw_spectrum(axes[1, 2], "columns of the mean dark", measured.column_offsets.reshape(2, 2, -1).mean(axis=0))
+    image = axes[0, 2].imshow(measured.shading - np.median(measured.shading), cmap="RdBu_r", aspect="auto")
     axes[0, 2].set(title="fixed pattern of the darks, block means (DN)", xticks=[], yticks=[])
     figure.colorbar(image, ax=axes[0, 2])
     return _png(figure)
 
 
+def _draw_spectrum(axes: Axes, name: str, lines: Float) -> None:
+    """Draw the power of offsets of even and odd lines, [2, N]."""
+    offsets = lines.T.ravel()
+    power = np.abs(np.fft.rfft(offsets - offsets.mean()))[1:-1] ** 2 / len(offsets)
+    axes.loglog(np.arange(1, len(power) + 1) / len(offsets), power, linewidth=0.6, color=COLOURS[""])
+    axes.set(title=f"spectrum of the {name}", xlabel="periods per line", ylabel="power (DN²)")
+
+
 def _draw_transfer(curve_axes: Axes, residual_axes: Axes, result: IsoResult, sites: list[str]) -> None:
     """Draw variance against signal, and what the line with the gain of the sensor leaves."""
-    gain = result.gain.sensor.value
+    gain = result["dn_per_e"].value
     for name, curve in zip(sites or ["", "", "", ""], result.curves, strict=True):
-        curve_axes.plot(curve.signal, curve.variance, "o", markersize=3, color=COLOURS[name], label=name or None)
-        error = 1.96 * np.hypot(curve.error, curve.dark_error) / (gain * curve.signal) * 100
-        rest = (curve.variance / (gain * curve.signal) - 1) * 100
-        residual_axes.errorbar(curve.signal, rest, error, fmt="o", markersize=3, color=COLOURS[name], linewidth=0.8)
+        line = gain * curve.signal
+        style: dict[str, Any] = {"fmt": "o", "markersize": 3, "color": COLOURS[name], "linewidth": 0.8}
+        error = NORMAL_95 * np.hypot(curve.error, curve.dark_error)
+        curve_axes.errorbar(curve.signal, curve.variance, error, label=name or None, **style)
+        residual_axes.errorbar(curve.signal, (curve.variance / line - 1) * 100, error / line * 100, **style)
     ends = np.array([0.0, usable(result.flats)[-1].signal_dn])
     curve_axes.plot(ends, gain * ends, color="#888888", linewidth=1)
     residual_axes.axhline(0, color="#888888", linewidth=1)
@@ -146,7 +149,7 @@ def _draw_transfer(curve_axes: Axes, residual_axes: Axes, result: IsoResult, sit
 
 def _draw_histogram(axes: Axes, result: IsoResult) -> None:
     """Draw the histogram of the darks against both fitted distributions."""
-    histogram, shape = result.histogram, result.shape
+    histogram, shape = result.histogram, result.shapes[0]
     group = max(1, round(1 / histogram.width))  # a bin for each DN, because values are integers
     edges = np.arange(0, len(histogram.counts), group)
     counts, moments = (
@@ -155,12 +158,20 @@ def _draw_histogram(axes: Axes, result: IsoResult) -> None:
     means = moments / np.maximum(counts, 1)
     shares = counts / counts.sum() / (group * histogram.width)
     axes.semilogy(means, np.maximum(shares, 1e-9), ".", markersize=4, color="#444444", label="darks")
-    for label, std, power in (("normal", shape.normal_std_dn, None), ("Tukey, λ", shape.tukey_std_dn, shape.shape)):
+    tukey = f"Tukey, λ {shape.shape:.3f}"
+    for label, std, power in (("normal", shape.normal_std_dn, None), (tukey, shape.tukey_std_dn, shape.shape)):
         likelihoods = probabilities(histogram.centres, std, power)
-        label += "" if power is None else f" {power:.3f}"
         axes.semilogy(histogram.centres, np.maximum(likelihoods, 1e-9), linewidth=1, label=label)
     axes.set(title="read noise", xlabel="DN from the mean of the row", ylabel="share", ylim=(1e-8, 1))
     axes.legend()
+
+
+AGAINST_ISO = (
+    ("dn_per_e", "DN per electron", 0, gain_law),
+    ("read_std_dn", "read noise (DN)", 1, std_law),
+    ("row_std_dn", "row noise (DN)", 1, std_law),
+)
+"""Numbers that are drawn against ISO: name, label, place of the axes, and function that fits a law."""
 
 
 def _against_iso(calibration: Calibration) -> bytes:
@@ -168,15 +179,9 @@ def _against_iso(calibration: Calibration) -> bytes:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    isos = [result.iso for result in calibration.isos]
-    for place, (axes, label, law, numbers) in enumerate(
-        (
-            (left, "DN per electron", gain_law, [result.gain.sensor for result in calibration.isos]),
-            (right, "read noise (DN)", std_law, [result.read for result in calibration.isos]),
-            (right, "row noise (DN)", std_law, [result.row for result in calibration.isos]),
-        )
-    ):
+    both, isos = figure.subplots(1, 2), calibration.captures.isos
+    for place, (name, label, side, law) in enumerate(AGAINST_ISO):
+        axes, numbers = both[side], [result[name] for result in calibration.isos]
         values = [number.value or math.nan for number in numbers]
         errors = [[number.value - number.low for number in numbers], [number.high - number.value for number in numbers]]
         axes.errorbar(isos, values, np.maximum(errors, 0), fmt="o", markersize=3, label=label, color=f"C{place}")
@@ -185,7 +190,6 @@ def _against_iso(calibration: Calibration) -> bytes:
             grid = np.geomspace(isos[branch[0]], isos[branch[-1]], 50)
             laws = [evaluate(form, iso=iso) or math.nan for iso in grid.tolist()]
             axes.plot(grid, laws, linewidth=0.8, color=f"C{place}")
-    for axes in (left, right):
         axes.set(xscale="log", yscale="log", xlabel="ISO")
         axes.legend()
     return _png(figure)

@@ -22,6 +22,7 @@ from unprocess_gen.reports.noise_check.checks import Checker, overlaps, pair_sum
 from unprocess_gen.reports.noise_check.scores import joined_points, row_offsets, variance_points
 from unprocess_gen.reports.noise_check.sums import Plane, Sums
 from unprocess_gen.reports.report_files import require_libraries
+from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 FITS_DRAWN = 8
 
@@ -57,7 +58,7 @@ class NoiseFit:
 
     def __str__(self) -> str:
         numbers = (
-            f"{name} {estimate:.6g} ± {1.96 * error:.2g} {unit} (expected {expected:.6g})"
+            f"{name} {estimate:.6g} ± {NORMAL_95 * error:.2g} {unit} (expected {expected:.6g})"
             for name, unit, estimate, error, expected in zip(
                 "ab", ("DN", "DN²"), self.estimate, self.error, self.expected, strict=True
             )
@@ -109,17 +110,16 @@ def fit_sums(key: str, sums: Sums) -> NoiseFit | None:
     if len(np.unique(points.signal)) < 3:
         return None
     design = np.stack([points.signal, np.ones_like(points.signal)])
-    inverse = np.linalg.inv((design * points.weight) @ design.T)
-    influence = inverse @ (design * points.weight)
+    by_point = influence(design, points.weight)
     count, std = (np.concatenate(values) for values in zip(*((p.count, p.expected.std) for p in planes), strict=True))
     temporal = np.concatenate([plane.noise.temporal_variance(plane.expected.signal) for plane in planes])
     rounding_dn2 = 0.0 if sums.plan.output.normalised else 1 / 12
-    expected = influence @ (temporal - rounding_dn2)
+    expected = by_point @ (temporal - rounding_dn2)
     drawn = count >= LEAST_SITES_OF_POINT
     return NoiseFit(
         key=key,
-        estimate=expected + influence @ points.difference,
-        error=np.sqrt(influence**2 @ (points.noise + points.unknown**2) + _row_variances(sums, planes, influence)),
+        estimate=expected + by_point @ points.difference,
+        error=np.sqrt(by_point**2 @ (points.noise + points.unknown**2) + _row_variances(sums, planes, by_point)),
         expected=expected,
         signal_dn=points.signal[drawn],
         variance_dn2=(points.difference + std**2 - rounding_dn2)[drawn],

@@ -20,12 +20,11 @@ from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.reports.noise_check.scores import LEAST_SITES, Score, Scores, repetition_score, scores_of
+from unprocess_gen.reports.noise_check.scores import LEAST_SITES, Scores, repetition_score, scores_of
 from unprocess_gen.reports.noise_check.sums import SparseNoise, Sums
 from unprocess_gen.simulation.effects import BY_NAME
+from unprocess_gen.statistics.scores import NORMAL_95, Score, alarm_limit
 
-FALSE_ALARM = 1e-6
-"""Probability of any alarm for a dataset whose noise is as recorded."""
 SHARED_ROUNDING = 0.15
 """Fraction of the rounding error that pairs with other curves or gains share, because most histograms decrease."""
 CURVE_NUMBERS = 4096
@@ -88,7 +87,7 @@ class Alarm(NamedTuple):
     def __str__(self) -> str:
         check, score = CHECKS[self.check], self.score
         scale = (100 if check.unit == "%" else 1) / score.information
-        size, error = (scale * value for value in (abs(score.total), 1.96 * score.std))
+        size, error = (scale * value for value in (abs(score.total), NORMAL_95 * score.std))
         decimals = max(0, -math.floor(math.log10(error)))
         side, cause = ("above", check.high) if score.excess > 0 else ("below", check.low)
         return (
@@ -116,7 +115,7 @@ def pair_sums(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | No
 
 def threshold(pairs: int) -> float:
     """Surprise from which a score is an alarm, in a dataset with a number of pairs."""
-    return math.log(2 * TESTS * (pairs + 1) / FALSE_ALARM)
+    return alarm_limit(TESTS * (pairs + 1))
 
 
 def failed_checks(key: str, scores: Scores, limit: float) -> list[Alarm]:

@@ -11,73 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.calibration.frame_sums import NEIGHBOURS, plane_names
 from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, PlaneNoise
 from unprocess_gen.reports.noise_check.sums import LARGEST_SAMPLE, Plane, SparseNoise, Sums
+from unprocess_gen.statistics.mosaics import NEIGHBOURS, plane_names
+from unprocess_gen.statistics.scores import UNFORESEEN, Score
 
 LEAST_SITES = 64
 """Fewest sites of a pair that is checked."""
 TAIL_ERROR = 0.05
 """Relative error of expected numbers of outliers, because tails add to other noise."""
-
-
-class Score(NamedTuple):
-    """Sum of a statistic over the sites of a pair, minus its expectation.
-
-    Attributes
-    ----------
-    total : float
-        The sum.
-    information : float
-        ``total / information`` estimates the difference of a quantity from its expected value.
-    variance : float
-        Variance of the sum due to noise.
-    rounding : float
-        Standard deviation due to the rounding of the clean frame, which pairs with the same curve and gains may share.
-    fixed : float
-        Standard deviation due to patterns that the frames of one body share.
-    step : float
-        Largest contribution of one site or line.
-    low, high : float
-        Smallest and largest expectation of the sum, which depends on values that the row does not state.
-    """
-
-    total: float
-    information: float
-    variance: float
-    rounding: float = 0.0
-    fixed: float = 0.0
-    step: float = 0.0
-    low: float = 0.0
-    high: float = 0.0
-
-    @property
-    def excess(self) -> float:
-        """Distance of the sum from the expectations that are possible."""
-        return self.total - min(max(self.total, self.low), self.high)
-
-    @property
-    def std(self) -> float:
-        """Standard deviation of the sum."""
-        return math.sqrt(self.variance + self.rounding**2 + self.fixed**2)
-
-    @property
-    def errors(self) -> float:
-        """Excess in standard errors, with its sign."""
-        return self.excess / self.std if self.std else 0.0
-
-    @property
-    def surprise(self) -> float:
-        """Negative logarithm of a bound on the probability of an excess as large in one direction.
-
-        Bernstein's inequality: P(excess > √(2·std²·x) + step·x/3) ≤ exp(-x). The bound holds for few sites too, where
-        sums are not normally distributed.
-        """
-        root, step, excess = math.sqrt(2) * self.std, self.step / 3, abs(self.excess)
-        if not excess or not root:
-            return 0.0
-        return (2 * excess / (root + math.sqrt(root * root + 4 * step * excess))) ** 2
 
 
 Scores = dict[tuple[str, str], Score]
@@ -340,9 +283,6 @@ def repetition_score(here: SparseNoise, there: SparseNoise) -> Score:
 
 
 # -------------------------------------------------------------------------------------------------- codes and outliers
-
-UNFORESEEN = 1e-8
-"""Probability of a rare value, beyond that which the row states."""
 
 
 def _code_score(sums: Sums, bit: int) -> Score:

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.calibration.frame_sums import NEIGHBOURS, TILE
 from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
 from unprocess_gen.reports.noise_check.expectation import FAR_Z, LARGEST_Z, Expectation, PlaneNoise, bin_width
 from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, Site
+from unprocess_gen.statistics.mosaics import NEIGHBOURS, TILE, neighbour_products
 
 Single = NDArray[np.float32]
 
@@ -193,10 +193,8 @@ class Sums:
                 self.columns[:, x, :, part] += column_sums
                 self.products["neighbours"] += removed
                 sites[:, y::2, x : self.width : 2] = residual, weight
-            residuals = sites[0].ravel()
-            for name, distances in NEIGHBOURS.items():
-                shifts = (y * (self.width + 2) + x for y, x in distances)
-                self.products[name] += sum(float(residuals[n:] @ residuals[:-n]) for n in shifts)
+            for name, products in neighbour_products(sites[0]).items():
+                self.products[name] += sum(products)
             sample.append(sites[:, -2 * top % SAMPLED :: SAMPLED, : self.width : SAMPLED])
             if self._noisy is not None:
                 codes, is_used = self._noisy[2 * top : 2 * bottom, : self.width], sites[1, :, : self.width] > 0

@@ -1,0 +1,1 @@
+"""Score statistics of frames: what ``verify --noise``, ``verify --against`` and ``calibrate`` share."""
