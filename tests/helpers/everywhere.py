@@ -172,8 +172,8 @@ def doubles() -> str:
         clean_dtype, dtype = (
             np.float32 if is_float else np.uint16 for is_float in (plan.output.clean_normalised, plan.output.normalised)
         )
-        form = render._form_of((plan,), shape, (origin[0] % 2, origin[1] % 2))
-        scene, noise = render._records(form, (plan,), shape, 256, origin)
+        form = render._form((plan,), shape, (origin[0] % 2, origin[1] % 2), 256)
+        scene, noise = render._records(form, (plan,), shape, origin)
         scratch = allocate_scratch(np.float32 if uses_scene32(plan) else np.float64)
         clean, noisy = np.empty(codes[..., 0].size, clean_dtype), np.empty((1, codes[..., 0].size), dtype)
         counts = np.zeros((1, render.COUNT_FIELDS), dtype=np.int64)

@@ -21,6 +21,7 @@ This module is the NumPy reference; `simulation.kernels.philox` contains the com
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import struct
 
@@ -379,7 +380,21 @@ def parameter_uniforms(key: int, count: int, level: int = 0, epoch: int = 0) -> 
     list of float
         (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
-    return _uniforms(key, count, 0, purpose("parameters", level), frame_word(0, epoch))
+    if not epoch:
+        return _uniforms(key, count, 0, purpose("parameters", level))[0]
+    number, place = divmod(epoch, EPOCHS_AT_ONCE)
+    return list(_uniforms_of_epochs(key, count, level, number * EPOCHS_AT_ONCE)[place])
+
+
+EPOCHS_AT_ONCE = 16
+"""Epochs whose parameters are drawn at once: for each alone they would take a quarter of a live crop of 128 x 128."""
+
+
+@functools.lru_cache(maxsize=1024)
+def _uniforms_of_epochs(key: int, count: int, level: int, first: int) -> list[list[float]]:
+    """Return `parameter_uniforms` of consecutive epochs."""
+    frames = [[frame_word(0, epoch)] for epoch in range(first, first + EPOCHS_AT_ONCE)]
+    return _uniforms(key, count, 0, purpose("parameters", level), frames)
 
 
 def scatter_uniforms(key: int, iso: float, count: int) -> list[float]:
@@ -403,17 +418,22 @@ def scatter_uniforms(key: int, iso: float, count: int) -> list[float]:
         (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
     low, high = struct.unpack("<II", struct.pack("<d", iso))
-    return _uniforms(key, count, low, purpose("scatter"), high)
+    return _uniforms(key, count, low, purpose("scatter"), high)[0]
 
 
-def _outputs(key: int, count: int, word_0: int, word_2: int, word_3: int = 0) -> tuple[Words, Words, Words, Words]:
-    """Output words of the counters with word 1 from 0 to ``count`` - 1, and the other words given."""
+def _outputs(
+    key: int, count: int, word_0: int, word_2: int, word_3: int | list[list[int]] = 0
+) -> tuple[Words, Words, Words, Words]:
+    """Output words of the counters with word 1 from 0 to ``count`` - 1, and the other words given.
+
+    With a column of words 3, they are [words, ``count``].
+    """
     counter = (word_0, np.arange(count, dtype=np.uint64), word_2, word_3)
     return philox4x32(tuple(np.asarray(word, dtype=np.uint64) for word in counter), key)
 
 
-def _uniforms(key: int, count: int, *words_023: int) -> list[float]:
-    """Uniform deviates (k + ½)·2**-52 from the first 52 bits k of `_outputs`."""
-    first, second, _, _ = _outputs(key, count, *words_023)
+def _uniforms(key: int, count: int, word_0: int, word_2: int, word_3: int | list[list[int]] = 0) -> list[list[float]]:
+    """Uniform deviates (k + ½)·2**-52 from the first 52 bits k of `_outputs`, for each word 3."""
+    first, second, _, _ = _outputs(key, count, word_0, word_2, word_3)
     bits = first.astype(np.uint64) << np.uint64(20) | second >> np.uint32(12)
-    return [(k + 0.5) * 2.0**-52 for k in bits.tolist()]
+    return [[(k + 0.5) * 2.0**-52 for k in row] for row in np.atleast_2d(bits).tolist()]

@@ -623,8 +623,12 @@ class Plan:
         return self.noise.physics
 
     def __hash__(self) -> int:
-        """Hash a few numbers: hashes of all fields take ten times as long, and patches look up their plan's records."""
-        return hash((self.stream_key, self.noise.level, self.noise.draw, self.noise.frame, self.noise.epoch))
+        """Hash a few numbers: hashes of all fields take ten times as long, and patches look up their plan's records.
+
+        Plans that are redrawn for an epoch differ in drawn numbers only.
+        """
+        noise, drawn = self.noise, (self.camera.rgb2cam[0], self.camera.inverse_rgb_gain, self.scene.exposure_ratio)
+        return hash((self.stream_key, noise.level, noise.draw, noise.frame, noise.epoch, noise.a_dn, drawn))
 
     def replace(self, **values: Any) -> Plan:
         """Return a copy with other values in fields of the plan or of its parts.

@@ -8,7 +8,7 @@ import math
 import operator
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,15 @@ from unprocess_gen.planning.mixture import config_of_key
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.pair import make_crop
+from unprocess_gen.simulation.pair import CropMaker, crop_maker
 from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
 
 REDRAWS = ("noise", "all", "none")
+
+KEPT_CROPS, NEW_CROPS = 1024, 4
+"""Numbers of pairs whose records are kept, 25 kB each; and of those that are new in each epoch, or whose pixels have 16
+bits, 5 MB each."""
 
 
 class LiveSample(Sample):
@@ -146,6 +150,8 @@ class LivePairs:
         self._ends = [*itertools.accumulate(map(len, self._sources))]
         self._redraw, self._patch, self._patches, self._as_float = redraw, patch, patches, as_float
         self._targets, self._arrays_only = tuple(targets), arrays_only
+        most = (NEW_CROPS if redraw == "all" else KEPT_CROPS), NEW_CROPS
+        self._kept: list[Recent[tuple[int, int], tuple[Plan, Patch, CropMaker]]] = [*map(Recent, most)]
         self._facts: Recent[int, Facts | None] = Recent(KEPT)  # they read all pixels of a photograph
 
     def __len__(self) -> int:
@@ -165,12 +171,10 @@ class LivePairs:
         image = source.image(number - (self._ends[place - 1] if place else 0))
         epoch = epoch if self._redraw != "none" else 0
         srgb = source.pixels(image)
-        plan, patch = self._redrawn(source.settings, image, srgb, epoch, number)
+        plan, patch, make = self._prepared(source.settings, image, srgb, epoch, number)
         if self._patch is not None:
             patch = _crop(plan, epoch, patch, self._patch, crop)
-        _check_kernels(self._targets, plan)
-        pixels, dark_pixels = crop_patch(srgb, patch), source.settings.dark_folder
-        clean, noisy, counts = make_crop(pixels, plan, patch.origin, epoch, dark_pixels)
+        clean, noisy, counts = make(crop_patch(srgb, patch), patch.origin, epoch)
         targets, frames = {}, (clean, noisy)
         if self._targets:
             pair, law = Pair(clean, noisy, counts()), noise_law(plan)
@@ -195,6 +199,22 @@ class LivePairs:
             (sample.clean, sample.noisy, _without_none(sample.row), *filter(None, [sample.targets]))
             for sample in samples
         ]
+
+    def _prepared(
+        self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int
+    ) -> tuple[Plan, Patch, CropMaker]:
+        """Return the plan of an epoch, without its number, the patch, and what makes crops of it."""
+        plan_epoch = epoch if self._redraw == "all" or image.plan.noise.dark.sha256 else 0
+        is_wide = srgb.itemsize > 1 or image.plan.source.dequantize != "off"
+        prepared = self._kept[is_wide].get((number, plan_epoch))
+        if prepared is None:
+            plan, patch = self._redrawn(settings, image, srgb, epoch, number)
+            for kernels in kernels_for(self._targets, plan):
+                self_test.check(kernels)
+            shape = (self._patch, self._patch) if self._patch else (patch.height, patch.width)
+            make = crop_maker(plan, shape, patch.origin, 256**srgb.itemsize, settings.dark_folder)
+            prepared = self._kept[is_wide].keep((number, plan_epoch), (plan, patch, make))
+        return prepared
 
     def _redrawn(
         self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int
@@ -279,13 +299,6 @@ def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, spli
 
         dataset = load_config(dataset)
     return [PlannedPairs(dataset, root, cache)]
-
-
-@lru_cache(maxsize=4096)
-def _check_kernels(targets: tuple[str, ...], plan: Plan) -> None:
-    """Test the kernels of a plan and its targets, once for each plan: their names take 3 % of a patch of 128 x 128."""
-    for kernels in kernels_for(targets, plan):
-        self_test.check(kernels)
 
 
 def _is_dataset(place: Any) -> bool:

@@ -20,6 +20,7 @@ from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core import types
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, split_uniform, stream_key
+from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.types import DarkFrames, Facts, Plan, SourcePlan
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
@@ -83,6 +84,8 @@ def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: Da
     levels = planner.levels_of_key(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
     noise = plan.noise
     redrawn, _ = next(itertools.islice(levels, noise.level, None))
+    if (noise.draw, noise.frame, noise.dark) == (0, 0, redrawn.noise.dark):
+        return redrawn
     return redrawn.replace(draw=noise.draw, frame=noise.frame, dark=noise.dark)
 
 
@@ -135,8 +138,15 @@ def plan_levels(
 
 
 def _planner(config: Config) -> Planner:
-    """Return the planner of a config, whatever its seed."""
-    return _planner_without_seed(replace(config, seed=0))
+    """Return the planner of a config, whatever its seed; hashing a config takes a fifth of all draws of an image."""
+    known = _planners.get(id(config))
+    if known is None or known[0] is not config:
+        known = _planners.keep(id(config), (config, _planner_without_seed(replace(config, seed=0))))
+    return known[1]
+
+
+_planners: Recent[int, tuple[Config, Planner]] = Recent(64)
+"""Planners by the identities of configs, which they keep."""
 
 
 @functools.lru_cache(maxsize=64)

@@ -32,7 +32,7 @@ from unprocess_gen.core.types import (
 )
 from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
-from unprocess_gen.simulation.kernels.render import pass_key, render_clean, render_crop, render_pairs
+from unprocess_gen.simulation.kernels.render import CODES, CropRenderer, pass_key, render_clean, render_pairs
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
 from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
@@ -124,41 +124,46 @@ def _pairs(
             yield pair if clean is pair.clean else replace(pair, clean=clean)
 
 
-def make_crop(
-    srgb: Srgb, plan: Plan, origin: tuple[int, int], epoch: int, dark_pixels: DarkPixels | None = None
-) -> tuple[Frame, Frame, Callable[[], Counts]]:
-    """Simulate the pair of a crop in an epoch, with little fixed cost if earlier crops had the same plan.
+CropMaker = Callable[[Srgb, tuple[int, int], int], tuple[Frame, Frame, Callable[[], Counts]]]
+"""Takes pixels, the row and column of the first one in the full frame, and the epoch. Returns the clean frame, the
+noisy frame, and a function that returns their counts."""
+
+
+def crop_maker(
+    plan: Plan, shape: tuple[int, int], corner: tuple[int, int], codes: int, dark_pixels: DarkPixels | None = None
+) -> CropMaker:
+    """Return a function that simulates crops of one image in any epoch, with little fixed cost for each.
 
     Parameters
     ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes, R, G, B.
     plan : Plan
-        All parameters of the pair but its epoch.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-    epoch : int
-        Number of the epoch.
+        All parameters of the pairs but their epoch.
+    shape : (int, int)
+        Height and width of all crops.
+    corner : (int, int)
+        Row and column of any crop; all others have the same parities.
+    codes : int
+        Number of codes of the image, 256 or 65,536.
     dark_pixels : DarkPixels, optional
         As for `make_pair`.
 
     Returns
     -------
-    clean, noisy : ndarray
-        As `make_pair` with ``plan.replace(epoch=epoch)``.
-    counts : callable
-        Returns the counts of the pair.
-
-    Raises
-    ------
-    ValueError
-        As `make_pair`.
+    callable
+        `CropMaker`, whose pairs are those of `make_pair` with ``plan.replace(epoch=epoch)``.
     """
     if plan.noise.dark.sha256 or plan.accuracy.uses_reference:
-        pair = make_pair(srgb, plan.replace(epoch=epoch), origin, dark_pixels)
-        return pair.clean, pair.noisy, lambda: pair.counts
-    _check_image(srgb, plan, origin)
-    return render_crop(_dequantise(srgb, plan, origin), plan, origin, epoch)
+
+        def make(srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
+            pair = make_pair(srgb, plan.replace(epoch=epoch), origin, dark_pixels)
+            return pair.clean, pair.noisy, lambda: pair.counts
+
+        return make
+    is_dithered = plan.source.dequantize != "off" and codes == CODES[0]
+    render = CropRenderer(plan, shape, (corner[0] % 2, corner[1] % 2), CODES[1] if is_dithered else codes)
+    if not is_dithered:
+        return render
+    return lambda srgb, origin, epoch: render(_dequantise(srgb, plan, origin), origin, epoch)
 
 
 def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:

@@ -27,14 +27,6 @@ def slots_of(plan: Plan) -> Slots:
     return Slots(black_dn, physics.dn_per_e, patterns, **filled)
 
 
-def slots_in_epoch(plan: Plan, epoch: int | None) -> Slots:
-    """Return the slots of a plan in an epoch, by default its own: only offsets of lines have words of an epoch."""
-    slots = slots_of(plan)
-    if epoch is None or not (slots.columns or (slots.rows and slots.rows.correlation)):
-        return slots
-    return slots_of(plan.replace(epoch=epoch))
-
-
 def fixed_patterns(plan: Plan) -> Patterns:
     """Return the fixed patterns of a plan; frames that share them can be simulated in one pass."""
     return slots_of(plan).patterns if plan.noise.physics is not None else Patterns()

@@ -10,7 +10,9 @@ from helpers.flats import dead, hot_pixel_means, plan_with, response
 
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.kernels import body
 from unprocess_gen.simulation.kernels.body import Body, body_of, forget_bodies
+from unprocess_gen.simulation.kernels.strips import SiteMap
 from unprocess_gen.simulation.plan_slots import fixed_patterns
 from unprocess_gen.simulation.slots import NormalPattern, Patterns
 
@@ -97,3 +99,27 @@ def test_patterns_are_computed_once_for_all_frames_of_a_body() -> None:
     assert body_of(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values is first
     other = body_of(Patterns(electrons=pattern._replace(body_key=2)), (4, 70), (1, 1)).response.values
     assert not np.array_equal(other, first)
+
+
+@pytest.mark.parametrize("limits", [{}, {"FRAME_BYTES": 0, "MOST_DEFECTS": 0}, {"MOST_FRAMES": 0}])
+@pytest.mark.parametrize("share", [0.0, 2e-4])
+def test_patterns_of_live_crops_equal_those_of_other_crops(
+    share: float, limits: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are cut from patterns of the frame, which grow, unless these are too large or too many."""
+    for name, limit in limits.items():
+        monkeypatch.setattr(body, name, limit)
+    patterns, _ = patterns_of("prnu", *DEFECTS, hot_pixel_share=share, dead_pixel_share=share)
+    for shape, origin in CROPS:
+        expected, live = (body_of(patterns, shape, origin, is_live=is_live) for is_live in (False, True))
+        first = origin[1] % BLOCK
+        for ours, theirs in zip(live[:3], expected[:3], strict=True):
+            np.testing.assert_array_equal(sites(ours, shape, first), sites(theirs, shape, first))
+    assert not limits.get("MOST_FRAMES", 1) or len(body._frames) == 2
+
+
+def sites(values: SiteMap, shape: tuple[int, int], first: int) -> np.ndarray:
+    """Return the values of the sites of a crop."""
+    row, column = values.steps
+    places = np.arange(shape[0])[:, None] * row + (first + np.arange(shape[1])) * column
+    return np.asarray(values.values[places])

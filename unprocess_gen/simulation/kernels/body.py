@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
 from typing import Any, NamedTuple
 
@@ -57,10 +58,12 @@ def body_of(patterns: Patterns, shape: Shape, origin: Shape, is_live: bool = Fal
     """Return the fixed patterns of a body for a crop of ``shape`` at ``origin``, without the factor on the light."""
     electrons, sites, bright, dead = patterns.electrons, patterns.sites_dn, patterns.bright, patterns.dead
     kept = _live_patterns if is_live else _kept
+    response_of = _cut_response if is_live and not patterns.light else functools.partial(kept, _normal_pattern)
+    defects_of = _cut_defects if is_live else functools.partial(kept, _defect_map)
     return Body(
-        kept(_normal_pattern, electrons, shape, origin) if electrons else EQUAL_RESPONSE,
+        response_of(electrons, shape, origin) if electrons else EQUAL_RESPONSE,
         kept(_normal_pattern, sites, shape, origin) if sites else NO_OFFSETS,
-        kept(_defect_map, (bright, dead), shape, origin) if bright or dead else NO_DEFECTS,
+        defects_of((bright, dead), shape, origin) if bright or dead else NO_DEFECTS,
         _means_e(bright.mean_e if bright else 0.0),
     )
 
@@ -103,6 +106,7 @@ def forget_bodies() -> None:
     """Drop the cached patterns, so that the next frame computes them, as the first frame of a body does."""
     for cache in _caches:
         cache.cache_clear()
+    _frames.clear()
 
 
 def _radial_factor(slot: RadialFactor, shape: Shape, origin: Shape) -> SiteMap:
@@ -155,7 +159,10 @@ def word_threshold(fraction: float) -> np.uint64:
     return np.uint64(int(fraction * 2**32))
 
 
-def _defect_map(slots: tuple[BrightPixels | None, DeadSlot | None], shape: Shape, origin: Shape) -> SiteMap:
+DefectSlots = tuple[BrightPixels | None, DeadSlot | None]
+
+
+def _defect_map(slots: DefectSlots, shape: Shape, origin: Shape) -> SiteMap:
     """Return the map of bright defects and of dead pixels; a missing slot has none."""
     either = slots[0] or slots[1]
     assert either is not None
@@ -207,3 +214,86 @@ def _fill_defects(
                 for n in range(strip.first, strip.after):
                     if row[n] == 0 and np.uint64(bright[n]) < below[0]:
                         row[n] = np.uint16(FIRST_STEP + (steps[n] >> np.uint32(22)))
+
+
+# ------------------------------------------------------------------------------------------------- frames of live crops
+
+FRAME_BYTES, MOST_DEFECTS, MOST_FRAMES, FRAME_STEP = 2**28, 2**14, 64, 1024
+"""Memory for the responses of frames in a process, most defects of a frame, and most frames, beyond which patterns are
+computed for each crop; and the multiple to which sides of frames are rounded up."""
+
+
+class _Frame(NamedTuple):
+    """Hold a pattern of the complete frame, from which live crops cut theirs.
+
+    Live crops are at new places in each epoch. To compute their patterns would take a quarter of a crop of 128 x 128.
+    """
+
+    sides: Shape
+    values: Any  # response [H, W]; or rows, columns and numbers of defects as lists; None beyond a limit
+
+
+_frames: dict[Any, _Frame] = {}
+"""Frames by slot. They grow to contain all crops."""
+
+
+def _frame_of(compute: Any, slot: Any, shape: Shape, origin: Shape) -> _Frame:
+    """Return the frame of a slot, which contains a crop."""
+    frame, ends = _frames.get(slot), (origin[0] + shape[0], origin[1] + shape[1])
+    if frame is None and len(_frames) >= MOST_FRAMES:
+        return _Frame(ends, None)
+    if frame is None or ends[0] > frame.sides[0] or ends[1] > frame.sides[1]:
+        known = frame.sides if frame else (0, 0)
+        height, width = (max(-(-end // FRAME_STEP) * FRAME_STEP, side) for end, side in zip(ends, known, strict=True))
+        frame = _frames[slot] = _Frame((height, width), compute(slot, (height, width)))
+    return frame
+
+
+def _cut_response(slot: NormalPattern, shape: Shape, origin: Shape) -> SiteMap:
+    """Return the response of a live crop as a view of that of the frame."""
+    (_, width), values = _frame_of(_frame_response, slot, shape, origin)
+    if values is None:
+        crop: SiteMap = _live_patterns(_normal_pattern, slot, shape, origin)
+        return crop
+    return SiteMap(values.reshape(-1)[origin[0] * width + origin[1] // BLOCK * BLOCK :], (width, 1))
+
+
+def _frame_response(slot: NormalPattern, sides: Shape) -> NDArray[np.float32] | None:
+    others = (frame.values for key, frame in _frames.items() if key != slot)
+    kept_bytes = sum(values.nbytes for values in others if isinstance(values, np.ndarray))
+    if 4 * sides[0] * sides[1] + kept_bytes > FRAME_BYTES:
+        return None
+    return _normal_pattern(slot, sides, (0, 0)).values.reshape(sides)
+
+
+def _cut_defects(slots: DefectSlots, shape: Shape, origin: Shape) -> SiteMap:
+    """Return the defects of a live crop; most crops have none."""
+    defects = _frame_of(_frame_defects, slots, shape, origin).values
+    if defects is None:
+        crop: SiteMap = _live_patterns(_defect_map, slots, shape, origin)
+        return crop
+    rows, columns, numbers = defects
+    near = range(bisect.bisect_left(rows, origin[0]), bisect.bisect_left(rows, origin[0] + shape[0]))
+    inside = [n for n in near if 0 <= columns[n] - origin[1] < shape[1]]
+    if not inside:
+        return NO_DEFECTS
+    left, width = origin[1] // BLOCK * BLOCK, padded_width(origin[1], shape[1])
+    values = np.zeros((shape[0], width), dtype=np.uint16)
+    for n in inside:
+        values[rows[n] - origin[0], columns[n] - left] = numbers[n]
+    return SiteMap(values.reshape(-1), (width, 1))
+
+
+def _frame_defects(slots: DefectSlots, sides: Shape) -> list[list[int]] | None:
+    """Return the defects of a frame, row by row; computed in parts, because the map of a frame is large."""
+    if sum(slot.share for slot in slots if slot) * sides[0] * sides[1] > MOST_DEFECTS:
+        return None
+    parts = [np.zeros((3, 0), dtype=np.int64)]
+    for top in range(0, sides[0], FRAME_STEP):
+        numbers = _defect_map(slots, (FRAME_STEP, sides[1]), (top, 0))
+        if numbers.steps[0]:
+            part = numbers.values.reshape(FRAME_STEP, sides[1])
+            rows, columns = part.nonzero()
+            parts.append(np.stack([rows + top, columns, part[rows, columns]]))
+    defects: list[list[int]] = np.concatenate(parts, axis=1).tolist()
+    return defects

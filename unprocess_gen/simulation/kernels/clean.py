@@ -119,8 +119,10 @@ def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -
     )
 
 
-_scenes = [functools.lru_cache(maxsize=count)(_scene) for count in (1024, 4)]
-"""Scenes of 256 codes (18 kB each) and of 65,536 codes (5 MB each), of which the last ones are kept."""
+KEPT_SCENES = 1024, 4
+"""Numbers of scenes of 256 codes (18 kB each) and of 65,536 codes (5 MB each) that are kept."""
+
+_scenes = [functools.lru_cache(maxsize=count)(_scene) for count in KEPT_SCENES]
 
 
 def _products(plan: Plan, codes: int) -> NDArray[np.float64]:

@@ -47,8 +47,10 @@ def electron_noise(
         noise = _electron_noise(frames, columns, (top, left))
     elif any(slots.fixed_columns for slots in frames):
         noise = _electron_noise(frames, -(-(left + columns) // _COLUMNS) * _COLUMNS, (top, 0))
-        for name in ("columns_dn", "fixed_columns_dn", "base_dn"):
-            members[name] = np.ascontiguousarray(getattr(noise, name)[..., left : left + columns])
+        cut = slice(left, left + columns)
+        members["columns_dn"] = np.ascontiguousarray(noise.columns_dn[:, cut])
+        members["fixed_columns_dn"] = noise.fixed_columns_dn[cut]
+        members["base_dn"] = np.ascontiguousarray(noise.base_dn[..., cut])
         members["padded_width"] = columns
     else:
         noise = _electron_noise(frames, columns, (top, 0))

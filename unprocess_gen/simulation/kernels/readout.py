@@ -26,6 +26,7 @@ noise: `Gaussian`, `Gaussian32` or `Electrons`. Each function below that is made
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,7 +105,7 @@ def readout_of(
         for plan in plans
     ]
     packed = first.output.layout == PACKED
-    planes = np.argsort([2 * y + x for y, x in plane_sites(first.sensor.pattern, origin)])
+    planes = _plane_order(first.sensor.pattern, origin)
     kind = Unrounded if first.output.normalised else FloatClean if first.output.clean_normalised else Rounded
     return kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
@@ -116,6 +117,12 @@ def readout_of(
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
+
+
+@functools.lru_cache(maxsize=32)
+def _plane_order(pattern: str, origin: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the number of the packed plane of each site of the tile."""
+    return np.argsort([2 * y + x for y, x in plane_sites(pattern, origin)])
 
 
 def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:

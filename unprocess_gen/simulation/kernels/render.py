@@ -19,7 +19,14 @@ from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.core.types import PACKED, Counts, DarkFramePlan, DarkPixels, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE, body_of, light_factor
-from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene_of, with_response
+from unprocess_gen.simulation.kernels.clean import (
+    KEPT_SCENES,
+    Scene,
+    Scene32,
+    fill_clean,
+    scene_of,
+    with_response,
+)
 from unprocess_gen.simulation.kernels.electron_records import electron_noise
 from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
@@ -37,7 +44,11 @@ from unprocess_gen.simulation.kernels.readout import (
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
 from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, buffers_in, locate, scratch_of_thread
-from unprocess_gen.simulation.plan_slots import fixed_patterns, slots_in_epoch
+from unprocess_gen.simulation.plan_slots import fixed_patterns, slots_of
+from unprocess_gen.simulation.slots import Slots
+
+CODES = 256, 65536
+"""Numbers of codes of images of 8 bits and of 16 bits."""
 
 
 def render_pairs(
@@ -64,21 +75,30 @@ def render_pairs(
     list of Pair
         One pair per plan; all share the clean array.
     """
-    clean, noisy, numbers = _fill_frames(srgb, tuple(plans), len(plans), origin, dark_pixels)
+    clean, noisy, numbers = _frames_of(srgb, tuple(plans), len(plans), origin, dark_pixels)
     counts = _counts_of(numbers, plans[0])
     return [Pair(clean, frame, counted) for frame, counted in zip(noisy, counts, strict=True)]
 
 
-def render_crop(
-    srgb: Srgb, plan: Plan, origin: tuple[int, int], epoch: int
-) -> tuple[Frame, Frame, Callable[[], Counts]]:
-    """Simulate the pair of a crop in an epoch in place of the plan's, without a dark frame: frames, and their counts.
+class CropRenderer:
+    """Render crops of a plan in its epochs, all of ``shape``, without a dark frame.
 
-    The records of a plan serve all its epochs: preparing them for each would take longer than a patch of 128 x 128. The
-    counts are built when they are asked for, because a record of Python takes 5 µs.
+    What crops share is prepared once, which takes longer than a crop of 128 x 128. ``corner`` is the place of their
+    first site in the tile, and ``codes`` the number of codes of their image.
     """
-    clean, noisy, numbers = _fill_frames(srgb, (plan,), 1, origin, epoch=epoch)
-    return clean, noisy[0], lambda: _counts_of(numbers, plan)[0]
+
+    def __init__(self, plan: Plan, shape: tuple[int, int], corner: tuple[int, int], codes: int) -> None:
+        self._plan, self._plans, self._shape = plan, (plan,), shape
+        self._form = _form(self._plans, shape, corner, codes)
+
+    def __call__(self, srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
+        """Return the clean frame, the noisy frame and a function that returns their counts, which takes 5 µs."""
+        form = self._form
+        scene, noise = _records(form, self._plans, self._shape, origin, epoch=epoch)
+        keys = form.keys.copy()
+        keys[0, 3] = frame_word(self._plan.noise.frame, epoch)
+        clean, noisy, numbers = _fill_frames(srgb, form, scene, noise, keys, origin)
+        return clean, noisy[0], lambda: _counts_of(numbers, self._plan)[0]
 
 
 def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
@@ -93,7 +113,10 @@ def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
 
 def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
     """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
-    return _fill_frames(srgb, (plan.replace(dark=DarkFramePlan()),), 0, origin)[0]
+    return _frames_of(srgb, (plan.replace(dark=DarkFramePlan()),), 0, origin)[0]
+
+
+Noise = Gaussian | Gaussian32 | Electrons
 
 
 class _Form(NamedTuple):
@@ -102,15 +125,15 @@ class _Form(NamedTuple):
     shape: tuple[int, ...]
     clean_dtype: Any
     noisy_dtype: Any
-    scene: type[Scene]
+    scene: Scene  # its class selects the precision
     noise: Gaussian | Gaussian32 | None  # None for noise in electrons, which depends on the place
+    frames: tuple[Slots, ...]  # of noise in electrons
     readout: ReadOut
     keys: NDArray[np.uint64]
 
 
-@functools.lru_cache(maxsize=1024)
-def _form_of(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int, int]) -> _Form:
-    """Return the form of frames of ``shape`` whose first site is ``corner`` of a tile."""
+def _form(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int, int], codes: int) -> _Form:
+    """Return the form of frames of ``shape``, from ``codes`` codes, whose first site is ``corner`` of a tile."""
     first, in_float32 = plans[0], uses_scene32(plans[0])
     packed = first.output.layout == PACKED
     noise = None if first.noise.counts_electrons else (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
@@ -118,39 +141,45 @@ def _form_of(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int,
         (4, shape[0] // 2, shape[1] // 2) if packed else shape,
         np.float32 if first.output.clean_normalised else np.uint16,
         np.float32 if first.output.normalised else np.uint16,
-        Scene32 if in_float32 else Scene,
+        scene_of(first, codes, corner, Scene32 if in_float32 else Scene),
         noise,
+        () if noise else tuple(map(slots_of, plans)),
         readout_of(plans, shape if packed else (0, 0), corner, in_float32),
         philox_keys(plans),
     )
 
 
-def _fill_frames(
+_forms = [functools.lru_cache(maxsize=count)(_form) for count in KEPT_SCENES]
+
+
+def _frames_of(
     srgb: Srgb,
     plans: tuple[Plan, ...],
     count: int,
     origin: tuple[int, int],
     dark_pixels: DarkPixels | None = None,
-    epoch: int | None = None,
 ) -> tuple[Frame, Frame, NDArray[np.int64]]:
-    """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`.
+    """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`."""
+    shape, is_wide = srgb.shape[:2], srgb.itemsize > 1
+    form = _forms[is_wide](plans, shape, (origin[0] % 2, origin[1] % 2), CODES[is_wide])
+    scene, noise = _records(form, plans, shape, origin, dark_pixels)
+    return _fill_frames(srgb, form, scene, noise, form.keys[:count], origin)
+
+
+def _fill_frames(
+    srgb: Srgb, form: _Form, scene: Scene, noise: Noise, keys: NDArray[np.uint64], origin: tuple[int, int]
+) -> tuple[Frame, Frame, NDArray[np.int64]]:
+    """Return the clean frame, a noisy frame for each key, and their numbers of `Counts`.
 
     Only the numbers of the first noisy frame include the counts of the clean frame.
     """
-    shape = srgb.shape[0], srgb.shape[1]
-    form = _form_of(plans, shape, (origin[0] % 2, origin[1] % 2))
     clean = np.empty(form.shape, form.clean_dtype)
-    noisy = np.empty((count, *form.shape), form.noisy_dtype)
-    counts = np.zeros((max(count, 1), COUNT_FIELDS), np.int64)
-    scene, noise = _records(form, plans, shape, 256 if srgb.itemsize == 1 else 65536, origin, dark_pixels, epoch)
+    noisy = np.empty((len(keys), *form.shape), form.noisy_dtype)
+    counts = np.zeros((max(len(keys), 1), COUNT_FIELDS), np.int64)
     # a view, a read-only array or a subclass would be another type, compiled again
     codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
-    keys = form.keys[:count]
-    if epoch is not None:
-        keys = keys.copy()
-        keys[0, 3] = frame_word(plans[0].noise.frame, epoch)
-    scratch = scratch_of_thread(np.float32 if form.scene is Scene32 else np.float64)
-    frames = clean.reshape(-1), noisy.reshape(count, clean.size)
+    scratch = scratch_of_thread(np.float32 if type(scene) is Scene32 else np.float64)
+    frames = clean.reshape(-1), noisy.reshape(len(keys), clean.size)
     _render(codes, scene, noise, keys, origin, form.readout, scratch, *frames, counts)
     return clean, noisy, counts
 
@@ -159,20 +188,17 @@ def _records(
     form: _Form,
     plans: tuple[Plan, ...],
     shape: tuple[int, int],
-    codes: int,
     origin: tuple[int, int],
     dark_pixels: DarkPixels | None = None,
     epoch: int | None = None,
-) -> tuple[Scene, Gaussian | Gaussian32 | Electrons]:
-    """Return the scene and the noise, whose classes select the compiled code.
-
-    Patches of an image find what they share in caches: preparing it would take a quarter of the time of a patch.
-    """
-    first = plans[0]
-    scene = scene_of(first, codes, (origin[0] % 2, origin[1] % 2), form.scene)
+) -> tuple[Scene, Noise]:
+    """Return the scene and the noise at a place, whose classes select the compiled code."""
+    first, scene = plans[0], form.scene
     if form.noise is not None:
         return scene, form.noise
-    frames = tuple(slots_in_epoch(plan, epoch) for plan in plans)
+    frames = form.frames
+    if epoch and any(slots.columns or (slots.rows and slots.rows.correlation) for slots in frames):
+        frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in plans)  # offsets of lines have words of an epoch
     body = body_of(frames[0].patterns, shape, origin, is_live=epoch is not None)
     factor = light_factor(frames[0].patterns, body, shape, origin, first.noise.averaged)
     if factor is not None:
