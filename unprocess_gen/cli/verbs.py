@@ -31,9 +31,16 @@ def _date(text: str) -> str:
     return date.fromisoformat(text).isoformat()
 
 
-def _to(text: str, metavar: str, *, required: bool = False) -> Argument:
-    kind = "folder" if metavar == "DIR" else metavar.lower()
-    return Argument(("--to",), text, metavar, _local_path, f"a local {kind}", f"{kind}s", required)
+def _file(flag: str, text: str, metavar: str = "FILE", *, required: bool = False) -> Argument:
+    return Argument((flag,), text, metavar, _local_path, "a local file", "files", required)
+
+
+def _folder(flag: str, text: str, metavar: str = "FOLDER", *, required: bool = False) -> Argument:
+    return Argument((flag,), text, metavar, _local_path, "a local folder", "folders", required)
+
+
+def _choice(name: str, text: str, *choices: str, required: bool = False) -> Argument:
+    return Argument((name,), text, f"{{{','.join(choices)}}}", required=required, choices=choices)
 
 
 def _composing(name: str, summary: str, run: str, *arguments: Argument, resumes: bool = False) -> Verb:
@@ -120,17 +127,10 @@ _VERBS = (
         (
             *INPUTS,
             REGENERATE,
-            _to("with --noise: draw the fits in FILE (PNG); with --against: list all numbers in FILE (CSV)", "FILE"),
+            _file("--to", "with --noise: draw the fits in FILE (PNG); with --against: list all numbers in FILE (CSV)"),
             Argument(("--repair",), "restore damaged files to the same bytes"),
             Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
-            Argument(
-                ("--against",),
-                "compare raw darks and flats of a camera with the noise profile",
-                "FRAMES",
-                _local_path,
-                "a local folder",
-                "folders",
-            ),
+            _folder("--against", "compare raw darks and flats of a camera with the noise profile", "FRAMES"),
         ),
         PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
     ),
@@ -142,7 +142,7 @@ _VERBS = (
             *INPUTS,
             Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
             KEYS,
-            _to("write the arrays to FOLDER", "FOLDER"),
+            _folder("--to", "write the arrays to FOLDER"),
         ),
         PlaceArgument("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
     ),
@@ -151,7 +151,7 @@ _VERBS = (
         "write an HTML page about a dataset or a sweep, or the card of a dataset",
         "reports.report",
         (
-            _to("write FILE instead of DIR/report.html; with --card, a folder", "FILE"),
+            _file("--to", "write FILE instead of DIR/report.html; with --card, a folder"),
             Argument(("--card",), "write README.md and croissant.json (Croissant 1.1) instead of the page"),
             Argument(("--licence", "--license"), "with --card: licence of the dataset, an SPDX name or URL", "LICENCE"),
             Argument(("--published",), "with --card: date of publication", "DATE", _date, "a date, such as 2026-01-31"),
@@ -167,14 +167,7 @@ _VERBS = (
             KEYS,
             _integer("--port", "number of the port on 127.0.0.1; default: a free one", 0),
             Argument(("--no-browser",), "print the address, and open no browser"),
-            Argument(
-                ("--save",),
-                "write FILE, a page of this state without controls, and stop",
-                "FILE",
-                _local_path,
-                "a local file",
-                "files",
-            ),
+            _file("--save", "write FILE, a page of this state without controls, and stop"),
             SETTINGS_SOURCE,
         ),
         PlaceArgument("PHOTO", "a photograph, a folder of photographs, or a dataset", "files", optional=True),
@@ -186,7 +179,7 @@ _VERBS = (
         "reports.preview",
         (
             KEYS,
-            _to("write the pictures to FOLDER", "FOLDER", required=True),
+            _folder("--to", "write the pictures to FOLDER", required=True),
             SOURCE,
             Argument(("--stages",), "draw each processing step too"),
         ),
@@ -198,7 +191,7 @@ _VERBS = (
         "reports.dng",
         (
             replace(KEYS, required=True),
-            _to("write the files to FOLDER", "FOLDER", required=True),
+            _folder("--to", "write the files to FOLDER", required=True),
             Argument(("--noisy",), "only noisy frames"),
             Argument(("--clean",), "only clean frames"),
         ),
@@ -209,14 +202,8 @@ _VERBS = (
         "write a dataset or sweep in another format; a killed export is continued",
         "reports.export",
         (
-            _to("write to FOLDER", "FOLDER", required=True),
-            Argument(
-                ("--format",),
-                "files of NumPy or TIFF, HDF5, or LMDB",
-                "{npy,tiff,hdf5,lmdb}",
-                choices=("npy", "tiff", "hdf5", "lmdb"),
-                required=True,
-            ),
+            _folder("--to", "write to FOLDER", required=True),
+            _choice("--format", "files of NumPy or TIFF, HDF5, or LMDB", "npy", "tiff", "hdf5", "lmdb", required=True),
         ),
         PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
         resumes=True,
@@ -230,11 +217,11 @@ _VERBS = (
             OUT,
             _integer("n_jobs", "number of worker processes; -1: all cores"),
             Argument(("executor",), "what runs the workers: local or dask", "NAME"),
-            Argument(
-                ("output.frames",),
+            _choice(
+                "output.frames",
                 "false: only the manifest; true: also the frames of a manifest without frames",
-                "{true,false}",
-                choices=("true", "false"),
+                "true",
+                "false",
             ),
             Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
             _integer("source.max_failed", "largest number of failed sources with exit code 0"),
@@ -247,7 +234,7 @@ _VERBS = (
         "make a benchmark build and compare every byte with its recorded digests",
         "builds.build",
         (
-            _to("write the build to DIR", "DIR"),
+            _folder("--to", "write the build to DIR", "DIR"),
             Argument(("--list",), "list all builds"),
             _integer("n_jobs", "number of worker processes; -1: all cores"),
         ),
@@ -259,20 +246,13 @@ _VERBS = (
         "measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile",
         "calibration.calibrate",
         (
-            _to("write the profile to FILE.yaml, and all estimates to FILE.json", "FILE", required=True),
-            Argument(
-                ("--report",),
-                "draw curves, histograms and maps in PAGE (HTML)",
-                "PAGE",
-                _local_path,
-                "a local file",
-                "files",
-            ),
-            Argument(
-                ("--from",),
+            _file("--to", "write the profile to FILE.yaml, and all estimates to FILE.json", required=True),
+            _file("--report", "draw curves, histograms and maps in PAGE (HTML)", "PAGE"),
+            _choice(
+                "--from",
                 "make the profile from NoiseProfile tags of DNG files, or from darks alone",
-                "{noise_profile,darks}",
-                choices=("noise_profile", "darks"),
+                "noise_profile",
+                "darks",
             ),
             Argument(
                 ("--gain",),
@@ -285,14 +265,7 @@ _VERBS = (
             ),
             Argument(("--quick",), "accept one level of two flats, and two darks; intervals are wider"),
             Argument(("--two-parameter",), "write gain and variance without light only: a and b"),
-            Argument(
-                ("--keep-darks",),
-                "copy the darks to FOLDER/isoN, for noise.dark_frames",
-                "FOLDER",
-                _local_path,
-                "a local folder",
-                "folders",
-            ),
+            _folder("--keep-darks", "copy the darks to FOLDER/isoN, for noise.dark_frames"),
         ),
         PlaceArgument("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
     ),
@@ -301,15 +274,8 @@ _VERBS = (
         "write a camera option, and a sensor option, from one raw file",
         "camera.camera",
         (
-            _to("write the matrix of the camera to CAMERA.yaml", "CAMERA", required=True),
-            Argument(
-                ("--sensor",),
-                "write pattern, bits and levels to SENSOR.yaml",
-                "SENSOR",
-                _local_path,
-                "a local file",
-                "files",
-            ),
+            _file("--to", "write the matrix of the camera to CAMERA.yaml", "CAMERA", required=True),
+            _file("--sensor", "write pattern, bits and levels to SENSOR.yaml", "SENSOR"),
         ),
         PlaceArgument("FILE", "the raw file: a DNG, or another one that LibRaw reads", "files"),
     ),
