@@ -143,7 +143,7 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
         + (unchecked if checks.unchecked else "")
     )
     if to is not None:
-        photon_transfer.draw_fits(summary.first, Path(to))
+        Path(to).write_bytes(photon_transfer.draw_fits(summary.first))
         print_result(f"drawn in {to}")
     unlisted = checks.wrong_pairs - sum(bool(alarm.key) for alarm in checks.alarms)
     more = [f"noise of {counted(unlisted, 'other pair')}: wrong too"] if unlisted else []

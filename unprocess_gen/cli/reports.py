@@ -19,7 +19,7 @@ from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals, read_table, swept_keys
 from unprocess_gen.config.option_files import group_options
 from unprocess_gen.config.raw_validation import require_photographs
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
+from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.reports.formatting import counted
 
@@ -143,12 +143,7 @@ def report(call: Call) -> int:
     if {"dark_frames", "dark_shading"} & call.values.keys():
         dark.open()  # refuses places that the user names and that do not exist
     page, photographs = None if to is None else Path(to), None if root is None else any_path(root)
-    try:
-        print_result(write_dataset_report(folder, page, photographs, dark))
-    except (PermissionError, MachineError) as error:
-        if to is None and isinstance(folder, Path) and not os.access(folder, os.W_OK):
-            raise MachineError(f"{folder}: the page cannot be written to the dataset; give --to FILE") from error
-        raise
+    print_result(write_dataset_report(folder, page, photographs, dark))
     return 0
 
 

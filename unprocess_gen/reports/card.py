@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import html
 import json
-import os
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from unprocess_gen.pipeline.workspace import CARD_FILES
 from unprocess_gen.reports.dataset_page.page import checked_facts, shown_settings
 from unprocess_gen.reports.dataset_page.statistics import ManifestStatistics, read_statistics, values_text
 from unprocess_gen.reports.formatting import byte_size, counted
-from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.reports.report_files import writable_folder, write_files
 from unprocess_gen.sources.names import encode_name
 
 CROISSANT = "http://mlcommons.org/croissant/1.1"
@@ -97,7 +96,9 @@ def write_card(folder: AnyPath, to: Path | None = None, statements: Statements |
     author may have edited; DamageError if the dataset is not finished or was changed.
     """
     require("mlcroissant", "report: --card needs mlcroissant", "card")
-    out = _folder_to_write(folder, to)
+    out = to or writable_folder(folder, "folder")
+    if to is not None and not (isinstance(folder, Path) and to.resolve() == folder.resolve()):
+        check_output_folder(to, f"--to {to}")
     facts, config = checked_facts(folder)
     manifest = folder / "manifest.csv"
     statistics = read_statistics(read_rows(manifest), facts["pairs"])
@@ -112,17 +113,6 @@ def write_card(folder: AnyPath, to: Path | None = None, statements: Statements |
             )
     write_files(out, {name: text.encode() for name, text in contents.items()})
     return out
-
-
-def _folder_to_write(folder: AnyPath, to: Path | None) -> Path:
-    if to is not None and not (isinstance(folder, Path) and to.resolve() == folder.resolve()):
-        check_output_folder(to, f"--to {to}")
-        return to
-    if not isinstance(folder, Path):
-        raise ConfigError(f"report: {folder} is in an object store; expected a local folder; give --to FOLDER")
-    if not os.access(folder, os.W_OK):
-        raise ConfigError(f"report: {folder} is read-only; expected a folder that can be written; give --to FOLDER")
-    return folder
 
 
 # ----------------------------------------------------------------------------------------------------------- README.md

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Float
 from unprocess_gen.dataset.reader import RawPairs, Sample
+from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.noise_check.checks import Checker, overlaps, pair_sums
 from unprocess_gen.reports.noise_check.scores import joined_points, row_offsets, variance_points
 from unprocess_gen.reports.noise_check.sums import Plane, Sums
@@ -155,8 +155,8 @@ def check_figure_file(to: Path) -> None:
     require_libraries(f"--to {to}", ("matplotlib",))
 
 
-def draw_fits(fits: list[NoiseFit], to: Path | BinaryIO) -> None:
-    """Draw variance against signal with the expected lines, as PNG."""
+def draw_fits(fits: list[NoiseFit]) -> bytes:
+    """Draw variance against signal with the expected lines; return a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5), layout="constrained")
@@ -168,4 +168,4 @@ def draw_fits(fits: list[NoiseFit], to: Path | BinaryIO) -> None:
         axes.plot(ends, fit.expected[0] * ends + fit.expected[1], color=colour, label=fit.key)
     axes.set(xlabel="signal above black (DN)", ylabel="variance of the noise (DN²)", title="Photon transfer")
     axes.legend(title="line: expected from the manifest")
-    figure.savefig(to, dpi=120)
+    return figure_png(figure, dpi=120)

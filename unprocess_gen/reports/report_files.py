@@ -5,13 +5,15 @@ A report is not part of a dataset. This module imports no kernel, so that the da
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.libraries import require
-from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_folder
+from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_file, check_output_folder
+from unprocess_gen.core.paths import AnyPath
 
 LIBRARIES = {"matplotlib": "drawing needs", "jinja2": "HTML pages need"}
 """Optional libraries of the extra ``figures``, and the purpose that an error message names."""
@@ -58,6 +60,24 @@ def check_report_folder(out: Path, verb: str) -> None:
                 f"out={out}: contains a dataset ({name}); expected a folder without one; choose another out"
             )
     check_output_folder(out, f"out={out}")
+
+
+def check_page_file(file: Path, option: str) -> None:
+    """Raise ConfigError if a page cannot be written to a file, or would replace another file than a page."""
+    check_output_file(file, option, "an HTML page", b"<!doctype html", b"<html")
+
+
+def writable_folder(folder: AnyPath, kind: str) -> Path:
+    """Return the folder of a dataset in which a report, a ``file`` or files of a ``folder``, is written without --to.
+
+    ConfigError if it is remote or read-only.
+    """
+    advice = f"give --to {kind.upper()}"
+    if not isinstance(folder, Path):
+        raise ConfigError(f"report: {folder} is in an object store; expected a local {kind}; {advice}")
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"report: {folder} is read-only; expected a {kind} that can be written; {advice}")
+    return folder
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:

@@ -8,14 +8,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import quote
 
-import cv2
 import numpy as np
 
 from unprocess_gen.core.errors import UnprocessGenError
-from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.types import Float
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
@@ -24,9 +22,10 @@ from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.targets import noise_law
 from unprocess_gen.pipeline.workspace import REPORT
 from unprocess_gen.reports.dataset_page.page import write_dataset_report
+from unprocess_gen.reports.encoding import jpeg
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.reports.html_pages import data_uri, render_page
-from unprocess_gen.reports.report_files import require_libraries, write_files
+from unprocess_gen.reports.report_files import check_page_file, require_libraries, write_files
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.contact_sheet import develop_detail
 from unprocess_gen.simulation.reference.isp import to_light
@@ -60,7 +59,7 @@ def write_sweep_page(folder: Path, jobs: Table, swept: Sequence[str], to: Path |
     require_libraries("report")
     file = folder / REPORT if to is None else to
     if to is not None:
-        check_output_file(to, f"--to {to}", "an HTML page", b"<!doctype html", b"<html")
+        check_page_file(to, f"--to {to}")
     cells = {job["folder"]: _cell(folder, job, file.parent) for job in with_bar(jobs, "dataset", len(jobs))}
     highest_dn = max((float(cell.std_dn.max(initial=0)) for cell in cells.values()), default=0.0)
     counts = {key: len({job.get(key, "") for job in jobs}) for key in swept}
@@ -130,12 +129,8 @@ def _pictures(folder: Path) -> tuple[tuple[tuple[str, str], ...], Float]:
         drawn["noisy, developed"] = develop_detail(frames[1], plan, window)
     signal_dn = np.linspace(plan.sensor.black_level_dn, plan.sensor.white_level_dn, CURVE_LEVELS)
     std_dn = noise_std(signal_dn, noise_law(plan)).astype(np.float64)
-    return tuple((title, _jpeg(picture)) for title, picture in drawn.items()), std_dn
-
-
-def _jpeg(picture: Any) -> str:
-    _, encoded = cv2.imencode(".jpg", panels.byte_codes(picture)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return data_uri(encoded.tobytes(), "jpeg")
+    jpegs = {title: jpeg(panels.byte_codes(picture), JPEG_QUALITY) for title, picture in drawn.items()}
+    return tuple((title, data_uri(content, "jpeg")) for title, content in jpegs.items()), std_dn
 
 
 def _curve(std_dn: Float, highest_dn: float) -> str:

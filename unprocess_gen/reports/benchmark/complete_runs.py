@@ -23,8 +23,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
-
 from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import AccuracyConfig, Config, SourceConfig
 from unprocess_gen.core.errors import ConfigError, SourceError
@@ -34,6 +32,7 @@ from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.reports.benchmark.methods import FrameErrors
 from unprocess_gen.reports.benchmark.session import EXACT, SampleSizes
 from unprocess_gen.reports.benchmark.timing import measure_in_turns
+from unprocess_gen.reports.encoding import jpeg
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.sources.loader import list_photographs, load_source
@@ -145,8 +144,7 @@ def _select(config: Config, sizes: SampleSizes, folder: Path) -> RunFiles:
 def _write_scene(config: SourceConfig, source: Source, folder: Path) -> None:
     """Write a built-in scene, in full size, as a JPEG file."""
     _, scene = load_source(replace(config, downscale=1), source)
-    _, content = cv2.imencode(".jpg", scene.srgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    write_files(folder, {f"{source.name}.jpg": content.tobytes()})
+    write_files(folder, {f"{source.name}.jpg": jpeg(scene.srgb, JPEG_QUALITY)})
 
 
 def time_run(config: Config, files: RunFiles, tier: AccuracyConfig) -> RunTimes:

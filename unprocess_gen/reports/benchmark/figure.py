@@ -7,7 +7,6 @@ beats in both error and time. Every point is labelled with its name; points in t
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +16,7 @@ import numpy as np
 from unprocess_gen.reports.benchmark.complete_runs import RunMeasurement
 from unprocess_gen.reports.benchmark.measure import Measurement
 from unprocess_gen.reports.benchmark.session import EXACT, FAST, GIVEN, REFERENCE
+from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.paper.pictures import BLUE, GREEN, GREY, INK, ORANGE
 
@@ -77,9 +77,7 @@ def benchmark_figure(rows: Sequence[Measurement], runs: Sequence[RunMeasurement]
             _draw_points(panels[title], [row for row in rows if row.stage in stages])
         _draw_legend(figure, [row.method for row in rows if row.stage == "tier"])
         figure.supxlabel("time of a pair or stage, ns per pixel (one thread)", fontsize=10)
-        content = io.BytesIO()
-        figure.savefig(content, format="png", dpi=100)
-    return content.getvalue()
+        return figure_png(figure, dpi=100)
 
 
 def _draw_runs(axes: Axes, runs: Sequence[RunMeasurement]) -> None:

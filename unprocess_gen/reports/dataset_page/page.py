@@ -8,13 +8,10 @@ arrays, only a few evenly spaced pairs are read: `PAIRS_FITTED` for the noise ch
 from __future__ import annotations
 
 import functools
-import io
-import os
 import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from unprocess_gen.config.schema import ENTRY_GROUPS, Config
@@ -22,7 +19,6 @@ from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.values import error_in_one_line, value_text
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import file_sha256
-from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Row
@@ -35,10 +31,11 @@ from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.workspace import REPORT, read_dataset
 from unprocess_gen.reports import photon_transfer
 from unprocess_gen.reports.dataset_page.statistics import SITE_COLUMNS, NumberSummary, read_statistics, values_text
+from unprocess_gen.reports.encoding import figure_png, jpeg
 from unprocess_gen.reports.formatting import byte_size, short_number
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.noise_check.checks import Checker
-from unprocess_gen.reports.report_files import require_libraries, write_files
+from unprocess_gen.reports.report_files import check_page_file, require_libraries, writable_folder, write_files
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 from unprocess_gen.sources.dark_frames import NO_PLACES, DarkPlaces
 from unprocess_gen.sources.names import encode_name
@@ -69,22 +66,11 @@ def write_dataset_report(
     not finished or was changed; MachineError if writing fails.
     """
     require_libraries("report")
-    file = _file_to_write(folder, to)
+    file = to or writable_folder(folder, "file") / REPORT
+    if to is not None and not (isinstance(folder, Path) and to.resolve() == (folder / REPORT).resolve()):
+        check_page_file(to, f"--to {to}")
     write_files(file.parent, {file.name: dataset_page(folder, source, dark).encode()})
     return file
-
-
-def _file_to_write(folder: AnyPath, to: Path | None) -> Path:
-    default = folder / REPORT
-    if to is None:
-        if not isinstance(default, Path):
-            raise ConfigError(f"report: {folder} is in an object store; expected a local file; give --to FILE")
-        if not os.access(default.parent, os.W_OK):
-            raise ConfigError(f"report: {folder} is read-only; expected a file that can be written; give --to FILE")
-        return default
-    if not isinstance(default, Path) or to.resolve() != default.resolve():
-        check_output_file(to, f"--to {to}", "an HTML page", b"<!doctype html", b"<html")
-    return to
 
 
 def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlaces = NO_PLACES) -> str:
@@ -146,14 +132,11 @@ def checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
 
 
 def _pair_values(folder: AnyPath, source: AnyPath | None, dark: DarkPlaces, first: Row) -> dict[str, Any]:
-    """Values of the sections about pairs; the contact sheet is a JPEG, because noise makes a PNG four times as large.
+    """Values of the sections about pairs.
 
     The noise of a few evenly spaced pairs is checked and fitted, unless their dark frames are not available.
     """
-    _, sheet = cv2.imencode(
-        ".jpg", contact_sheet(folder, source=source)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    )
-    pairs, figure, missing, noise = RawPairs(folder), io.BytesIO(), "", None
+    pairs, figure, missing, noise = RawPairs(folder), b"", "", None
     numbers = evenly_spaced(range(len(pairs)), PAIRS_FITTED)
     try:
         access = dark.open() if first["dark_frame"] else None
@@ -162,15 +145,15 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark: DarkPlaces, firs
         examined = with_bar((pairs[number] for number in numbers), "pair checked", len(numbers))
         noise = photon_transfer.examine_pairs(examined, Checker(np.ones((len(numbers), 2), int)), access)
         if noise.first:
-            photon_transfer.draw_fits(noise.first, figure)
+            figure = photon_transfer.draw_fits(noise.first)
     except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
         missing = str(error)
     return {
-        "contact_sheet": data_uri(sheet.tobytes(), "jpeg"),
+        "contact_sheet": data_uri(jpeg(contact_sheet(folder, source=source), JPEG_QUALITY), "jpeg"),
         "noise": noise,
         "missing": missing,
         "count": len(numbers),
-        "figure": data_uri(figure.getvalue()),
+        "figure": data_uri(figure),
         "first_shard": f"{folder_name(folder)}/shards/{shard_name(int(first['shard'] or 0))}",
         "first_key": sample_key(first),
     }
@@ -193,7 +176,7 @@ BARS = 24
 def _chart(column: NumberSummary) -> Chart:
     from matplotlib.figure import Figure  # optional library, extra "figures"
 
-    figure, content = Figure(figsize=(3, 1.1), layout="constrained"), io.BytesIO()
+    figure = Figure(figsize=(3, 1.1), layout="constrained")
     axes = figure.subplots()
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.set_yticks([])
@@ -201,8 +184,7 @@ def _chart(column: NumberSummary) -> Chart:
     axes.set_xscale("log" if is_logarithmic else "linear")
     space = np.geomspace if is_logarithmic else np.linspace
     axes.hist(column.values, space(column.least, column.greatest, BARS + 1).tolist())
-    figure.savefig(content, dpi=120)
     least, mean, greatest = (short_number(value, 4) for value in (column.least, column.mean, column.greatest))
     unit = " % of the frame" if column.column in SITE_COLUMNS else ""
     caption = f"{MEANINGS[column.column]}: {least} to {greatest}{unit}, mean {mean}"
-    return Chart(column.column, caption, data_uri(content.getvalue()))
+    return Chart(column.column, caption, data_uri(figure_png(figure, dpi=120)))

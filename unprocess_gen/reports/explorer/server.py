@@ -9,9 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.reports.explorer.opening import Choices
-from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.reports.report_files import check_page_file, write_files
 
 HOST = "127.0.0.1"
 
@@ -65,6 +64,6 @@ def save(choices: Choices, to: Path) -> None:
     """Write a page of the first choice to a file, which may replace an HTML page."""
     from unprocess_gen.reports.explorer.page import Page
 
-    check_output_file(to, f"--save {to}", "an HTML page", b"<!doctype html", b"<html")
+    check_page_file(to, f"--save {to}")
     content = Page(choices, next(iter(choices)), saved=True).html()
     write_files(to.parent, {to.name: content.encode()})

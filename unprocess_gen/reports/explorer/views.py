@@ -60,7 +60,7 @@ def view(shown: Shown, window: Window, common: bool, most: tuple[int, int] = VIE
         raw, developed = _drawn(frame, shown, window, side)
         light = np.sqrt(np.clip(to_light(raw, shown.plan), 0, 1)) if common else stretch(raw)[0]
         columns[name] = _words(light)
-        columns[f"{name}_developed"] = _words(developed if common else _stretched(developed))
+        columns[f"{name}_developed"] = _words(developed if common else stretch(developed, least=1e-6)[0])
         columns[f"{name}_dn"] = raw if raw.dtype == np.uint16 else raw.astype(np.float32)
     columns["saturated"] = _words(_saturated(shown.saturated[window], columns["clean"].shape, shown, side))
     for channel, name in enumerate("rgb"):
@@ -92,11 +92,6 @@ def _drawn(frame: MosaicArray, shown: Shown, window: Window, side: int) -> tuple
     planes = _planes(frame[window], side)
     rgb = panels.planes_to_rgb(planes, shown.plan.sensor.pattern)
     return planes.mean(axis=-1), process(to_light(rgb, shown.plan), shown.plan)
-
-
-def _stretched(image: Float) -> Float:
-    low, high = np.percentile(image, (0.1, 99.9))
-    return np.asarray(np.clip((image - low) / max(high - low, 1e-6), 0, 1))
 
 
 def _saturated(mask: NDArray[np.bool_], shape: tuple[int, ...], shown: Shown, side: int) -> Float:

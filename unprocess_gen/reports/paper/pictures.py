@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Frame, Srgb
+from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.html_pages import PageTable
 from unprocess_gen.simulation.reference.cfa import CHANNELS, mosaic, tile
 
@@ -106,9 +106,7 @@ def panel_aspect(srgb: Srgb) -> float:
 
 def png(figure: Figure) -> bytes:
     """The bytes of a PNG."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110)
-    return content.getvalue()
+    return figure_png(figure, dpi=110)
 
 
 def percent(part: int | np.integer[Any], total: int) -> str:

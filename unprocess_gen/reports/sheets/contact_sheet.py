@@ -24,7 +24,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError
@@ -35,6 +34,7 @@ from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import CODE_RANGE, Float, Plan, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row, read_columns
 from unprocess_gen.pipeline.progress import with_bar
+from unprocess_gen.reports.encoding import png
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs
@@ -76,9 +76,9 @@ def write_sheets(
                 "datasets; choose another folder, or remove them"
             )
     for pair in selected_pairs(folder, keys, source):
-        contents = {f"{pair.key}.png": _png(pair_sheet(pair), mark)}
+        contents = {f"{pair.key}.png": _marked_png(pair_sheet(pair), mark)}
         if with_stages and pair.source is not None:
-            contents[f"{pair.key}.stages.png"] = _png(stages_sheet(pair, pair.source), mark)
+            contents[f"{pair.key}.stages.png"] = _marked_png(stages_sheet(pair, pair.source), mark)
         write_files(to, contents)
         yield SheetFiles(pair.key, str(pair.row["source"]), tuple(to / name for name in contents), pair.missing_source)
 
@@ -107,9 +107,8 @@ def _is_marked(path: Path, mark: bytes) -> bool:
     return False
 
 
-def _png(picture: Picture, mark: bytes) -> bytes:
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]), (cv2.IMWRITE_PNG_COMPRESSION, 3))
-    content = encoded.tobytes()
+def _marked_png(picture: Picture, mark: bytes) -> bytes:
+    content = png(picture)
     return content[:PNG_HEADER_BYTES] + mark + content[PNG_HEADER_BYTES:]
 
 
@@ -175,10 +174,13 @@ STRETCHED = (0.1, 99.9)
 """Percentiles of a picture that its own stretch maps to black and white."""
 
 
-def stretch(dn: MosaicArray) -> tuple[Float, str]:
-    """Stretch a frame to [0, 1] between its percentiles `STRETCHED`, which are also given in words."""
+def stretch(dn: MosaicArray, least: float = 1.0) -> tuple[Float, str]:
+    """Stretch a frame to [0, 1] between its percentiles `STRETCHED`, which are also given in words.
+
+    A range of less than ``least`` is not stretched to [0, 1].
+    """
     low, high = np.percentile(dn, STRETCHED)
-    return np.clip((dn - low) / max(high - low, 1.0), 0, 1), f"{low:.5g} to {high:.5g} DN"
+    return np.clip((dn - low) / max(high - low, least), 0, 1), f"{low:.5g} to {high:.5g} DN"
 
 
 DEMOSAIC_REACH_PX = 2
