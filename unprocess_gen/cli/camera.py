@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.messages import print_result
+from unprocess_gen.cli.messages import print_result, print_results
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import LocalPath, local_path
@@ -22,23 +22,17 @@ def camera(call: Call) -> int:
     file = local_path(call.path, f"camera: {call.path} is in an object store; expected a local file")
     if not file.is_file():
         raise ConfigError(f"camera {file}: no such file; expected a raw file")
-    to, sensor = Path(call.values["to"]), call.values.get("sensor")
-    check_options(to, None if sensor is None else Path(sensor))
-    options = camera_options(file, to.stem)
-    _write(to, options.camera)
-    if sensor is not None:
-        _write(Path(sensor), options.sensor)
-    for sentence in options.sources:
-        print_result(sentence)
-    chosen = [f"camera={to.stem}", *([] if sensor is None else [f"sensor={Path(sensor).stem}"])]
-    folder = to.parent.parent
-    where = f"--config-dir {shlex.quote(str(folder))}"
+    to, sensor = Path(call.values["to"]), Path(call.values["sensor"]) if "sensor" in call.values else None
+    check_options(to, sensor)
+    options, chosen = camera_options(file, to.stem), ""
+    for path, group, text in ((to, "camera", options.camera), (sensor, "sensor", options.sensor)):
+        if path is not None:
+            with machine_errors(path):
+                LocalPath(path).write(text.encode(), str(path.parent))
+            chosen += f" {group}={path.stem}"
+    print_results(options.sources)
+    where = f"--config-dir {shlex.quote(str(to.parent.parent))}"
     if to.absolute().parent.name != "camera":
         where = "the file in a folder camera of --config-dir, and"
-    print_result(f"{to}: use it with {where} {' '.join(chosen)}")
+    print_result(f"{to}: use it with {where}{chosen}")
     return 0
-
-
-def _write(path: Path, text: str) -> None:
-    with machine_errors(path):
-        LocalPath(path).write(text.encode(), str(path.parent))

@@ -14,6 +14,7 @@ from typing import Any
 from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
 from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.targets import TARGETS
+from unprocess_gen.simulation.reference.light import LIGHTS
 
 Test = Callable[[Any], bool]
 
@@ -207,23 +208,20 @@ DEQUANTIZE = Switch("off", "dither", "dither_all")
 
 CAMERA_LAWS = Choice("fixed", "convex", "choice", "identity", "custom")
 
-LIGHT_NAMES = ("daylight", "cloudy", "shade", "tungsten", "fluorescent", "d65", "d50", "a")
-"""Lights whose gains follow from the matrix of the camera (`simulation.reference.light`)."""
-
-LIGHT = Choice(*LIGHT_NAMES, "scene")
+LIGHT = Choice(*LIGHTS, "scene")
 
 
 def _is_light(value: Any) -> bool:
     """Check a light, or lights and their shares in turn."""
     if not isinstance(value, list | tuple):
-        return value in LIGHT_NAMES
+        return value in LIGHTS
     names, shares = value[::2], value[1::2]
-    known = len(names) == len(shares) > 0 and all(name in LIGHT_NAMES for name in names)
+    known = len(names) == len(shares) > 0 and all(name in LIGHTS for name in names)
     return known and all(is_number(share) and share > 0 for share in shares) and abs(sum(shares) - 1) <= 1e-9
 
 
 SCENE_LIGHT = Limit(
-    f"one of {', '.join(LIGHT_NAMES)}, or several with shares that sum to 1, such as [tungsten, 0.7, daylight, 0.3]",
+    f"one of {', '.join(LIGHTS)}, or several with shares that sum to 1, such as [tungsten, 0.7, daylight, 0.3]",
     _is_light,
 )
 

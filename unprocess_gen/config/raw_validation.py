@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import operator
 
 from unprocess_gen.config.interpretation import is_physical, uses_dark_frames
-from unprocess_gen.config.schema import Config, SourceConfig
-from unprocess_gen.config.values import refusal
+from unprocess_gen.config.schema import Config, RawConfig, SourceConfig
+from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.values import refusal, value_text
 from unprocess_gen.simulation.reference.cfa import MONO
 
 PHOTOGRAPH_SETTINGS = {"downscale": 1, "dequantize": "off", "icc": "ignore"}
 """Keys of the source that prepare photographs, with the value of raw sources."""
-RAW_SETTINGS = {"shrink": 1, "own_noise": "keep"}
+RAW_SETTINGS = {"shrink": 1, "own_noise": "keep", **{f"raw.{name}": None for name in settings_of(RawConfig)}}
 """Keys of raw sources, with the value of photographs."""
 
 
@@ -19,17 +20,14 @@ def check_raw_source(config: Config) -> None:
     """Raise ConfigError if settings of raw sources and of photographs are mixed, or contradict each other."""
     source, is_raw = config.source, config.source.kind == "raw"
     for name, value in (PHOTOGRAPH_SETTINGS if is_raw else RAW_SETTINGS).items():
-        if (setting := getattr(source, name)) != value:
+        if (setting := operator.attrgetter(name)(source)) != value:
             kind, advice = ("photographs", "use source.shrink") if is_raw else ("raw sources", "set source.kind=raw")
-            raise refusal(f"source.{name}", setting, f"is for {kind}; expected {value}, or {advice}")
+            raise refusal(f"source.{name}", setting, f"is for {kind}; expected {value_text(value)}, or {advice}")
     if is_raw:
         _check_levels(config)
         _check_own_noise(config)
         _check_targets(config)
         return
-    for name, setting in asdict(source.raw).items():
-        if setting is not None:
-            raise refusal(f"source.raw.{name}", setting, "describes raw files; expected null, or set source.kind=raw")
     if config.sensor.levels == "source":
         raise refusal("sensor.levels", "source", "photographs state no levels; choose a sensor, or set source.kind=raw")
 

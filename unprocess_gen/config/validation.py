@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import math
 import operator
 import re
@@ -60,7 +61,7 @@ from unprocess_gen.core.roots import SourceRoots, absolute_root
 from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
-from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains, chromaticity
+from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
 
 CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
 """Settings that `noise_validation` checks if the noise profile uses them, as version 0.1 did.
@@ -323,17 +324,13 @@ def _check_lights(config: Config) -> None:
     matrix = colour.matrix(config.camera.xyz2cam or ())
     for name, _ in lights(config):
         light = LIGHTS[name]
-        for step in range(9):
-            mired = 1e6 / light.high_k + step / 8 * (1e6 / light.low_k - 1e6 / light.high_k)
-            for side in (-1, 1):
-                try:
-                    gains = camera_gains(matrix, chromaticity(light, 1e6 / mired, light.offset + side * light.scatter))
-                except ValueError as error:
-                    raise refusal("gains.light", name, f"{error}; expected another light or matrix") from None
-                if not all(MIN_GAIN <= gain <= MAX_GAIN for gain in gains):
-                    raise refusal(
-                        "gains.light", name, f"gives gains {gains[0]:g} and {gains[1]:g}; expected {GAIN_TEXT}"
-                    )
+        for step, side in itertools.product(range(9), (-1, 1)):
+            try:
+                red, blue = camera_gains(matrix, light.xy(light.kelvin(step / 8), side))
+            except ValueError as error:
+                raise refusal("gains.light", name, f"{error}; expected another light or matrix") from None
+            if not (MIN_GAIN <= red <= MAX_GAIN and MIN_GAIN <= blue <= MAX_GAIN):
+                raise refusal("gains.light", name, f"gives gains {red:g} and {blue:g}; expected {GAIN_TEXT}")
 
 
 # ------------------------------------------------------------------------------------------------ effects and output

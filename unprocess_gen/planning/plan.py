@@ -35,7 +35,7 @@ from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.raw_source import NEUTRAL, own_noise, parts_of, with_raw_sensor
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
-from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains, chromaticity
+from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
 from unprocess_gen.simulation.reference.sensor import noise_in_dn
 
 
@@ -427,13 +427,8 @@ def draw_light(
     """Draw a light and its colour temperature; return both, and the gains of red and blue of a camera under it."""
     ends = list(itertools.accumulate(share for _, share in lights))
     name = lights[bisect.bisect_right(ends[:-1], uniforms[Draw.LIGHT])][0]
-    light = LIGHTS[name]
-    kelvin = light.low_k
-    if light.low_k < light.high_k:
-        coolest, warmest = 1e6 / light.high_k, 1e6 / light.low_k
-        kelvin = 1e6 / (coolest + uniforms[Draw.CCT] * (warmest - coolest))
-    distance = light.offset + (2 * uniforms[Draw.LIGHT_DISTANCE] - 1) * light.scatter
-    return name, kelvin, camera_gains(matrix, chromaticity(light, kelvin, distance))
+    kelvin = LIGHTS[name].kelvin(uniforms[Draw.CCT])
+    return name, kelvin, camera_gains(matrix, LIGHTS[name].xy(kelvin, 2 * uniforms[Draw.LIGHT_DISTANCE] - 1))
 
 
 def convex_weights(uniforms: Sequence[float]) -> Weights:

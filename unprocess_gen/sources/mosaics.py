@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import file_sha256
-from unprocess_gen.core.libraries import require
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.sources.raw.decode import decode_raw
 
@@ -87,14 +86,13 @@ def _check_array(path: Path, key: str, pixels: NDArray[Any], numbers: bool) -> N
 
 def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
     """Decode a raw file: the visible part of the mosaic."""
-    require("rawpy", f"{key}: {path} is a raw file, which needs rawpy", "raw", ", or convert the frames to NPY")
     try:
         frame = decode_raw(content)
     except SourceError as error:
         raise ConfigError(f"{key}: {path} {error.text}") from error
     facts = frame.metadata
     blacks = set(facts.black_dn or ())
-    if frame.colours.shape != (2, 2) or not blacks:
+    if frame.xtrans is not None or not blacks:
         raise ConfigError(f"{key}: {path} holds no Bayer mosaic; expected one")
     if len(blacks) > 1:
         raise ConfigError(

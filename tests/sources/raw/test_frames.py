@@ -211,7 +211,7 @@ def test_xtrans_needs_cells() -> None:
     tile = np.array(["GBGGRG", "RGRBGB", "GBGGRG", "GRGGBG", "BGBRGR", "GRGGBG"])
     colours = np.array([["RGB".index(one) for one in row] for row in tile], np.uint8)
     pixels = np.random.default_rng(4).integers(1024, 16000, (18, 24)).astype(np.uint16)
-    frame = RawFrame(pixels, colours, RawMetadata(black_dn=(1022.0,) * 4, white_dn=16383.0))
+    frame = RawFrame(pixels, RawMetadata(black_dn=(1022.0,) * 4, white_dn=16383.0), colours)
     with pytest.raises(SourceError, match="X-Trans"):
         _photograph(SourceConfig(kind="raw"), frame)
     photograph = _photograph(SourceConfig(kind="raw", shrink=2), frame)

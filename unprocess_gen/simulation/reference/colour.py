@@ -89,6 +89,26 @@ def multiply(left: Matrix, right: Matrix) -> Matrix:
     )
 
 
+def transform(entries: Matrix, vector: Sequence[float]) -> tuple[float, float, float]:
+    """Multiply a matrix by a vector; each sum is computed from left to right.
+
+    Parameters
+    ----------
+    entries : Matrix
+        The matrix.
+    vector : sequence of float
+        Three values.
+
+    Returns
+    -------
+    tuple of three floats
+        The product.
+    """
+    x, y, z = vector
+    first, second, third = (entries[row] * x + entries[row + 1] * y + entries[row + 2] * z for row in (0, 3, 6))
+    return first, second, third
+
+
 def mix(matrices: Sequence[Matrix], weights: Sequence[float]) -> Matrix:
     """Return the weighted sum of XYZ → camera matrices; Brooks et al. mix before they normalise.
 

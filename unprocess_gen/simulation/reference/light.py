@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from unprocess_gen.simulation.reference.colour import Matrix
+from unprocess_gen.simulation.reference.colour import Matrix, transform
 
 XY = tuple[float, float]
 """CIE 1931 chromaticity."""
@@ -37,6 +37,41 @@ class Light:
     on_daylight: bool
     offset: float = 0.0
     scatter: float = 0.0
+
+    def kelvin(self, share: float) -> float:
+        """Return the colour temperature at a share of the range, counted in its reciprocal.
+
+        Parameters
+        ----------
+        share : float
+            0 for the highest, 1 for the lowest colour temperature.
+
+        Returns
+        -------
+        float
+            Colour temperature, kelvin.
+        """
+        if self.low_k == self.high_k:
+            return self.low_k
+        coolest, warmest = 1e6 / self.high_k, 1e6 / self.low_k
+        return 1e6 / (coolest + share * (warmest - coolest))
+
+    def xy(self, kelvin: float, side: float) -> XY:
+        """Return a chromaticity of the light.
+
+        Parameters
+        ----------
+        kelvin : float
+            Colour temperature.
+        side : float
+            Deviation from ``offset`` in units of ``scatter``, -1 to 1.
+
+        Returns
+        -------
+        XY
+            The chromaticity.
+        """
+        return chromaticity(self, kelvin, self.offset + side * self.scatter)
 
 
 LIGHTS: Mapping[str, Light] = {
@@ -141,9 +176,7 @@ def camera_gains(xyz2cam: Matrix, xy: XY) -> tuple[float, float]:
     """
     x, y = xy
     xyz = x / y, 1.0, (1.0 - x - y) / y
-    red, green, blue = (
-        xyz2cam[row] * xyz[0] + xyz2cam[row + 1] * xyz[1] + xyz2cam[row + 2] * xyz[2] for row in (0, 3, 6)
-    )
+    red, green, blue = transform(xyz2cam, xyz)
     if not (red > 0 and green > 0 and blue > 0):
         raise ValueError("the camera's response to this light is not positive")
     return green / red, green / blue

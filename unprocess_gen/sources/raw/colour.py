@@ -8,11 +8,10 @@ chromaticity, order of the search), Adobe's DNG SDK 1.4 is followed. Only + − 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert, matrix, multiply
-from unprocess_gen.simulation.reference.light import XY
+from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert, matrix, multiply, transform
+from unprocess_gen.simulation.reference.light import XY, camera_gains
 
 Neutral = tuple[float, float, float]
 """Camera values of a neutral surface."""
@@ -97,20 +96,17 @@ class DngColour:
             return self.white_xy or D50
         last = before = D50
         for _ in range(MOST_ITERATIONS):
-            before, last = last, _xy(_apply(invert(self.matrix_at(last)), self.neutral))
+            before, last = last, _xy(transform(invert(self.matrix_at(last)), self.neutral))
             if abs(last[0] - before[0]) + abs(last[1] - before[1]) < CLOSE:
                 return last
         return (last[0] + before[0]) / 2, (last[1] + before[1]) / 2
 
     def gains(self) -> tuple[float, float] | None:
         """Return the gains of red and blue that make the white point gray; None if no tag states it."""
-        neutral = self.neutral
-        if neutral is None:
-            if self.white_xy is None:
-                return None
-            x, y = self.white_xy
-            neutral = _apply(self.matrix_at(self.white_xy), (x / y, 1.0, (1 - x - y) / y))
-        return neutral[1] / neutral[0], neutral[1] / neutral[2]
+        if self.neutral is not None:
+            red, green, blue = self.neutral
+            return green / red, green / blue
+        return None if self.white_xy is None else camera_gains(self.matrix_at(self.white_xy), self.white_xy)
 
 
 def temperature(white: XY) -> float:
@@ -130,13 +126,6 @@ def temperature(white: XY) -> float:
             return 1e6 / max(_ISOTHERMS[number - 1][0] * share + mired * (1 - share), 10.0)
         last = distance
     raise AssertionError("the last line returns")
-
-
-def _apply(entries: Matrix, vector: Sequence[float]) -> Neutral:
-    red, green, blue = (
-        entries[row] * vector[0] + entries[row + 1] * vector[1] + entries[row + 2] * vector[2] for row in (0, 3, 6)
-    )
-    return red, green, blue
 
 
 def _xy(xyz: Neutral) -> XY:

@@ -17,12 +17,13 @@ from unprocess_gen.sources.raw.metadata import (
     JPEG_XL,
     RawMetadata,
     decoder_facts,
-    decoder_message,
+    opened_by_libraw,
     tags_of,
+    tiff_pages,
 )
 
-MOST_PATTERN = 6
-"""Side of the largest CFA tile, of X-Trans."""
+XTRANS_CELL = 6
+"""Side of the CFA tile of X-Trans; the tile of Bayer has 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +34,15 @@ class RawFrame:
     ----------
     pixels : ndarray of uint16, [H, W]
         DN, without masked borders.
-    colours : ndarray of uint8, [2, 2] or [6, 6]
-        Colour of the sites of the top-left tile: 0 red, 1 green, 2 blue, 3 the green of the blue rows.
     metadata : RawMetadata
         Facts; levels and pattern of the visible part.
+    xtrans : ndarray of uint8, [6, 6] or None
+        Colour of the sites of the top-left tile of X-Trans: 0 red, 1 or 3 green, 2 blue; None for a Bayer mosaic.
     """
 
     pixels: NDArray[np.uint16]
-    colours: NDArray[np.uint8]
     metadata: RawMetadata
+    xtrans: NDArray[np.uint8] | None = None
 
 
 def decoder_versions() -> dict[str, str]:
@@ -64,23 +65,17 @@ def decode_raw(content: bytes, max_pixels: int = 2**40) -> RawFrame:
 
 
 def _decode_with_libraw(content: bytes, facts: RawMetadata, max_pixels: int) -> RawFrame:
-    import rawpy
-
-    try:
-        with rawpy.imread(io.BytesIO(content)) as raw:
-            _check_size(raw.sizes.width, raw.sizes.height, max_pixels)
-            if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
-                raise SourceError("unsupported", "contains no mosaic (LibRaw); expected red, green and blue sites")
-            side = len(raw.raw_pattern)
-            if side > MOST_PATTERN or raw.num_colors != 3:
-                raise SourceError("unsupported", f"has a CFA of {side} x {side} sites and {raw.num_colors} colours")
-            completed, colours = facts.completed(decoder_facts(raw)), raw.raw_colors_visible[:side, :side].copy()
-            if facts.area is None or facts.pattern is None:
-                return RawFrame(raw.raw_image_visible.copy(), colours, completed)
+    with opened_by_libraw(content) as raw:
+        _check_size(raw.sizes.width, raw.sizes.height, max_pixels)
+        side = len(raw.raw_pattern)
+        if side not in (2, XTRANS_CELL) or raw.num_colors != 3:
+            raise SourceError("unsupported", f"has a CFA of {side} x {side} sites and {raw.num_colors} colours")
+        completed = facts.completed(decoder_facts(raw))
+        if facts.area is not None and facts.pattern is not None:
             # LibRaw moves odd margins to even ones, and then confuses the black levels of the sites
-            return RawFrame(_visible(raw.raw_image, facts.area), _colours(facts.pattern), completed)
-    except rawpy.LibRawError as error:
-        raise SourceError("corrupt", f"cannot be decoded by LibRaw ({decoder_message(error)})") from error
+            return RawFrame(_visible(raw.raw_image, facts.area), completed)
+        xtrans = raw.raw_colors_visible[:side, :side].copy() if side == XTRANS_CELL else None
+        return RawFrame(raw.raw_image_visible.copy(), completed, xtrans)
 
 
 def _decode_jpeg_xl(content: bytes, facts: RawMetadata, max_pixels: int) -> RawFrame:
@@ -89,8 +84,7 @@ def _decode_jpeg_xl(content: bytes, facts: RawMetadata, max_pixels: int) -> RawF
     import tifffile
 
     with tifffile.TiffFile(io.BytesIO(content)) as file:
-        pages = (page for first in file.pages for page in (first, *(first.pages or ())))
-        page: Any = next(page for page in pages if page.tags.valueof(262) == CFA)
+        page: Any = next(page for page in tiff_pages(file) if page.tags.valueof(262) == CFA)
         height, width = page.shape
         area = facts.area or (0, 0, height, width)
         _check_size(area[3] - area[1], area[2] - area[0], max_pixels)
@@ -103,7 +97,7 @@ def _decode_jpeg_xl(content: bytes, facts: RawMetadata, max_pixels: int) -> RawF
         pixels = _visible(fields.transpose(1, 0, 3, 2).reshape(height, width), area)
     if pixels.dtype != np.uint16 or facts.pattern is None:
         raise SourceError("unsupported", f"is a mosaic of {pixels.dtype}; expected uint16 and a Bayer pattern")
-    return RawFrame(pixels, _colours(facts.pattern), facts.completed(RawMetadata()))
+    return RawFrame(pixels, facts.completed(RawMetadata()))
 
 
 def _visible(stored: NDArray[np.uint16], area: tuple[int, int, int, int]) -> NDArray[np.uint16]:
@@ -114,10 +108,6 @@ def _visible(stored: NDArray[np.uint16], area: tuple[int, int, int, int]) -> NDA
             "corrupt", f"its ActiveArea {area} is not inside of its {stored.shape[1]} x {stored.shape[0]} sites"
         )
     return stored[top:bottom, left:right].copy()
-
-
-def _colours(pattern: str) -> NDArray[np.uint8]:
-    return np.array(["RGB".index(letter) for letter in pattern], np.uint8).reshape(2, 2)
 
 
 def _check_size(width: int, height: int, max_pixels: int) -> None:

@@ -24,12 +24,11 @@ from unprocess_gen.core.types import CameraPlan, IspPlan, Levels, Photograph, Ra
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites
 from unprocess_gen.sources.image import decode
-from unprocess_gen.sources.raw.decode import RawFrame, decode_raw
+from unprocess_gen.sources.raw.decode import XTRANS_CELL, RawFrame, decode_raw
 from unprocess_gen.sources.raw.metadata import LOSSY, RawMetadata
 
 XTRANS = "XTRANS"
 """Value of the column ``raw_pattern`` for tiles of 6 x 6 sites."""
-XTRANS_CELL = 6
 LONGEST_CAMERA_NAME = 64
 """Characters of the name of a camera in a row."""
 LEAST_GAIN, MOST_GAIN = 1e-3, 1e3
@@ -67,16 +66,12 @@ def _photograph(config: SourceConfig, frame: RawFrame) -> Photograph:
         facts.iso or 0.0,
         facts.exposure_s or 0.0,
     )
-    codes = _repeated(frame.pixels) if config.shrink == 1 else _means(frame, pattern, source)
-    levels = round(sum(black) / 4), round(min(white))
-    sensor = SensorPlan("RGGB" if pattern == XTRANS else pattern, int(levels[1]).bit_length(), *levels)
+    codes = np.repeat(frame.pixels[..., None], 3, axis=2) if config.shrink == 1 else _means(frame, pattern, source)
     noise = _own_noise(facts, config.raw, (black[1], white[1])) if config.shrink == 1 else None
-    return Photograph(codes, 1, RawParts(source, _camera(facts), IspPlan("none", "srgb"), sensor, noise), _note(facts))
-
-
-def _note(facts: RawMetadata) -> str:
+    sensor = file_sensor(pattern, black, white)
     lossy = LOSSY.get(facts.compression or 0)
-    return f"is compressed with {lossy}, which removes noise and detail" if lossy else ""
+    note = f"is compressed with {lossy}, which removes noise and detail" if lossy else ""
+    return Photograph(codes, 1, RawParts(source, _camera(facts), IspPlan("none", "srgb"), sensor, noise), note)
 
 
 def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
@@ -91,8 +86,7 @@ def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
         raise SourceError("unsupported", f"contains {actual}; expected a mosaic [H, W] of uint16")
     if pixels.size > config.max_pixels:
         raise SourceError("too_large", f"has {pixels.size} pixels; expected source.max_pixels={config.max_pixels}")
-    colours = np.array(["RGB".index(letter) for letter in raw.pattern], np.uint8).reshape(2, 2)
-    return RawFrame(np.ascontiguousarray(pixels), colours, RawMetadata(pattern=raw.pattern))
+    return RawFrame(np.ascontiguousarray(pixels), RawMetadata(pattern=raw.pattern))
 
 
 def _npy(content: bytes) -> NDArray[Any]:
@@ -117,7 +111,7 @@ def _picture(config: SourceConfig, content: bytes) -> NDArray[Any]:
 
 def file_pattern(frame: RawFrame, raw: RawConfig) -> str:
     """Return the CFA pattern of the visible part; SourceError if it is another one than the given, or none."""
-    pattern = XTRANS if frame.colours.shape == (XTRANS_CELL, XTRANS_CELL) else frame.metadata.pattern or ""
+    pattern = frame.metadata.pattern or "" if frame.xtrans is None else XTRANS
     if pattern not in (*PATTERNS, XTRANS):
         raise SourceError(
             "unsupported", f"has the CFA pattern {pattern or 'of no tile'}; expected {', '.join(PATTERNS)}"
@@ -148,8 +142,10 @@ def file_levels(facts: RawMetadata, pattern: str, raw: RawConfig) -> tuple[Level
     return black, white
 
 
-def _repeated(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    return np.repeat(pixels[..., None], 3, axis=2)
+def file_sensor(pattern: str, black: Levels, white: Levels) -> SensorPlan:
+    """Return one black and one white level for all planes, the bits that hold them, and a Bayer pattern."""
+    levels = round(sum(black) / 4), round(min(white))
+    return SensorPlan("RGGB" if pattern == XTRANS else pattern, levels[1].bit_length(), *levels)
 
 
 def _means(frame: RawFrame, pattern: str, source: SourcePlan) -> NDArray[np.uint16]:
@@ -173,8 +169,8 @@ def _means(frame: RawFrame, pattern: str, source: SourcePlan) -> NDArray[np.uint
 
 def _planes(frame: RawFrame, pattern: str) -> Sequence[Sequence[int]]:
     """Return the packed plane of each site of the CFA tile."""
-    if pattern == XTRANS:
-        return [[(0, 1, 3, 1)[colour] for colour in row] for row in frame.colours.tolist()]
+    if frame.xtrans is not None:
+        return [[(0, 1, 3, 1)[colour] for colour in row] for row in frame.xtrans.tolist()]
     sites = {site: plane for plane, site in enumerate(plane_sites(pattern))}
     return [[sites[y, x] for x in (0, 1)] for y in (0, 1)]
 

@@ -7,7 +7,8 @@ not. A fact that neither gives is None. The facts of tags take precedence, becau
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,15 @@ def read_metadata(path: Path, key: str) -> RawMetadata:
 
     Raises ConfigError or MachineError.
     """
-    return read_tags(path, key).completed(_from_decoder(path, key))
+    tags = read_tags(path, key)
+    _require("rawpy", path, key)
+    try:
+        with opened_by_libraw(path.read_bytes()) as raw:
+            if raw.raw_pattern.shape != (2, 2):
+                raise SourceError("unsupported", "contains no Bayer mosaic; expected a CFA pattern of 2x2 sites")
+            return tags.completed(decoder_facts(raw))
+    except SourceError as error:
+        raise ConfigError(f"{key}: {path} {error.text}") from error
 
 
 def read_tags(path: Path, key: str) -> RawMetadata:
@@ -104,7 +113,7 @@ def tags_of(content: bytes, check: bool = True) -> RawMetadata:
 
     try:
         with tifffile.TiffFile(io.BytesIO(content)) as file:
-            pages = list(_pages(file))
+            pages = list(tiff_pages(file))
             raw = next((page for page in pages if page.tags.valueof(262) in (CFA, LINEAR)), pages[0])
             if check:
                 _check_image(raw, len(content))
@@ -116,7 +125,7 @@ def tags_of(content: bytes, check: bool = True) -> RawMetadata:
         return RawMetadata()
 
 
-def _pages(file: Any) -> Any:
+def tiff_pages(file: Any) -> Iterator[Any]:
     """Yield the images of a TIFF: of its first directories, and of their SubIFDs."""
     for first in file.pages:
         yield from (first, *(getattr(first, "pages", ()) or ()))
@@ -196,20 +205,19 @@ def _numbers(tag: Any) -> tuple[float, ...]:
     return tuple(map(float, values))
 
 
-def _from_decoder(path: Path, key: str) -> RawMetadata:
-    """Read levels, pattern, ISO and exposure with LibRaw."""
-    _require("rawpy", path, key)
+@contextmanager
+def opened_by_libraw(content: bytes) -> Iterator[Any]:
+    """Open the bytes of a raw file with LibRaw; SourceError unless they are one, and contain a mosaic."""
     import rawpy
 
     try:
-        with rawpy.imread(str(path)) as raw:
-            if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None or raw.raw_pattern.shape != (2, 2):
-                raise ConfigError(f"{key}: {path} contains no Bayer mosaic; expected a raw file with a 2x2 CFA pattern")
-            return decoder_facts(raw)
-    except OSError as error:
-        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
+        with rawpy.imread(io.BytesIO(content)) as raw:
+            if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
+                raise SourceError("unsupported", "contains no mosaic (LibRaw); expected red, green and blue sites")
+            yield raw
     except rawpy.LibRawError as error:
-        raise ConfigError(f"{key}: {path} cannot be decoded ({decoder_message(error)})") from error
+        message = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
+        raise SourceError("corrupt", f"cannot be decoded by LibRaw ({message})") from error
 
 
 def decoder_facts(raw: Any) -> RawMetadata:
@@ -226,8 +234,3 @@ def decoder_facts(raw: Any) -> RawMetadata:
         xyz2cam=matrix(entries) if any(entries) else None,
         gains=(red / green, blue / green) if min(red, green, blue) > 0 else None,
     )
-
-
-def decoder_message(error: Exception) -> str:
-    """Return the message of an error of LibRaw."""
-    return error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)

@@ -14,7 +14,7 @@ from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.sources.raw.colour import temperature
 from unprocess_gen.sources.raw.decode import decode_raw
-from unprocess_gen.sources.raw.frames import XTRANS, camera_colours, file_levels, file_pattern
+from unprocess_gen.sources.raw.frames import XTRANS, camera_colours, file_levels, file_pattern, file_sensor
 from unprocess_gen.sources.raw.metadata import RawMetadata, tags_of
 
 MARK = "Written by gen-dataset camera"
@@ -82,21 +82,21 @@ def camera_options(file: Path, name: str) -> CameraOptions:
         raise ConfigError(f"camera {file}: has an X-Trans mosaic, which no sensor option has; expected a Bayer mosaic")
     model = " ".join((frame.metadata.model or "a camera without a name").split())
     matrix_source, gains_source = _matrix_source(tags), _gains_source(tags, gains)
-    levels = round(sum(black) / 4), round(min(white))
+    sensor = file_sensor(pattern, black, white)
     origin = f"# {file.name}, SHA-256 {file_sha256(file)}.\n"
     entries = [f"{entry:.6g}" for entry in matrix]
     rows = ",\n          ".join(", ".join(entries[row : row + 3]) for row in (0, 3, 6))
-    bits = int(levels[1]).bit_length()
-    level_sources = [f"{tag} {value}" for tag, value in _level_sources(tags, black, levels[1])]
+    levels = _levels_source(tags, black, sensor.white_level_dn)
     return CameraOptions(
         f"# {model}: the matrix from XYZ to the camera. {MARK}.\n# Source: {matrix_source}.\n{origin}"
         f"# Gains of the frame: {gains_source}.\nname: {name}\nlaw: custom\nxyz2cam: [{rows}]\n",
-        f"# {model}, {bits} bits. {MARK}.\n# Source: {', '.join(level_sources)}.\n{origin}bits: {bits}\n"
-        f"black_level_dn: {levels[0]}\nwhite_level_dn: {levels[1]}\npattern: {pattern}\n{SENSOR_LINES}",
+        f"# {model}, {sensor.bits} bits. {MARK}.\n# Source: {levels}.\n{origin}bits: {sensor.bits}\n"
+        f"black_level_dn: {sensor.black_level_dn}\nwhite_level_dn: {sensor.white_level_dn}\npattern: {pattern}\n"
+        f"{SENSOR_LINES}",
         (
             f"matrix: {matrix_source}",
             f"gains: {gains_source}",
-            f"levels: {', '.join(level_sources)}; {bits} bits hold them",
+            f"levels: {levels}; {sensor.bits} bits hold them",
             f"pattern: {pattern} at the corner of the visible part "
             f"({'CFAPattern and ActiveArea' if tags.colour else 'LibRaw'})",
         ),
@@ -132,9 +132,9 @@ def _gains_source(tags: RawMetadata, gains: tuple[float, float] | None) -> str:
     return f"red {red}, blue {blue} ({tag}); gains=fixed gains.red={red} gains.blue={blue}"
 
 
-def _level_sources(tags: RawMetadata, black: tuple[float, ...], white: int) -> list[tuple[str, str]]:
+def _levels_source(tags: RawMetadata, black: tuple[float, ...], white: int) -> str:
+    """Describe the levels and their source."""
     levels = f"{black[0]:g}" if len(set(black)) == 1 else f"{', '.join(f'{level:g}' for level in black)} (mean)"
-    return [
-        ("black level (LibRaw)" if tags.black_dn is None else "BlackLevel", levels),
-        ("white level (LibRaw)" if tags.white_dn is None else "WhiteLevel", f"{white}"),
-    ]
+    black_tag = "black level (LibRaw)" if tags.black_dn is None else "BlackLevel"
+    white_tag = "white level (LibRaw)" if tags.white_dn is None else "WhiteLevel"
+    return f"{black_tag} {levels}, {white_tag} {white}"
