@@ -19,14 +19,14 @@ from helpers.promise_report import Figure
 
 from unprocess_gen.config.accuracy import METHODS, STAGES, Method, choose_methods
 from unprocess_gen.config.schema import AccuracyConfig, Config
-from unprocess_gen.config.serialization import read_option
+from unprocess_gen.config.serialization import read_tiers
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.reports import report_files
 from unprocess_gen.reports.benchmark import complete_runs, figure, measure, methods, report, session
 from unprocess_gen.reports.benchmark.complete_runs import RunFiles, RunMeasurement, RunTimes
 from unprocess_gen.reports.benchmark.measure import TIER_STAGES, BenchmarkReport, Measurement
-from unprocess_gen.reports.benchmark.session import EXACT, REFERENCE, BenchmarkProfiles, SampleSizes
+from unprocess_gen.reports.benchmark.session import EXACT, REFERENCE, SampleSizes
 from unprocess_gen.reports.benchmark.timing import measure_in_turns
 from unprocess_gen.reports.estimate import estimate_run
 from unprocess_gen.reports.plan_text import format_estimate
@@ -37,20 +37,13 @@ LITTLE = SampleSizes(photographs=3, rounds=2, sampled=(64, 96), readable=(24, 32
 SMALLEST = SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), run_files=1)
 
 
-TIERS: dict[str, AccuracyConfig] = {name: read_option("accuracy", name) for name in (REFERENCE, EXACT, "fast")}
+TIERS = read_tiers()
 
 
 @pytest.fixture(scope="session")
-def profiles() -> BenchmarkProfiles:
-    two_numbers, electrons = (read_option("noise", name) for name in ("imx385_iso3200", "sony_a7s2"))
-    scenes = {name: read_option("scene", name) for name in ("daylight", "night")}
-    return BenchmarkProfiles(TIERS, two_numbers, electrons, read_option("sensor", "generic_14bit"), scenes)
-
-
-@pytest.fixture(scope="session")
-def measured(settings: Settings, profiles: BenchmarkProfiles) -> BenchmarkReport:
+def measured(settings: Settings) -> BenchmarkReport:
     config = settings("scene=low_light", "source.downscale=2")
-    return measure.measure_accuracy(config, profiles, LITTLE, "gen-dataset accuracy")
+    return measure.measure_accuracy(config, LITTLE, "gen-dataset accuracy")
 
 
 def rows_of(measured: BenchmarkReport, stage: str) -> dict[str, Measurement]:
@@ -125,8 +118,8 @@ def test_exact_and_reference_have_no_errors(measured: BenchmarkReport) -> None:
         assert (errors == (0, 0, 0, 0, 0)) == is_exact
 
 
-def test_errors_of_a_tier_are_those_of_its_frames(settings: Settings, profiles: BenchmarkProfiles) -> None:
-    opened = session.open_session(settings("source.limit=1"), profiles, LITTLE)
+def test_errors_of_a_tier_are_those_of_its_frames(settings: Settings) -> None:
+    opened = session.open_session(settings("source.limit=1"), LITTLE)
     ((pair, plan),) = opened.sampled_pairs("given", TIERS["fast"])
     ((reference, _),) = opened.sampled_pairs("given", TIERS[REFERENCE])
     errors = methods.frame_errors(opened, "given", TIERS["fast"])
@@ -167,14 +160,14 @@ def test_every_tier_runs_in_every_setting(measured: BenchmarkReport) -> None:
         assert run.ratio_to_exact == pytest.approx((run.ns_per_pixel or 0) / (exact[run.setting].ns_per_pixel or 0))
 
 
-def test_settings_of_runs_include_both_kinds_of_noise(settings: Settings, profiles: BenchmarkProfiles) -> None:
+def test_settings_of_runs_include_both_kinds_of_noise(settings: Settings) -> None:
     for overrides, names in (
         ((), ["given", "daylight", "night"]),
         (("noise=sony_a7s2", "scene=low_light"), ["given", "two_parameter_noise", "daylight", "night"]),
         (("noise=sony_a7s2", "scene=night", "effects.assumed=off"), ["given", "two_parameter_noise", "daylight"]),
     ):
         config = settings(*overrides, "effects.tolerance=0.2")
-        configs = session.run_settings(config, profiles)
+        configs = session.run_settings(config)
         assert list(configs) == names
         assert {(run.effects.assumed, run.effects.tolerance) for run in configs.values()} == {
             (config.effects.assumed, 0.2)
@@ -216,9 +209,7 @@ def test_runs_have_the_bytes_of_generate_and_leave_nothing(
     assert list(folder.iterdir()) == []
 
 
-def test_ended_measurement_leaves_nothing(
-    folder: Path, settings: Settings, profiles: BenchmarkProfiles, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ended_measurement_leaves_nothing(folder: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     level = complete_runs.LOGGER.level
 
     def generate(config: Config) -> Any:
@@ -227,7 +218,7 @@ def test_ended_measurement_leaves_nothing(
 
     monkeypatch.setattr(complete_runs, "generate", generate)
     with pytest.raises(KeyboardInterrupt):
-        measure.measure_accuracy(settings(), profiles, SMALLEST)
+        measure.measure_accuracy(settings(), SMALLEST)
 
     assert list(folder.iterdir()) == []
     assert complete_runs.LOGGER.level == level
@@ -370,31 +361,29 @@ def test_documentation_has_the_recommendations() -> None:
     ],
     ids=lambda overrides: overrides[0],
 )
-def test_any_config_can_be_measured(
-    overrides: tuple[str, ...], settings: Settings, profiles: BenchmarkProfiles, tmp_path: Path
-) -> None:
+def test_any_config_can_be_measured(overrides: tuple[str, ...], settings: Settings, tmp_path: Path) -> None:
     root = fill(tmp_path / "photos", 2)
     (root / "000.png").write_bytes(b"")  # is ignored
     config = settings(*overrides, f"source.root={root}")
     validate_config(config)
-    measured = measure.measure_accuracy(config, profiles, SMALLEST)
+    measured = measure.measure_accuracy(config, SMALLEST)
 
     assert all(rows_of(measured, stage)[EXACT].error_max == 0 for stage in TIER_STAGES)
     assert ("mine" in rows_of(measured, "tier")) == ("accuracy.name=mine" in overrides)
     assert measured.conditions["photographs"].startswith("001.png, of ")
 
 
-def test_budget_that_is_no_tier_has_its_own_name(settings: Settings, profiles: BenchmarkProfiles) -> None:
-    opened = session.open_session(settings("accuracy.law_distance=1e-3"), profiles, SMALLEST)
+def test_budget_that_is_no_tier_has_its_own_name(settings: Settings) -> None:
+    opened = session.open_session(settings("accuracy.law_distance=1e-3"), SMALLEST)
 
     assert list(opened.tiers) == [*TIERS, "exact_changed"]
     assert opened.given_tier == "exact_changed"
 
 
-def test_no_readable_photograph_is_an_error(settings: Settings, profiles: BenchmarkProfiles, tmp_path: Path) -> None:
+def test_no_readable_photograph_is_an_error(settings: Settings, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"")
     with pytest.raises(ConfigError, match=r"none of 1 photographs tried can be read"):
-        measure.measure_accuracy(settings(f"source.root={tmp_path}"), profiles, LITTLE)
+        measure.measure_accuracy(settings(f"source.root={tmp_path}"), LITTLE)
 
 
 # The report -----------------------------------------------------------------------------------------------------------
@@ -455,9 +444,7 @@ def test_accuracy_writes_four_files_and_reports_them(
     run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     true = measure.measure_accuracy
-    monkeypatch.setattr(
-        measure, "measure_accuracy", lambda config, profiles, command: true(config, profiles, SMALLEST, command)
-    )
+    monkeypatch.setattr(measure, "measure_accuracy", lambda config, command: true(config, SMALLEST, command))
     written = tmp_path / "new/report"
     written.mkdir(parents=True)
     for name in report.REPORT_FILES:

@@ -17,10 +17,9 @@ from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen.config.schema import replaced
-from unprocess_gen.config.serialization import read_option
 from unprocess_gen.reports.paper import figures as paper_figures
 from unprocess_gen.reports.paper import pictures as figure_pictures
-from unprocess_gen.reports.paper.figures import INTERPRETATIONS, PaperOptions, Saturation
+from unprocess_gen.reports.paper.figures import INTERPRETATIONS, Saturation
 from unprocess_gen.reports.paper.pictures import PaperFigure
 from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.simulation.reference.cfa import PATTERNS
@@ -30,15 +29,9 @@ FILES = [*(f"fig{number}.png" for number in range(1, 8)), "figures.html"]
 
 
 @pytest.fixture(scope="module")
-def options() -> PaperOptions:
-    gains = {name: read_option("gains", name) for name in paper_figures.GAINS}
-    return PaperOptions(gains, read_option("noise", paper_figures.AUTHORS_NOISE))
-
-
-@pytest.fixture(scope="module")
-def drawn(settings: Settings, options: PaperOptions) -> list[PaperFigure]:
+def drawn(settings: Settings) -> list[PaperFigure]:
     """The figures for two built-in scenes."""
-    return paper_figures.draw_figures(settings("source.limit=2"), options)
+    return paper_figures.draw_figures(settings("source.limit=2"))
 
 
 def named(drawn: list[PaperFigure], file: str) -> PaperFigure:
@@ -76,12 +69,12 @@ def test_every_caption_compares_with_the_article(drawn: list[PaperFigure]) -> No
 
 
 def test_counts_of_figure_6_agree_with_the_reference(
-    settings: Settings, options: PaperOptions, drawn: list[PaperFigure], figure: Figure
+    settings: Settings, drawn: list[PaperFigure], figure: Figure
 ) -> None:
     srgb = synthetic.scene("dead_leaves-0")
     planes = srgb[0::2, 0::2, 0], srgb[0::2, 1::2, 1], srgb[1::2, 0::2, 1], srgb[1::2, 1::2, 2]
     before = sum(int((plane == 255).sum()) for plane in planes)
-    subject = paper_figures.load_figure_source(settings("source.limit=1"), options)
+    subject = paper_figures.load_figure_source(settings("source.limit=1"))
     after = {name: reference_pair(srgb, subject.plans[name]).counts.saturated for name in paper_figures.GAINS}
 
     listed = {
@@ -113,8 +106,8 @@ def test_match_means_more_saturation_in_the_bottom_row_only(top: int, bottom: in
     assert counted.count_matching(interpretation) == fits
 
 
-def test_multiplication_matches_the_caption_and_division_does_not(settings: Settings, options: PaperOptions) -> None:
-    counted = paper_figures.load_figure_source(settings("source.limit=5"), options).saturation
+def test_multiplication_matches_the_caption_and_division_does_not(settings: Settings) -> None:
+    counted = paper_figures.load_figure_source(settings("source.limit=5")).saturation
     by_formula, by_pictures = (counted.count_matching(interpretation) for interpretation in INTERPRETATIONS)
     assert by_formula == 0
     assert by_pictures >= 3
@@ -143,13 +136,11 @@ def test_block_means_keep_mean_and_cfa_sites() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1), (2, 2), (3, 40), (17, 131), (131, 17)])
-def test_photographs_of_any_shape_are_drawn(
-    shape: tuple[int, int], settings: Settings, options: PaperOptions, tmp_path: Path
-) -> None:
+def test_photographs_of_any_shape_are_drawn(shape: tuple[int, int], settings: Settings, tmp_path: Path) -> None:
     Image.fromarray(pixels(3, *shape)).save(tmp_path / "one.png")
     config = settings()
     config = replaced(config, {"source.root": str(tmp_path)})
-    assert len(paper_figures.draw_figures(config, options)) == len(FILES) - 1
+    assert len(paper_figures.draw_figures(config)) == len(FILES) - 1
 
 
 # The command ----------------------------------------------------------------------------------------------------------
@@ -158,7 +149,7 @@ def test_photographs_of_any_shape_are_drawn(
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, drawn: list[PaperFigure]) -> None:
     """Let the verb write figures that are already drawn."""
-    monkeypatch.setattr(paper_figures, "draw_figures", lambda config, options: drawn)
+    monkeypatch.setattr(paper_figures, "draw_figures", lambda config: drawn)
 
 
 @pytest.mark.usefixtures("quick")
@@ -207,14 +198,12 @@ def test_missing_library_gives_one_line_that_names_the_extra(
 
 
 @pytest.mark.slow
-def test_unreadable_photograph_is_named_and_the_next_one_shown(
-    settings: Settings, options: PaperOptions, tmp_path: Path
-) -> None:
+def test_unreadable_photograph_is_named_and_the_next_one_shown(settings: Settings, tmp_path: Path) -> None:
     (tmp_path / "<a>.png").write_bytes(b"no picture")
     Image.fromarray(pixels(3, 1, 1)).save(tmp_path / "<b>.png")
     config = settings()
     config = replaced(config, {"source.root": str(tmp_path)})
-    page = page_text(paper_figures.draw_figures(config, options))
+    page = page_text(paper_figures.draw_figures(config))
     assert "Photographs that cannot be read: &lt;a&gt;.png (unsupported)." in page
     assert html.unescape(page).count("On <b>.png") == 5
     assert "<a>" not in page and "<b>" not in page

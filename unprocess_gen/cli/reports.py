@@ -17,14 +17,13 @@ from unprocess_gen.cli.messages import print_result
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals, read_table, swept_keys
-from unprocess_gen.config.option_files import group_options
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
-    from unprocess_gen.config.schema import AccuracyConfig, Config
+    from unprocess_gen.config.schema import Config
     from unprocess_gen.core.paths import AnyPath
     from unprocess_gen.core.roots import Root
     from unprocess_gen.reports.estimate import RunEstimate
@@ -38,11 +37,12 @@ def plan(call: Call) -> int:
 
 
 def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate, list[str]]:
+    from unprocess_gen.config.serialization import read_tiers
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run
     from unprocess_gen.reports.plan_text import format_estimate
 
-    estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
+    estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, read_tiers())
     blank = [""] if label and not label.startswith("1/") else []
     return 0, estimate, [*blank, f"out       {config.out}", format_estimate(estimate)]
 
@@ -54,7 +54,6 @@ def accuracy(call: Call) -> int:
 
 def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
     from unprocess_gen.config.interpretation import uses_dark_frames
-    from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports.benchmark import measure
     from unprocess_gen.reports.benchmark import report as benchmark_report
 
@@ -65,24 +64,9 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
         )
     require_photographs(config.source, "accuracy")
     out = _report_folder(config, "accuracy")
-    profiles = measure.BenchmarkProfiles(
-        _tiers(),
-        read_option("noise", "imx385_iso3200"),
-        read_option("noise", "sony_a7s2"),
-        read_option("sensor", "generic_14bit"),
-        {name: read_option("scene", name) for name in ("daylight", "night")},
-    )
-    benchmark = measure.measure_accuracy(config, profiles, command=command)
+    benchmark = measure.measure_accuracy(config, command=command)
     benchmark_report.write_benchmark(benchmark, out)
     return 0, None, [benchmark_report.report_text(benchmark), f"{out}: {', '.join(benchmark_report.REPORT_FILES)}"]
-
-
-def _tiers() -> dict[str, AccuracyConfig]:
-    """Return every tier of ``conf/accuracy``, the reference first."""
-    from unprocess_gen.config.serialization import read_option
-
-    names = sorted(group_options("accuracy"), key=lambda name: name != "reference")
-    return {name: read_option("accuracy", name) for name in names}
 
 
 FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")
@@ -98,15 +82,12 @@ def figures(call: Call) -> int:
 
 
 def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
-    from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports.paper import figures as paper_figures
 
     require_photographs(config.source, "figures")
     out = _report_folder(config, "figures")
-    gains = {name: read_option("gains", name) for name in paper_figures.GAINS}
-    authors = read_option("noise", paper_figures.AUTHORS_NOISE)
-    drawn = paper_figures.draw_figures(config, paper_figures.PaperOptions(gains, authors))
-    return 0, None, [f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}"]
+    files = paper_figures.write_figures(paper_figures.draw_figures(config), out, command)
+    return 0, None, [f"{out}: {', '.join(files)}"]
 
 
 def _compose_report(call: Call, task: Callable[..., tuple[int, None, list[str]]]) -> int:

@@ -25,8 +25,17 @@ from unprocess_gen.config.interpretation import (
     uses_dark_frames,
     uses_physics,
 )
-from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import ENTRY_GROUPS, GROUPS, NESTED, Config, MixtureEntry, all_settings, frozen
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.schema import (
+    ENTRY_GROUPS,
+    GROUPS,
+    NESTED,
+    AccuracyConfig,
+    Config,
+    MixtureEntry,
+    all_settings,
+    frozen,
+)
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
@@ -253,6 +262,12 @@ def read_option(group: str, name: str | Path) -> Any:
         return OmegaConf.to_object(OmegaConf.merge(writable_node(GROUPS[group]), loaded))
     except (OmegaConfBaseException, ValueError) as error:
         raise ConfigError(f"{path}: is no option of {group} ({error_in_one_line(error)})") from error
+
+
+def read_tiers() -> dict[str, AccuracyConfig]:
+    """Read every tier of ``conf/accuracy``, the reference first."""
+    names = sorted(group_options("accuracy"), key=lambda name: name != "reference")
+    return {name: read_option("accuracy", name) for name in names}
 
 
 def differences(config_yaml: str, other_yaml: str) -> list[str]:

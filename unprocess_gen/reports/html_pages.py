@@ -14,7 +14,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from jinja2 import Environment, Template
 
 INVISIBLE = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
@@ -38,7 +38,17 @@ class PageTable(NamedTuple):
 
 def render_page(template: str, **values: Any) -> str:
     """Return a page rendered from a template of ``templates/``; a missing value raises `jinja2.UndefinedError`."""
-    return _environment().get_template(template).render(values)
+    return page_template(template).render(values)
+
+
+def page_template(name: str) -> Template:
+    """Return a template of ``templates/``."""
+    return _environment().get_template(name)
+
+
+def render_macro(name: str, content: Any) -> str:
+    """Return a part of a page, rendered by a macro of ``macros.html``."""
+    return str(getattr(page_template("macros.html").module, name)(content))
 
 
 def data_uri(content: bytes, kind: str = "png") -> str:

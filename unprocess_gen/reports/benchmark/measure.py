@@ -35,7 +35,6 @@ from unprocess_gen.reports.benchmark import complete_runs, methods
 from unprocess_gen.reports.benchmark import session as sessions
 from unprocess_gen.reports.benchmark.complete_runs import RunFiles, RunKey, RunMeasurement
 from unprocess_gen.reports.benchmark.session import GIVEN, PHYSICAL, TWO_PARAMETER, BenchmarkImage, BenchmarkSession
-from unprocess_gen.reports.benchmark.session import BenchmarkProfiles as BenchmarkProfiles
 from unprocess_gen.reports.benchmark.timing import measure_in_turns, median_ratio
 from unprocess_gen.reports.formatting import counted
 
@@ -78,9 +77,7 @@ TIER_STAGES = tuple(stage for stage in methods.STAGE_ERRORS if stage.startswith(
 """The end-to-end stages."""
 
 
-def measure_accuracy(
-    config: Config, profiles: BenchmarkProfiles, sizes: sessions.SampleSizes | None = None, command: str = ""
-) -> BenchmarkReport:
+def measure_accuracy(config: Config, sizes: sessions.SampleSizes | None = None, command: str = "") -> BenchmarkReport:
     """Measure every method and tier on photographs of a config's source; report progress on stderr.
 
     Rows are in the order of `METHODS`, then rows of tiers. ConfigError if no photograph can be read, or the config
@@ -91,7 +88,7 @@ def measure_accuracy(
             "output.dtype=float32: cannot be measured, because errors are in integer DN; expected uint16; set "
             "output.dtype=uint16 (float32 frames are exact and equal in every tier)"
         )
-    session = sessions.open_session(config, profiles, sizes or sessions.SampleSizes())
+    session = sessions.open_session(config, sizes or sessions.SampleSizes())
     tiers, rounds = session.tiers, session.sizes.rounds
     calls = _time_calls(session, session.images)
     steps = len(METHODS) + len(session.all_configs) * len(tiers) + (rounds + 1) * len(calls)

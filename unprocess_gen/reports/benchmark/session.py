@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 from unprocess_gen.config import schema
 from unprocess_gen.config.accuracy import METHODS, Method, choose_methods
 from unprocess_gen.config.interpretation import is_physical
-from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SceneConfig, SensorConfig
+from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig
+from unprocess_gen.config.serialization import read_option, read_tiers
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.sequences import evenly_spaced
@@ -30,22 +31,17 @@ TWO_PARAMETER, PHYSICAL, GIVEN = "two_parameter", "physical", "given"
 TWO_PARAMETER_RUN = "two_parameter_noise"
 """Name of the setting of complete runs that has the user's sensor with two-parameter noise."""
 
+OTHER_NOISE = {TWO_PARAMETER: "imx385_iso3200", PHYSICAL: "sony_a7s2"}
+"""Noise profile of each kind, for a user's config with noise of the other kind."""
+
+RUN_SCENES = ("daylight", "night")
+"""Scenes of complete runs with physical noise."""
+
 FALLBACK_ISO = 1600
 """ISO of the physical profile if it is not calibrated at the ISO of the scene."""
 
 LAW_DISTANCE = 5e-3
 """Budget under which a method that approximates Poisson counts is measured."""
-
-
-@dataclass(frozen=True, slots=True)
-class BenchmarkProfiles:
-    """Options with which a user's config is compared: tiers and scenes by name, one profile of each kind of noise."""
-
-    tiers: dict[str, AccuracyConfig]
-    two_parameter_noise: NoiseConfig
-    physical_noise: NoiseConfig
-    sensor: SensorConfig
-    scenes: dict[str, SceneConfig]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,40 +163,41 @@ def _numbers(accuracy: AccuracyConfig) -> object:
 # ------------------------------------------------------------------------------------------------------ construction
 
 
-def open_session(config: Config, profiles: BenchmarkProfiles, sizes: SampleSizes) -> BenchmarkSession:
+def open_session(config: Config, sizes: SampleSizes) -> BenchmarkSession:
     """Session for a config; ConfigError if no photograph can be read or the config cannot be compared."""
     mosaics = replace(config, output=replace(config.output, layout=MOSAIC))  # packing changes no value
-    runs, at_14_bits = run_settings(config, profiles), configs_at_14_bits(mosaics, profiles)
+    runs, at_14_bits = run_settings(config), configs_at_14_bits(mosaics)
     for compared in (*runs.values(), *at_14_bits.values()):
         validate_config(compared)
-    images, tiers = load_images(mosaics, sizes), compared_tiers(config, profiles)
+    images, tiers = load_images(mosaics, sizes), compared_tiers(config)
     return BenchmarkSession({**at_14_bits, GIVEN: mosaics}, tiers, images, sizes, runs)
 
 
-def run_settings(config: Config, profiles: BenchmarkProfiles) -> dict[str, Config]:
+def run_settings(config: Config) -> dict[str, Config]:
     """The given config, two-parameter noise, and physical noise in each scene; others differ from it."""
-    two_parameter, physical = _kinds_of_noise(config, profiles)
-    scenes = {name: _at_calibrated_iso(replace(physical, scene=scene)) for name, scene in profiles.scenes.items()}
+    two_parameter, physical = _kinds_of_noise(config)
+    scenes = {name: _at_calibrated_iso(replace(physical, scene=read_option("scene", name))) for name in RUN_SCENES}
     others = {TWO_PARAMETER_RUN: two_parameter, **scenes}
     return {GIVEN: config, **{name: other for name, other in others.items() if other != config}}
 
 
-def configs_at_14_bits(config: Config, profiles: BenchmarkProfiles) -> dict[str, Config]:
+def configs_at_14_bits(config: Config) -> dict[str, Config]:
     """Two configs with 14 bits, whose noise is two-parameter and Gaussian, and physical."""
-    two_parameter, physical = _kinds_of_noise(replace(config, sensor=profiles.sensor), profiles)
+    two_parameter, physical = _kinds_of_noise(replace(config, sensor=read_option("sensor", "generic_14bit")))
     gaussian = replace(two_parameter, noise=replace(two_parameter.noise, law="gaussian"))
     return {TWO_PARAMETER: gaussian, PHYSICAL: _at_calibrated_iso(physical)}
 
 
-def _kinds_of_noise(config: Config, profiles: BenchmarkProfiles) -> tuple[Config, Config]:
+def _kinds_of_noise(config: Config) -> tuple[Config, Config]:
     """The config with two-parameter and with physical noise; one of them is the given one."""
     if is_physical(config.noise):
-        return _with_other_noise(config, profiles.two_parameter_noise), config
-    return config, _with_other_noise(config, profiles.physical_noise)
+        return _with_other_noise(config, TWO_PARAMETER), config
+    return config, _with_other_noise(config, PHYSICAL)
 
 
-def _with_other_noise(config: Config, noise: NoiseConfig) -> Config:
-    """Replace a noise profile by one of the other kind, and drop effects that do not apply to it."""
+def _with_other_noise(config: Config, kind: str) -> Config:
+    """Replace a noise profile by one of another kind, and drop effects that do not apply to it."""
+    noise: NoiseConfig = read_option("noise", OTHER_NOISE[kind])
     effects = schema.EffectsConfig(tolerance=config.effects.tolerance, assumed=config.effects.assumed)
     return replace(config, noise=noise, effects=effects, clean=schema.CleanConfig())
 
@@ -213,12 +210,12 @@ def _at_calibrated_iso(config: Config) -> Config:
     return config
 
 
-def compared_tiers(config: Config, profiles: BenchmarkProfiles) -> dict[str, AccuracyConfig]:
+def compared_tiers(config: Config) -> dict[str, AccuracyConfig]:
     """Every tier, and the given budget under its own name if it differs from all tiers."""
-    given = config.accuracy
-    if any(_numbers(given) == _numbers(tier) for tier in profiles.tiers.values()):
-        return profiles.tiers
-    return {**profiles.tiers, f"{given.name}_changed" if given.name in profiles.tiers else given.name: given}
+    given, tiers = config.accuracy, read_tiers()
+    if any(_numbers(given) == _numbers(tier) for tier in tiers.values()):
+        return tiers
+    return {**tiers, f"{given.name}_changed" if given.name in tiers else given.name: given}
 
 
 def load_images(config: Config, sizes: SampleSizes) -> tuple[BenchmarkImage, ...]:

@@ -23,7 +23,6 @@ from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import pair_row, row_json
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
-from unprocess_gen.planning.mixture import image_config
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.empty_bands import empty_bands
 from unprocess_gen.reports.estimate import SourceEstimate
@@ -149,17 +148,17 @@ class Exploration:
         saturated = pair.clean == plan.saturated_value
         if plan.output.layout == PACKED:
             saturated = unpack(saturated, plan.sensor.pattern)
-        lines = tuple(_lines(settings, source.stream_identity(sha256), source, image, plan, pair))
+        lines = tuple(_lines(settings, source, sha256, image, plan, pair))
         keys = tuple(parts)
         return Shown(config, srgb, plan, patch, pair, *frames, saturated, row, keys, lines, image.dark_folder)
 
 
 def _lines(
-    settings: PairSettings, identity: tuple[str, int], source: Source, image: PlannedImage, plan: Plan, pair: Pair
+    settings: PairSettings, source: Source, sha256: str, image: PlannedImage, plan: Plan, pair: Pair
 ) -> list[str]:
     """Lines of ``plan`` about the scene and the noise of a pair."""
-    config = image_config(settings.config, *identity)
-    levels = plan_levels(config, *identity, image.facts, settings.dark_frames)
+    assert image.config is not None
+    levels = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
     is_rounded = pair.clean.dtype == np.uint16
     estimate = SourceEstimate(
         source,
@@ -169,7 +168,7 @@ def _lines(
         clean_levels=int(np.count_nonzero(np.bincount(pair.clean.ravel()))) if is_rounded else 0,
         bands=empty_bands(image.srgb, plan),
     )
-    return noise_lines(config, [estimate], settings.dark_frames)
+    return noise_lines(image.config, [estimate], settings.dark_frames)
 
 
 @functools.lru_cache(maxsize=4)

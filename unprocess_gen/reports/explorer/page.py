@@ -7,13 +7,11 @@ A page on a server recomputes its pair when a control changes; a saved page show
 from __future__ import annotations
 
 import base64
-import html
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from bokeh.core.templates import get_env
 from bokeh.document import Document
 from bokeh.embed import file_html
 from bokeh.models import (
@@ -37,9 +35,9 @@ from unprocess_gen.reports.explorer import views
 from unprocess_gen.reports.explorer.controls import NONE, SECTIONS, SETTINGS, WEIGHTS, names_of, shown_value, widget
 from unprocess_gen.reports.explorer.exploration import Exploration, Shown
 from unprocess_gen.reports.explorer.opening import Choices
-from unprocess_gen.reports.html_pages import visible
+from unprocess_gen.reports.html_pages import page_template, render_macro, render_page
 
-TEMPLATES = Path(__file__).parents[1] / "templates"
+TEMPLATE = "explorer.html"
 LINE_COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0072b2", "noisy": "#d55e00"}
 PLOTS = {
     "source_histogram": ("Histogram of the source", "code", "share of the pixels"),
@@ -59,17 +57,6 @@ STRETCHES = ("common stretch", "own stretch")
 SAVED_PX = (240, 320)
 """Most rows and columns of a picture in a saved page, of which each pixel takes 50 bytes."""
 
-TEXTS = """
-pre { margin: 0; font-size: 12px; overflow-x: auto; }
-pre.command { white-space: pre-wrap; }
-dl { display: grid; grid-template-columns: minmax(7rem, max-content) 1fr; gap: .1rem .8rem; margin: 0;
-  overflow-wrap: anywhere; }
-dt { font-weight: 600; }
-dd { margin: 0; }
-[role=alert] { background: #fdecea; color: #7a1c12; border-left: 4px solid #c0392b; padding: .5rem .8rem; }
-"""
-"""Style of texts, which Bokeh draws in shadow trees of their own."""
-
 WAIT_MS = 20
 """Time in which changes are collected before the pair is computed."""
 
@@ -85,9 +72,7 @@ class Page:
         self._syncing, self._waiting = False, set[str]()
         self._pixels = ColumnDataSource()
         self._x, self._y = Range1d(0, 1), Range1d(1, 0)
-        self._message, self._facts, self._plan = Div(name="message"), Div(name="facts"), Div(name="plan")
-        for div in (self._message, self._facts, self._plan):
-            div.update(sizing_mode="stretch_width", stylesheets=[TEXTS])
+        self._message, self._facts, self._plan = map(_text_box, ("message", "facts", "plan"))
         self._pictures = {name: self._picture(name) for name in views.PICTURES}
         self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in PLOTS}
         self._curves = {name: self._curve(name) for name in PLOTS}
@@ -141,14 +126,19 @@ class Page:
 
     # ---------------------------------------------------------------------------------------------------------- state
 
-    def refresh(self) -> bool:
-        """Compute the pair and draw everything; show the sentence of an error, and return whether there is none."""
+    @contextmanager
+    def _reported(self) -> Iterator[None]:
+        """Show the sentence of an error in the page."""
         try:
-            self._draw(self._state.shown())
+            yield
         except UnprocessGenError as error:
             self._say(str(error))
-            return False
-        return True
+
+    def _update(self) -> None:
+        """Compute the pair, draw everything, and set the controls."""
+        with self._reported():
+            self._draw(self._state.shown())
+            self._sync()
 
     def _draw(self, shown: Shown) -> None:
         is_new = self._shown is None or shown.clean.shape != self._shown.clean.shape
@@ -203,11 +193,11 @@ class Page:
                 ys = [[share or None for share in line] for line in ys]
             self._lines[name].data = {"xs": xs, "ys": ys, "label": list(lines), "colour": colours}
         self._points.data = {"x": transfer.points[0], "y": transfer.points[1]}
-        self._facts.text = _facts(shown, transfer.text)
-        self._plan.text = f"<pre>{_text(chr(10).join(shown.lines))}</pre>"
+        self._facts.text = render_macro("facts", _facts(shown, transfer.text))
+        self._plan.text = render_macro("lines", "\n".join(shown.lines))
 
     def _say(self, sentence: str) -> None:
-        self._message.text = f"<div role='alert'>{_text(sentence)}</div>" if sentence else ""
+        self._message.text = render_macro("alert", sentence) if sentence else ""
 
     # -------------------------------------------------------------------------------------------------------- controls
 
@@ -232,7 +222,7 @@ class Page:
     def document(self, document: Document) -> None:
         """Fill a document of the server."""
         self._document = document
-        document.title, document.template = "unprocess_gen explorer", _template()
+        document.title, document.template = "unprocess_gen explorer", page_template(TEMPLATE)
         roots = [self._message, self._facts, self._plan, *self._pictures.values(), *self._curves.values()]
         self._widgets = {
             name: widget(name, self._state.composition.own_folders)
@@ -256,8 +246,7 @@ class Page:
         for model in (*roots, *self._widgets.values(), *buttons, *inputs, self._command):
             document.add_root(model)
         document.template_variables.update(_variables(live=True))
-        if self.refresh():
-            self._sync()
+        self._update()
 
     def _buttons(self) -> list[Button]:
         copy = Button(label="Copy the command", name="copy", button_type="primary")
@@ -269,7 +258,7 @@ class Page:
             save = Button(label=f"Save the pair as {form.upper()}", name=f"save_{form}")
             save.on_click(partial(self._save, form))
             buttons.append(save)
-        self._file.js_on_change("data", CustomJS(args={"file": self._file}, code=SAVE))
+        self._file.js_on_change("data", CustomJS(args={"file": self._file}, code=render_page("explorer_save.js")))
         for number, (label, move) in enumerate(MOVES.items()):
             button = Button(label=label, name=f"move_{number}", width=48)
             button.on_click(lambda move=move: self._move(*move))
@@ -288,10 +277,6 @@ class Page:
 
         self._document.add_timeout_callback(run, WAIT_MS)
 
-    def _update(self) -> None:
-        if self.refresh():
-            self._sync()
-
     def _changed(self, name: str, attr: str, old: Any, new: Any) -> None:
         if self._syncing:
             return
@@ -307,13 +292,9 @@ class Page:
         self._later(self._update, "pair")
 
     def _opened(self, attr: str, old: Any, new: str) -> None:
-        try:
-            self._state = self._choices[new]()
-        except UnprocessGenError as error:
-            self._say(str(error))
-            return
-        self._shown = None
-        self._later(self._update, "pair")
+        with self._reported():
+            self._state, self._shown = self._choices[new](), None
+            self._later(self._update, "pair")
 
     def _chosen_part(self, attr: str, old: Any, new: str) -> None:
         if not self._syncing and "-" in new:
@@ -346,38 +327,23 @@ class Page:
     def _save(self, form: str) -> None:
         if self._shown is None:
             return
-        try:
-            content = self._shown.archive(form)
-        except UnprocessGenError as error:
-            self._say(str(error))
-            return
-        name = f"{self._shown.row['key']}.{form}.zip"
-        self._file.data = {"name": [name], "content": [base64.b64encode(content).decode()]}
+        with self._reported():
+            content = base64.b64encode(self._shown.archive(form)).decode()
+            self._file.data = {"name": [f"{self._shown.row['key']}.{form}.zip"], "content": [content]}
 
     def html(self) -> str:
         """Return a page of the state, without controls; the error of the settings is raised."""
         shown = self._state.shown()
         self._draw(shown)
-        command = Div(name="command", text=f"<pre class='command'>{_text(self._state.command)}</pre>")
-        command.update(sizing_mode="stretch_width", stylesheets=[TEXTS])
+        command = _text_box("command", render_macro("wrapped", self._state.command))
         models = [self._facts, self._plan, command, *self._pictures.values(), *self._curves.values()]
         title, variables = f"{shown.row['source']} as raw frames", _variables(live=False)
-        return str(file_html(models, INLINE, title=title, template=_template(), template_variables=variables))
+        template = page_template(TEMPLATE)
+        return str(file_html(models, INLINE, title=title, template=template, template_variables=variables))
 
 
-SAVE = """
-if (file.data.name.length) {
-  const bytes = Uint8Array.from(atob(file.data.content[0]), letter => letter.charCodeAt(0));
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([bytes], {type: "application/zip"}));
-  link.download = file.data.name[0];
-  link.click();
-}
-"""
-
-
-def _text(text: str) -> str:
-    return html.escape(str(visible(text)))
+def _text_box(name: str, text: str = "") -> Div:
+    return Div(name=name, text=text, sizing_mode="stretch_width", stylesheets=[render_page("explorer_texts.css")])
 
 
 SHOWN_SHARES = {
@@ -390,10 +356,10 @@ SHOWN_SHARES = {
 """Columns that count sites, by what the page calls them."""
 
 
-def _facts(shown: Shown, transfer: str) -> str:
-    """Numbers of the pair as an HTML list."""
+def _facts(shown: Shown, transfer: str) -> dict[str, str]:
+    """Numbers of the pair, by what the page calls them."""
     row, sites, camera = shown.row, shown.clean.size, shown.plan.camera
-    facts = {
+    return {
         "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
         **{name: f"{int(row[column] or 0) / sites:.3%}" for name, column in SHOWN_SHARES.items()},
         "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
@@ -401,19 +367,12 @@ def _facts(shown: Shown, transfer: str) -> str:
         "effects": ", ".join(shown.plan.noise.effects),
         "XXH3": f"clean {row['clean_xxh3']}, noisy {row['noisy_xxh3']}",
     }
-    lines = "".join(f"<dt>{name}</dt><dd>{_text(text)}</dd>" for name, text in facts.items())
-    return f"<dl>{lines}</dl>"
-
-
-def _template() -> Any:
-    return get_env().from_string((TEMPLATES / "explorer.html").read_text(encoding="utf-8"))
 
 
 def _variables(live: bool) -> dict[str, Any]:
     """Values of the template."""
     return {
         "live": live,
-        "style": (TEMPLATES / "style.css").read_text(encoding="utf-8"),
         "sections": {section: names_of(section) for section in SECTIONS},
         "pictures": views.PICTURES,
         "curves": PLOTS,

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.sequences import evenly_spaced
@@ -82,14 +83,6 @@ AUTHORS_NOISE = "imx385_iso3200_rvdd"
 """The option of ``conf/noise`` with the noise profile of the article's author."""
 
 
-@dataclass(frozen=True, slots=True)
-class PaperOptions:
-    """The settings that the article fixes: the gains of `GAINS` by name, and its author's noise profile."""
-
-    gains: Mapping[str, GainsConfig]
-    authors_noise: NoiseConfig
-
-
 @dataclass(slots=True)
 class Saturation:
     """Site counts of several photographs, the one in the figures first, and the photographs that cannot be read.
@@ -120,12 +113,13 @@ class FigureSource:
     saturation: Saturation
 
 
-def load_figure_source(config: Config, options: PaperOptions) -> FigureSource:
+def load_figure_source(config: Config) -> FigureSource:
     """Read evenly spaced photographs, one at a time, and count their saturated sites; the first one is in the figures.
 
     ConfigError if none can be read.
     """
     sources = evenly_spaced(list_photographs(config.source).sources, PHOTOGRAPHS_COUNTED)
+    configs = {name: replace(config, gains=read_option("gains", name)) for name in GAINS}
     saturation, subject = Saturation(), None
     for source in sources:
         try:
@@ -134,9 +128,9 @@ def load_figure_source(config: Config, options: PaperOptions) -> FigureSource:
             saturation.failed.append(f"{source.name} ({error.reason})")
             continue
         srgb, identity = photograph.srgb, source.stream_identity(sha256)
-        plans = {name: plan_image(replace(config, gains=options.gains[name]), *identity) for name in GAINS}
+        plans = {name: plan_image(option, *identity) for name, option in configs.items()}
         if subject is None:
-            authors = replace(config, noise=options.authors_noise, gains=options.gains[DEFAULT_GAINS])
+            authors = replace(configs[DEFAULT_GAINS], noise=read_option("noise", AUTHORS_NOISE))
             subject = FigureSource(source.name, srgb, plans, plan_image(authors, *identity), saturation)
         before = saturated_sites(srgb, config.sensor.pattern)
         saturation.sites.append(before.size)
@@ -158,7 +152,7 @@ def saturated_sites(srgb: Srgb, pattern: str) -> NDArray[np.bool_]:
 # ------------------------------------------------------------------------------------------------------------ figures
 
 
-def draw_figures(config: Config, options: PaperOptions) -> list[PaperFigure]:
+def draw_figures(config: Config) -> list[PaperFigure]:
     """Draw Figures 1 to 7 for the first readable photograph of the source of a validated config.
 
     ConfigError if no photograph can be read, or ``source.patch`` is set.
@@ -170,7 +164,7 @@ def draw_figures(config: Config, options: PaperOptions) -> list[PaperFigure]:
             f"source.patch={value_text(config.source.patch)}: the figures show complete photographs; expected null; "
             "leave it out"
         )
-    source = load_figure_source(config, options)
+    source = load_figure_source(config)
     draw = (
         *(draw_steps, draw_tone, draw_gamma, draw_highlight_function, draw_default_raw, draw_saturation),
         draw_highlights,
