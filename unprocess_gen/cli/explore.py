@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import check_overrides, option_folders
-from unprocess_gen.cli.messages import print_result
+from unprocess_gen.cli.messages import print_result, print_results
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.paths import any_path
@@ -16,8 +15,8 @@ from unprocess_gen.core.paths import any_path
 if TYPE_CHECKING:
     from unprocess_gen.reports.explorer.opening import Choices
 
-REFUSED = ("--multirun", "--cfg", "--resolve", "--package", "--info", "--hydra-help", "--shell-completion", "--run")
-"""Flags of Hydra that make no sense for a page."""
+CHOOSING = {"--config-dir", "--config-name", "--config-path"}
+"""Flags of Hydra that choose where options are; the others make no sense for a page."""
 
 HIGHEST_PORT = 65535
 
@@ -26,9 +25,8 @@ def explore(call: Call) -> int:
     """Serve a page on this machine until it is interrupted, or save one."""
     for library in ("bokeh", "jinja2"):
         require(library, f"explore: the page needs {library}", "explore")
-    for flag in REFUSED:
-        if flag in call.hydra:
-            raise ConfigError(f"explore: {flag}: a page shows one config; expected settings; leave it out")
+    if refused := sorted(call.hydra.keys() - CHOOSING):
+        raise ConfigError(f"explore: {refused[0]}: a page shows one config; expected settings; leave it out")
     port = call.values.get("port", 0)
     if port > HIGHEST_PORT:
         raise ConfigError(f"--port {port}: is no port; expected 0 to {HIGHEST_PORT}")
@@ -41,7 +39,7 @@ def explore(call: Call) -> int:
         server.save(choices, to)
         print_result(to)
         return 0
-    server.serve(choices, port, "no_browser" not in call.values, _started)
+    server.serve(choices, port, "no_browser" not in call.values, _print_address)
     return 0
 
 
@@ -57,6 +55,5 @@ def _choices(call: Call) -> Choices:
     return open_place(place, call.values.get("keys"), call.overrides, call.hydra_arguments, folders)
 
 
-def _started(address: str) -> None:
-    print_result(f"{address} shows the page on this machine; stop with Ctrl-C")
-    sys.stdout.flush()
+def _print_address(address: str) -> None:
+    print_results([f"{address} shows the page on this machine; stop with Ctrl-C"])

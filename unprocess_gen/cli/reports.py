@@ -111,30 +111,30 @@ def _report_folder(config: Config, verb: str) -> Path:
 
 def report(call: Call) -> int:
     """Write the HTML page of a dataset or a sweep, or the card of a dataset."""
+    from unprocess_gen.pipeline.verify import is_sweep
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
 
-    folder = dataset_folder(call, sweeps=True)
-    if isinstance(folder, Path) and (folder / "sweep.csv").is_file() and not (folder / "dataset.json").exists():
-        return _report_sweep(folder, call)
+    folder, to = dataset_folder(call, sweeps=True), Path(call.values["to"]) if "to" in call.values else None
+    if isinstance(folder, Path) and is_sweep(folder):
+        return _report_sweep(folder, to, call)
     _check_card_arguments(call)
     if "card" in call.values:
-        return _card(call, folder)
-    to, root = call.values.get("to"), given_root(call)
+        return _card(folder, to, call)
+    root = given_root(call)
     dark = dark_frames_of(folder / "manifest.csv", call)
     if {"dark_frames", "dark_shading"} & call.values.keys():
         dark.open()  # refuses places that the user names and that do not exist
-    page, photographs = None if to is None else Path(to), None if root is None else any_path(root)
-    print_result(write_dataset_report(folder, page, photographs, dark))
+    print_result(write_dataset_report(folder, to, None if root is None else any_path(root), dark))
     return 0
 
 
-def _report_sweep(folder: Path, call: Call) -> int:
+def _report_sweep(folder: Path, to: Path | None, call: Call) -> int:
     from unprocess_gen.reports.sweep_page import write_sweep_page
 
     if others := sorted(call.values.keys() & {"card", *FOR_PAGE, *FOR_CARD}):
         raise ConfigError(f"report: {folder}: is a sweep; --{others[0]} is for one of its datasets; leave it out")
-    to, jobs = call.values.get("to"), read_table(folder / "sweep.csv")
-    print_result(write_sweep_page(folder, jobs, swept_keys(jobs), None if to is None else Path(to)))
+    jobs = read_table(folder / "sweep.csv")
+    print_result(write_sweep_page(folder, jobs, swept_keys(jobs), to))
     return 0
 
 
@@ -150,18 +150,14 @@ def _check_card_arguments(call: Call) -> None:
             raise ConfigError(f"report: {flag} {call.values[name]}: is used {other} --card only; leave one of both out")
 
 
-def _card(call: Call, folder: AnyPath) -> int:
+def _card(folder: AnyPath, to: Path | None, call: Call) -> int:
     """Write the card of a dataset, and name what is left to its author."""
     from unprocess_gen.pipeline.workspace import CARD_FILES
-    from unprocess_gen.reports.card import Statements, write_card
+    from unprocess_gen.reports.card import write_card
 
-    to = Path(call.values["to"]) if "to" in call.values else None
-    statements = Statements(*(call.values.get(name, "") for name in FOR_CARD))
-    out = write_card(folder, to, statements)
-    left = (
-        f"; left to its author: {', '.join(f'--{name}' for name in statements.missing)}" if statements.missing else ""
-    )
-    print_result(f"{out}: {' and '.join(CARD_FILES)} written{left}")
+    out = write_card(folder, to, *(call.values.get(name, "") for name in FOR_CARD))
+    missing = ", ".join(f"--{name}" for name in FOR_CARD if name not in call.values)
+    print_result(f"{out}: {' and '.join(CARD_FILES)} written" + (f"; left to its author: {missing}" if missing else ""))
     return 0
 
 

@@ -39,7 +39,7 @@ def _folder(flag: str, text: str, metavar: str = "FOLDER", *, required: bool = F
     return Argument((flag,), text, metavar, _local_path, "a local folder", "folders", required)
 
 
-def _choice(name: str, text: str, *choices: str, required: bool = False) -> Argument:
+def _enum(name: str, text: str, *choices: str, required: bool = False) -> Argument:
     return Argument((name,), text, f"{{{','.join(choices)}}}", required=required, choices=choices)
 
 
@@ -203,7 +203,7 @@ _VERBS = (
         "reports.export",
         (
             _folder("--to", "write to FOLDER", required=True),
-            _choice("--format", "files of NumPy or TIFF, HDF5, or LMDB", "npy", "tiff", "hdf5", "lmdb", required=True),
+            _enum("--format", "files of NumPy or TIFF, HDF5, or LMDB", "npy", "tiff", "hdf5", "lmdb", required=True),
         ),
         PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
         resumes=True,
@@ -217,7 +217,7 @@ _VERBS = (
             OUT,
             _integer("n_jobs", "number of worker processes; -1: all cores"),
             Argument(("executor",), "what runs the workers: local or dask", "NAME"),
-            _choice(
+            _enum(
                 "output.frames",
                 "false: only the manifest; true: also the frames of a manifest without frames",
                 "true",
@@ -248,7 +248,7 @@ _VERBS = (
         (
             _file("--to", "write the profile to FILE.yaml, and all estimates to FILE.json", required=True),
             _file("--report", "draw curves, histograms and maps in PAGE (HTML)", "PAGE"),
-            _choice(
+            _enum(
                 "--from",
                 "make the profile from NoiseProfile tags of DNG files, or from darks alone",
                 "noise_profile",

@@ -40,11 +40,11 @@ def _option(folders: list[Path], group: str, option: str) -> dict[str, Any]:
     """Read the file of an option from the first folder that has it."""
     files = (folder / group / f"{option}.yaml" for folder in folders)
     file = next((file for file in files if file.is_file()), None)
-    return {} if file is None else _loaded(file, file.stat().st_mtime_ns)
+    return {} if file is None else _file_content(file, file.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=16)
-def _loaded(file: Path, modified_ns: int) -> dict[str, Any]:
+def _file_content(file: Path, modified_ns: int) -> dict[str, Any]:
     """Load a file, again only if it has changed: it takes 20 ms, for each config that a page composes."""
     content = OmegaConf.to_container(OmegaConf.load(file))
     assert isinstance(content, dict)

@@ -53,21 +53,20 @@ class Recomposition:
     def config(self, overrides: Sequence[str]) -> Config:
         """Return the config that `load_config` returns; ConfigError with the sentence of `load_config`."""
         values = [override for override in overrides if _is_value(override)]
-        options = tuple(override for override in overrides if override not in values)
         if any(override.startswith("mixture=") for override in values):  # its entries are composed with all overrides
-            values, options = [], tuple(overrides)
+            values = []
         try:
-            node = copy.deepcopy(self._node(options))
-            for value in map(OverridesParser.create().parse_override, map(hydra_override, values)):
-                OmegaConf.update(node, value.key_or_group, value.value(), merge=True)
-            choices = dict(node.hydra.runtime.choices)
-            config = validated_config(node, overrides)
+            return self._merged(overrides, values)
         except Exception:  # what is wrong is explained by a complete composition
-            for override in overrides:
-                check_override(override)
-            node = compose_node(overrides, self._folders)
-            choices = dict(node.hydra.runtime.choices)
-            config = validated_config(node, overrides)
+            return self._merged(overrides, [])
+
+    def _merged(self, overrides: Sequence[str], values: Sequence[str]) -> Config:
+        """Compose the other overrides, unless their node is kept, and merge values into it."""
+        node = copy.deepcopy(self._node(tuple(override for override in overrides if override not in values)))
+        for value in map(OverridesParser.create().parse_override, map(hydra_override, values)):
+            OmegaConf.update(node, value.key_or_group, value.value(), merge=True)
+        choices = dict(node.hydra.runtime.choices)
+        config = validated_config(node, overrides)
         self.choices = choices
         return config
 
@@ -107,15 +106,15 @@ def overrides_of(config: Config) -> dict[str, str]:
     with open_dict(node):
         node.pop("hydra")
     base = typed_config(node, options)
-    given |= {key: override_text(wanted) for key, wanted in _differences(config, base)}
+    given |= {key: override_text(wanted) for key, wanted in _differing_settings(config, base)}
     given = {key: text for key, text in given.items() if default_options().get(key) != text}
     composition = load_config([f"{key}={text}" for key, text in given.items()])
-    if left := [key for key, _ in _differences(config, composition)]:
+    if left := [key for key, _ in _differing_settings(config, composition)]:
         raise ConfigError(f"{', '.join(left)}: recorded settings that overrides cannot express; run gen-dataset again")
     return given
 
 
-def _differences(config: Config, other: Config) -> list[tuple[str, Any]]:
+def _differing_settings(config: Config, other: Config) -> list[tuple[str, Any]]:
     """Return the keys that decide data and differ, with their values in a config."""
     differences = []
     for group, name, setting in all_settings():

@@ -84,7 +84,7 @@ class Build:
         assert spec is not None and spec.origin is not None
         folder = Path(spec.origin).parent / "data"
         for name, digest in {str(row["source"]): row["source_sha256"] for row in self.rows()}.items():
-            actual = _digest(folder / name)
+            actual = _digest_text(folder / name)
             if actual != digest:
                 raise SourceChangedError(
                     f"build {self.name}: {folder / name}: its SHA-256 is {actual}; expected {digest}, as in "
@@ -130,7 +130,7 @@ class Build:
         if damaged:  # the files contradict each other
             return
         for file, digest in self.digests.items():
-            actual = _digest(folder / file)
+            actual = _digest_text(folder / file)
             if actual != digest and posixpath.basename(file) != MANIFEST:
                 yield Damage(file, f"its SHA-256 is {actual}, that of the build is {digest}")
         yield from self._differing_cells(folder)
@@ -167,6 +167,6 @@ def read_build(name: str) -> Build:
     return Build(name, recipe, {file: digest for digest, file in (line.split("  ", 1) for line in lines)})
 
 
-def _digest(file: Path) -> str:
+def _digest_text(file: Path) -> str:
     """SHA-256 of a file, or that it is missing."""
     return file_sha256(file) if file.is_file() else "none, the file is missing"

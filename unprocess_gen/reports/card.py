@@ -23,7 +23,7 @@ from unprocess_gen.dataset.columns import COLUMNS
 from unprocess_gen.dataset.manifest import read_columns, read_rows
 from unprocess_gen.pipeline.workspace import CARD_FILES
 from unprocess_gen.reports.dataset_page.page import checked_facts, shown_settings
-from unprocess_gen.reports.dataset_page.statistics import ManifestStatistics, read_statistics, values_text
+from unprocess_gen.reports.dataset_page.statistics import MEANINGS, ManifestStatistics, read_statistics, values_text
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.reports.report_files import writable_folder, write_files
 from unprocess_gen.sources.names import encode_name
@@ -38,7 +38,7 @@ CITATIONS = (
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Categories of Hugging Face: numbers of pairs below which each applies."""
 
-TEMPLATE = Path(__file__).parent / "templates" / "card.md"
+CARD_TEMPLATE = Path(__file__).parent / "templates" / "card.md"
 
 SHARDS = "- `shards/`: uncompressed tar files in WebDataset layout: `KEY.clean.npy`, `KEY.noisy.npy`, `KEY.json`\n"
 """Line about the files with frames."""
@@ -47,27 +47,19 @@ LEFT_TO_AUTHOR = "The author states here the licence of the source photographs, 
 
 
 @dataclass(frozen=True, slots=True)
-class Statements:
-    """Hold what the author of a dataset states: the licence, and the date of publication (ISO 8601)."""
-
-    licence: str = ""
-    published: str = ""
-
-    @property
-    def missing(self) -> list[str]:
-        """Names of what is not stated."""
-        return [name for name in ("licence", "published") if not getattr(self, name)]
-
-
-@dataclass(frozen=True, slots=True)
 class _Described:
-    """Hold what a card describes: the dataset's name, facts, settings, columns and statistics of its rows."""
+    """Hold what a card describes: the dataset's name, facts, settings, columns and statistics of its rows.
+
+    The author states ``licence`` and ``published``, the date of publication (ISO 8601).
+    """
 
     name: str
     facts: dict[str, Any]
     config: Config
     columns: tuple[str, ...]
     statistics: ManifestStatistics
+    licence: str
+    published: str
 
     @property
     def summary(self) -> str:
@@ -89,7 +81,7 @@ class _Described:
         return counted(self.statistics.images, kind)
 
 
-def write_card(folder: AnyPath, to: Path | None = None, statements: Statements | None = None) -> Path:
+def write_card(folder: AnyPath, to: Path | None = None, licence: str = "", published: str = "") -> Path:
     """Write the card of a finished dataset into it, or to another folder; return the folder.
 
     ConfigError if mlcroissant is missing, the folder cannot be written, or it has other files of these names, which the
@@ -102,9 +94,9 @@ def write_card(folder: AnyPath, to: Path | None = None, statements: Statements |
     facts, config = checked_facts(folder)
     manifest = folder / "manifest.csv"
     statistics = read_statistics(read_rows(manifest), facts["pairs"])
-    described = _Described(encode_name(folder_name(folder)), facts, config, read_columns(manifest), statistics)
-    given = statements or Statements()
-    contents = dict(zip(CARD_FILES, (_readme(described, given), _croissant(described, given)), strict=True))
+    name, columns = encode_name(folder_name(folder)), read_columns(manifest)
+    described = _Described(name, facts, config, columns, statistics, licence, published)
+    contents = dict(zip(CARD_FILES, (_readme(described), _croissant(described)), strict=True))
     for name, text in contents.items():
         if (out / name).exists() and (out / name).read_bytes() != text.encode():
             raise ConfigError(
@@ -118,10 +110,10 @@ def write_card(folder: AnyPath, to: Path | None = None, statements: Statements |
 # ----------------------------------------------------------------------------------------------------------- README.md
 
 
-def _readme(described: _Described, given: Statements) -> str:
+def _readme(described: _Described) -> str:
     facts, statistics, config = described.facts, described.statistics, described.config
-    licence, shards = given.licence or LEFT_TO_AUTHOR, facts["shards"]
-    if facts["source"]["kind"] == "synthetic" and not given.licence:
+    licence, shards = described.licence or LEFT_TO_AUTHOR, facts["shards"]
+    if facts["source"]["kind"] == "synthetic" and not described.licence:
         licence = "No photograph is contained: the sources are scenes that unprocess_gen (MIT) draws."
     contents = {
         "pairs": f"{facts['pairs']:,}, of {described.sources}",
@@ -134,15 +126,15 @@ def _readme(described: _Described, given: Statements) -> str:
         **{name: values_text(statistics.texts[name]) for name in ("camera", "noise", "scene")},
         "effects": values_text(statistics.effects),
     }
-    return TEMPLATE.read_text(encoding="utf-8").format(
+    return CARD_TEMPLATE.read_text(encoding="utf-8").format(
         title=html.escape(described.name, quote=False),
         name=json.dumps(described.name, ensure_ascii=False),
         quoted=shlex.quote(described.name),
-        licence_key=f"license: {json.dumps(given.licence)}\n" if given.licence else "",
+        licence_key=f"license: {json.dumps(described.licence)}\n" if described.licence else "",
         size=next((name for bound, name in SIZES if facts["pairs"] < bound), "n>10M"),
         summary=described.summary,
-        contents=_table("property", "value", contents),
-        settings=_table("setting", "value", shown_settings(config)),
+        contents=_markdown_table("property", "value", contents),
+        settings=_markdown_table("setting", "value", shown_settings(config)),
         shards=SHARDS if config.output.frames else "",
         reader="RawPairs" if config.output.frames else "LivePairs",
         fingerprint=facts["fingerprint"],
@@ -151,7 +143,7 @@ def _readme(described: _Described, given: Statements) -> str:
     )
 
 
-def _table(first: str, second: str, rows: Mapping[str, str]) -> str:
+def _markdown_table(first: str, second: str, rows: Mapping[str, str]) -> str:
     cells = (f"| {key} | {text.replace('|', chr(92) + '|')} |" for key, text in rows.items())
     return "\n".join([f"| {first} | {second} |", "|---|---|", *cells])
 
@@ -159,7 +151,7 @@ def _table(first: str, second: str, rows: Mapping[str, str]) -> str:
 # ------------------------------------------------------------------------------------------------------ croissant.json
 
 
-def _croissant(described: _Described, given: Statements) -> str:
+def _croissant(described: _Described) -> str:
     """Return Croissant JSON: the rows of the manifest as records, and the arrays in the shards with their keys."""
     import mlcroissant as mlc  # optional library, extra "card"
 
@@ -177,27 +169,27 @@ def _croissant(described: _Described, given: Statements) -> str:
         description=described.summary,
         conforms_to=[CROISSANT],
         keywords=["raw", "denoising", "image restoration", "synthetic"],
-        license=[given.licence] if given.licence else None,
-        date_published=given.published or None,
+        license=[described.licence] if described.licence else None,
+        date_published=described.published or None,
         cite_as=" ".join(CITATIONS),
         version="1.0.0",
         data_collection=f"Simulated by unprocess_gen {described.version}; fingerprint {facts['fingerprint']}.",
         distribution=[*files, *sets],
-        record_sets=[_rows(mlc, described.columns), *([_arrays(mlc)] if shards else [])],
+        record_sets=[_rows_record(mlc, described.columns), *([_arrays_record(mlc)] if shards else [])],
     )
     content = metadata.to_json()
     content["@context"]["containedIn"] = "cr:containedIn"  # a term of 1.1 that mlcroissant reads and does not write
     return json.dumps(content, indent=1, default=str) + "\n"
 
 
-def _rows(mlc: Any, names: tuple[str, ...]) -> Any:
+def _rows_record(mlc: Any, names: tuple[str, ...]) -> Any:
     """Describe the rows of the manifest, with a field for each of its columns."""
     types: dict[object, Any] = {int: mlc.DataType.INTEGER, float: mlc.DataType.FLOAT}
     fields = [
         mlc.Field(
             id=f"pairs/{column.name}",
             name=column.name,
-            description=", ".join(filter(None, (column.meaning, column.unit))),
+            description=MEANINGS[column.name],
             data_types=[types.get(column.type, mlc.DataType.TEXT)],
             source=mlc.Source(file_object="manifest.csv", extract=mlc.Extract(column=column.name)),
         )
@@ -208,7 +200,7 @@ def _rows(mlc: Any, names: tuple[str, ...]) -> Any:
     return mlc.RecordSet(id="pairs", name="pairs", description=description, key="pairs/key", fields=fields)
 
 
-def _arrays(mlc: Any) -> Any:
+def _arrays_record(mlc: Any) -> Any:
     """Describe the arrays in the shards: key, name of the array, and the content of the file."""
     regex = {"key": r"^([^.]+)\.", "array": r"^[^.]+\.(.+)\.npy$"}
     meanings = {

@@ -20,16 +20,16 @@ def figure_png(figure: Figure, dpi: int) -> bytes:
     return content.getvalue()
 
 
-def png(picture: NDArray[Any]) -> bytes:
+def picture_png(picture: NDArray[Any]) -> bytes:
     """Return a picture, 8-bit RGB ``[H, W, 3]``, as PNG."""
-    return _encoded(".png", picture, cv2.IMWRITE_PNG_COMPRESSION, 3)
+    return _picture_bytes(".png", picture, cv2.IMWRITE_PNG_COMPRESSION, 3)
 
 
-def jpeg(picture: NDArray[Any], quality: int) -> bytes:
+def picture_jpeg(picture: NDArray[Any], quality: int) -> bytes:
     """Return a picture, 8-bit RGB ``[H, W, 3]``, as JPEG; noise makes a PNG four times as large."""
-    return _encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, quality)
+    return _picture_bytes(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, quality)
 
 
-def _encoded(suffix: str, picture: NDArray[Any], option: int, value: int) -> bytes:
+def _picture_bytes(suffix: str, picture: NDArray[Any], option: int, value: int) -> bytes:
     _, content = cv2.imencode(suffix, np.ascontiguousarray(picture[..., ::-1]), (option, value))
     return content.tobytes()

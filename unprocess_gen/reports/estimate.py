@@ -26,7 +26,7 @@ from unprocess_gen.core.random_streams import stream_key
 from unprocess_gen.core.roots import is_remote
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.targets import FRAME_TARGETS
-from unprocess_gen.core.types import Plan, Source, Srgb
+from unprocess_gen.core.types import Frame, Plan, Source, Srgb
 from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
@@ -242,8 +242,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     height, width = photograph.srgb.shape[:2]
     clean_levels, planned_s = 0, time.perf_counter() - started
     for patch, plan, pair in image.pairs():
-        if not clean_levels and pair.clean.dtype == np.uint16:
-            clean_levels = int(np.count_nonzero(np.bincount(pair.clean.reshape(-1))))
+        clean_levels = clean_levels or count_levels(pair.clean)
         names = [name for name in config.output.targets if plan is image.plans[0] or name in FRAME_TARGETS]
         targets = targets_of(names, photograph.srgb, plan, patch, pair, noise_law(plan)).values()
         for frame in (*([pair.clean] if plan is image.plans[0] else []), pair.noisy, *targets):
@@ -263,6 +262,11 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         bands=empty_bands(photograph.srgb, levels[0]),
         noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, levels[0]),
     )
+
+
+def count_levels(clean: Frame) -> int:
+    """Count the distinct DN of a clean frame; 0 if it is not rounded."""
+    return int(np.count_nonzero(np.bincount(clean.reshape(-1)))) if clean.dtype == np.uint16 else 0
 
 
 def _tier_ns(

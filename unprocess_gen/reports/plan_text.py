@@ -198,7 +198,7 @@ def _two_number_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     return [
         f"noise     {noise.name}: {numbers} ({noise.units}, black {profile_levels[0]} "
         f"{noise.black}, white {profile_levels[1]})",
-        f"          on this sensor ({_levels_text(plans)}): a_dn {value_range([plan.noise.a_dn for plan in plans])}, "
+        f"          on this sensor ({_sensor_text(plans)}): a_dn {value_range([plan.noise.a_dn for plan in plans])}, "
         f"b_dn2 {value_range([plan.noise.b_dn2 for plan in plans])}; variance = a_dn·(x - black) + b_dn2",
         *([f"          {below}"] if zero_dn > 0 else []),
         f"effects   {', '.join(first.effects)}",
@@ -206,7 +206,7 @@ def _two_number_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     ]
 
 
-def _levels_text(plans: Sequence[Plan]) -> str:
+def _sensor_text(plans: Sequence[Plan]) -> str:
     """The levels of the pairs: with sensor=source those of the files."""
     black, white = ([getattr(plan.sensor, f"{end}_level_dn") for plan in plans] for end in ("black", "white"))
     return f"black {value_range(black)}, white {value_range(white)}"
@@ -229,7 +229,7 @@ def _physical_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     simulated = {name for plan in plans for name in plan.noise.effects}
     return [
         f"noise     {noise.name}: in DN of black {noise.black_level_dn}, white {noise.white_level_dn}; "
-        f"on this sensor ({_levels_text(plans)}) times {scale}",
+        f"on this sensor ({_sensor_text(plans)}) times {scale}",
         f"          system gain {value_range(gains, 4)} DN per electron, read noise {value_range(stds, 4)} DN standard "
         f"deviation ({distribution})",
         *_labelled("", [assumed and f"assumed, without a source: {assumed}", _assumed_sentence(config, plans)]),

@@ -22,7 +22,7 @@ from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.targets import noise_law
 from unprocess_gen.pipeline.workspace import REPORT
 from unprocess_gen.reports.dataset_page.page import write_dataset_report
-from unprocess_gen.reports.encoding import jpeg
+from unprocess_gen.reports.encoding import picture_jpeg
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.report_files import check_page_file, require_libraries, write_files
@@ -31,7 +31,7 @@ from unprocess_gen.reports.sheets.contact_sheet import develop_detail
 from unprocess_gen.simulation.reference.isp import to_light
 
 JPEG_QUALITY = 70
-COLUMNS = 5
+COLUMNS_ACROSS = 5
 """Values of the key across the table, if one has as many: they fit a window of 1200 pixels."""
 CURVE_LEVELS = 64
 CURVE_PX = (120, 48)
@@ -60,10 +60,10 @@ def write_sweep_page(folder: Path, jobs: Table, swept: Sequence[str], to: Path |
     file = folder / REPORT if to is None else to
     if to is not None:
         check_page_file(to, f"--to {to}")
-    cells = {job["folder"]: _cell(folder, job, file.parent) for job in with_bar(jobs, "dataset", len(jobs))}
+    cells = {job["folder"]: _job_cell(folder, job, file.parent) for job in with_bar(jobs, "dataset", len(jobs))}
     highest_dn = max((float(cell.std_dn.max(initial=0)) for cell in cells.values()), default=0.0)
     counts = {key: len({job.get(key, "") for job in jobs}) for key in swept}
-    across = min(swept, key=lambda key: abs(counts[key] - COLUMNS), default="") if len(swept) > 1 else ""
+    across = min(swept, key=lambda key: abs(counts[key] - COLUMNS_ACROSS), default="") if len(swept) > 1 else ""
     down = [key for key in swept if key != across]
     content = render_page(
         "sweep.html",
@@ -71,8 +71,8 @@ def write_sweep_page(folder: Path, jobs: Table, swept: Sequence[str], to: Path |
         across=across,
         down=down,
         columns=list(dict.fromkeys(job.get(across, "") for job in jobs)) if across else [],
-        rows=_rows(jobs, across, down, cells),
-        curve=lambda cell: _curve(cell.std_dn, highest_dn),
+        rows=_grid_rows(jobs, across, down, cells),
+        curve=lambda cell: _curve_points(cell.std_dn, highest_dn),
         highest_dn=highest_dn,
         jobs=len(jobs),
         finished=sum(bool(cell.pictures) for cell in cells.values()),
@@ -82,7 +82,7 @@ def write_sweep_page(folder: Path, jobs: Table, swept: Sequence[str], to: Path |
     return file
 
 
-def _rows(
+def _grid_rows(
     jobs: Table, across: str, down: Sequence[str], cells: Mapping[str, SweepCell]
 ) -> list[tuple[list[str], dict[str, list[SweepCell]]]]:
     """Group the cells by the values of the keys ``down``, then of the key ``across``, as in the table of the sweep."""
@@ -93,7 +93,7 @@ def _rows(
     return [(list(values), row) for values, row in rows.items()]
 
 
-def _cell(sweep: Path, job: Mapping[str, str], start: Path) -> SweepCell:
+def _job_cell(sweep: Path, job: Mapping[str, str], start: Path) -> SweepCell:
     """Describe a job; one without a readable dataset has no pictures, and the reason in its lines."""
     name = job["folder"]
     folder = sweep / name
@@ -129,11 +129,11 @@ def _pictures(folder: Path) -> tuple[tuple[tuple[str, str], ...], Float]:
         drawn["noisy, developed"] = develop_detail(frames[1], plan, window)
     signal_dn = np.linspace(plan.sensor.black_level_dn, plan.sensor.white_level_dn, CURVE_LEVELS)
     std_dn = noise_std(signal_dn, noise_law(plan)).astype(np.float64)
-    jpegs = {title: jpeg(panels.byte_codes(picture), JPEG_QUALITY) for title, picture in drawn.items()}
+    jpegs = {title: picture_jpeg(panels.byte_codes(picture), JPEG_QUALITY) for title, picture in drawn.items()}
     return tuple((title, data_uri(content, "jpeg")) for title, content in jpegs.items()), std_dn
 
 
-def _curve(std_dn: Float, highest_dn: float) -> str:
+def _curve_points(std_dn: Float, highest_dn: float) -> str:
     """Return the points of an SVG polyline."""
     width, height = CURVE_PX
     x = np.linspace(0, width, len(std_dn))

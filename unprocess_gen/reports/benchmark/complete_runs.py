@@ -32,7 +32,7 @@ from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.reports.benchmark.methods import FrameErrors
 from unprocess_gen.reports.benchmark.session import EXACT, SampleSizes
 from unprocess_gen.reports.benchmark.timing import measure_in_turns
-from unprocess_gen.reports.encoding import jpeg
+from unprocess_gen.reports.encoding import picture_jpeg
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.sources.loader import list_photographs, load_source
@@ -144,7 +144,7 @@ def _select(config: Config, sizes: SampleSizes, folder: Path) -> RunFiles:
 def _write_scene(config: SourceConfig, source: Source, folder: Path) -> None:
     """Write a built-in scene, in full size, as a JPEG file."""
     _, scene = load_source(replace(config, downscale=1), source)
-    write_files(folder, {f"{source.name}.jpg": jpeg(scene.srgb, JPEG_QUALITY)})
+    write_files(folder, {f"{source.name}.jpg": picture_jpeg(scene.srgb, JPEG_QUALITY)})
 
 
 def time_run(config: Config, files: RunFiles, tier: AccuracyConfig) -> RunTimes:

@@ -22,7 +22,6 @@ from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Row
-from unprocess_gen.dataset.columns import COLUMNS
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
@@ -30,8 +29,14 @@ from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.workspace import REPORT, read_dataset
 from unprocess_gen.reports import photon_transfer
-from unprocess_gen.reports.dataset_page.statistics import SITE_COLUMNS, NumberSummary, read_statistics, values_text
-from unprocess_gen.reports.encoding import figure_png, jpeg
+from unprocess_gen.reports.dataset_page.statistics import (
+    MEANINGS,
+    SITE_COLUMNS,
+    NumberSummary,
+    read_statistics,
+    values_text,
+)
+from unprocess_gen.reports.encoding import figure_png, picture_jpeg
 from unprocess_gen.reports.formatting import byte_size, short_number
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.noise_check.checks import Checker
@@ -43,8 +48,6 @@ from unprocess_gen.sources.names import encode_name
 PAIRS_FITTED = 8
 SHARDS_LISTED = 20
 JPEG_QUALITY = 88
-
-MEANINGS = {column.name: ", ".join(filter(None, (column.meaning, column.unit))) for column in COLUMNS}
 
 SETTINGS_SHOWN = (
     *("seed", "source.limit", "source.clips", "source.downscale", "source.dequantize", "source.patch"),
@@ -149,7 +152,7 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark: DarkPlaces, firs
     except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
         missing = str(error)
     return {
-        "contact_sheet": data_uri(jpeg(contact_sheet(folder, source=source), JPEG_QUALITY), "jpeg"),
+        "contact_sheet": data_uri(picture_jpeg(contact_sheet(folder, source=source), JPEG_QUALITY), "jpeg"),
         "noise": noise,
         "missing": missing,
         "count": len(numbers),

@@ -21,6 +21,9 @@ PAIRS_DRAWN = 20_000
 
 BATCH_ROWS = 512
 
+MEANINGS = {column.name: ", ".join(filter(None, (column.meaning, column.unit))) for column in COLUMNS}
+"""Meaning and unit of each column."""
+
 NUMBER_COLUMNS = tuple(
     column.name for column in COLUMNS if column.type is float and not column.name.startswith(("rgb2cam", "law_"))
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from bokeh.models import InputWidget, Select, Slider, TextInput
 
@@ -34,22 +34,14 @@ SECTIONS = {
 WEIGHTS = ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
 
 
-class SliderRange(NamedTuple):
-    """The ends and the step of a slider."""
-
-    start: float
-    end: float
-    step: float
-
-
 SLIDERS = {
-    "gains.red": SliderRange(0.5, 4, 0.01),
-    "gains.blue": SliderRange(0.5, 4, 0.01),
-    "gains.inverse_rgb": SliderRange(0.3, 2.2, 0.01),
-    "gains.threshold": SliderRange(0, 0.99, 0.01),
-    **{f"camera.weights.{name}": SliderRange(0, 1, 0.01) for name in WEIGHTS},
+    "gains.red": (0.5, 4),
+    "gains.blue": (0.5, 4),
+    "gains.inverse_rgb": (0.3, 2.2),
+    "gains.threshold": (0, 0.99),
+    **{f"camera.weights.{name}": (0, 1) for name in WEIGHTS},
 }
-"""Sliders by key; the weights have a slider for each camera."""
+"""Ends of sliders by key; the weights have a slider for each camera."""
 
 NONE = "(none)"
 DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}
@@ -67,8 +59,8 @@ def names_of(section: str) -> list[str]:
 def widget(name: str, folders: list[Any]) -> InputWidget:
     """Return the control of a group or key, without a value."""
     if name in SLIDERS:
-        place = SLIDERS[name]
-        return Slider(title=name, start=place.start, end=place.end, step=place.step, value=place.start)
+        start, end = SLIDERS[name]
+        return Slider(title=name, start=start, end=end, step=0.01, value=start)
     setting = SETTINGS.get(name)
     if setting is None:
         options = group_options(name, conf_dir(), *folders)

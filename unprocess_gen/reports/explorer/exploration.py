@@ -25,7 +25,7 @@ from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.empty_bands import empty_bands
-from unprocess_gen.reports.estimate import SourceEstimate
+from unprocess_gen.reports.estimate import SourceEstimate, count_levels
 from unprocess_gen.reports.plan_text import noise_lines
 from unprocess_gen.reports.sheets.panels import MosaicArray
 from unprocess_gen.simulation import self_test
@@ -126,8 +126,8 @@ class Exploration:
         """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
         config = self.composition.config(self.overrides)
         require_photographs(config.source, "explore")
-        source = _sources(config.source)[self.index]
-        sha256, photograph = _loaded(config.source, source, config.output.layout)
+        source = _listed_sources(config.source)[self.index]
+        sha256, photograph = _photograph(config.source, source, config.output.layout)
         settings = PairSettings.read(config)
         image = plan_pixels(settings, photograph, source, sha256)
         is_cut, several = config.source.patch is not None, len(image.plans) > 1
@@ -148,34 +148,33 @@ class Exploration:
         saturated = pair.clean == plan.saturated_value
         if plan.output.layout == PACKED:
             saturated = unpack(saturated, plan.sensor.pattern)
-        lines = tuple(_lines(settings, source, sha256, image, plan, pair))
+        lines = tuple(_plan_lines(settings, source, sha256, image, plan, pair))
         keys = tuple(parts)
         return Shown(config, srgb, plan, patch, pair, *frames, saturated, row, keys, lines, image.dark_folder)
 
 
-def _lines(
+def _plan_lines(
     settings: PairSettings, source: Source, sha256: str, image: PlannedImage, plan: Plan, pair: Pair
 ) -> list[str]:
     """Lines of ``plan`` about the scene and the noise of a pair."""
     assert image.config is not None
     levels = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
-    is_rounded = pair.clean.dtype == np.uint16
     estimate = SourceEstimate(
         source,
         0.0,
         levels=(plan,),
         predictions=(levels[plan.noise.level][1],),
-        clean_levels=int(np.count_nonzero(np.bincount(pair.clean.ravel()))) if is_rounded else 0,
+        clean_levels=count_levels(pair.clean),
         bands=empty_bands(image.srgb, plan),
     )
     return noise_lines(image.config, [estimate], settings.dark_frames)
 
 
 @functools.lru_cache(maxsize=4)
-def _sources(config: SourceConfig) -> tuple[Source, ...]:
+def _listed_sources(config: SourceConfig) -> tuple[Source, ...]:
     return list_photographs(config).sources
 
 
 @functools.lru_cache(maxsize=1)
-def _loaded(config: SourceConfig, source: Source, layout: str) -> tuple[str, Photograph]:
+def _photograph(config: SourceConfig, source: Source, layout: str) -> tuple[str, Photograph]:
     return load_source(config, source, layout)

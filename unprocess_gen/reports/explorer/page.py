@@ -31,13 +31,14 @@ from bokeh.plotting import figure
 from bokeh.resources import INLINE
 
 from unprocess_gen.core.errors import UnprocessGenError
+from unprocess_gen.reports.dataset_page.statistics import MEANINGS, SITE_COLUMNS
 from unprocess_gen.reports.explorer import views
 from unprocess_gen.reports.explorer.controls import NONE, SECTIONS, SETTINGS, WEIGHTS, names_of, shown_value, widget
 from unprocess_gen.reports.explorer.exploration import Exploration, Shown
 from unprocess_gen.reports.explorer.opening import Choices
 from unprocess_gen.reports.html_pages import page_template, render_macro, render_page
 
-TEMPLATE = "explorer.html"
+PAGE_TEMPLATE = "explorer.html"
 LINE_COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0072b2", "noisy": "#d55e00"}
 PLOTS = {
     "source_histogram": ("Histogram of the source", "code", "share of the pixels"),
@@ -69,7 +70,7 @@ class Page:
         self._state: Exploration = choices[label]()
         self._shown: Shown | None = None
         self._document: Document | None = None
-        self._syncing, self._waiting = False, set[str]()
+        self._syncing, self._waiting = False, set[Callable[[], None]]()
         self._pixels = ColumnDataSource()
         self._x, self._y = Range1d(0, 1), Range1d(1, 0)
         self._message, self._facts, self._plan = map(_text_box, ("message", "facts", "plan"))
@@ -78,13 +79,12 @@ class Page:
         self._curves = {name: self._curve(name) for name in PLOTS}
         self._points = ColumnDataSource({"x": [], "y": []})
         self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=LINE_COLOURS["clean"])
-        self._command = TextInput(name="command", value="", sizing_mode="stretch_width", title="Command of this pair")
+        self._command = TextInput(name="command", title="Command of this pair")
         self._stretch = Select(name="stretch", title="raw and developed", options=list(STRETCHES), value=STRETCHES[0])
         self._open = Select(name="open", title="photograph or row", options=list(choices), value=label)
-        self._part = Select(name="part", title="pair of the image", options=[])
-        self._other = TextInput(
-            name="other", title="other settings", placeholder="source.downscale=2 output.dtype=float32"
-        )
+        self._part = Select(name="part", title="pair of the image")
+        self._other = TextInput(name="other", title="other settings")
+        self._other.placeholder = "source.downscale=2 output.dtype=float32"
         self._file = ColumnDataSource({"name": [], "content": []}, name="file")
         self._widgets: dict[str, Any] = {}
 
@@ -193,7 +193,7 @@ class Page:
                 ys = [[share or None for share in line] for line in ys]
             self._lines[name].data = {"xs": xs, "ys": ys, "label": list(lines), "colour": colours}
         self._points.data = {"x": transfer.points[0], "y": transfer.points[1]}
-        self._facts.text = render_macro("facts", _facts(shown, transfer.text))
+        self._facts.text = render_macro("facts", _pair_facts(shown, transfer.text))
         self._plan.text = render_macro("lines", "\n".join(shown.lines))
 
     def _say(self, sentence: str) -> None:
@@ -222,7 +222,7 @@ class Page:
     def document(self, document: Document) -> None:
         """Fill a document of the server."""
         self._document = document
-        document.title, document.template = "unprocess_gen explorer", page_template(TEMPLATE)
+        document.title, document.template = "unprocess_gen explorer", page_template(PAGE_TEMPLATE)
         roots = [self._message, self._facts, self._plan, *self._pictures.values(), *self._curves.values()]
         self._widgets = {
             name: widget(name, self._state.composition.own_folders)
@@ -230,10 +230,9 @@ class Page:
             for name in names_of(section)
         }
         for name, control in self._widgets.items():
-            control.update(name=name, sizing_mode="stretch_width")
+            control.name = name
             control.on_change("value", partial(self._changed, name))
-        buttons = self._buttons()
-        inputs = [self._open, self._part, self._other, self._stretch]
+        inputs = [*self._widgets.values(), self._open, self._part, self._other, self._stretch, self._command]
         for control in inputs:
             control.sizing_mode = "stretch_width"
         self._open.on_change("value", self._opened)
@@ -242,8 +241,8 @@ class Page:
         self._stretch.on_change("value", lambda attr, old, new: self._draw_view())
         for end in (self._x, self._y):
             for side in ("start", "end"):
-                end.on_change(side, lambda attr, old, new: self._later(self._draw_view, "view"))
-        for model in (*roots, *self._widgets.values(), *buttons, *inputs, self._command):
+                end.on_change(side, lambda attr, old, new: self._later(self._draw_view))
+        for model in (*roots, *inputs, *self._buttons()):
             document.add_root(model)
         document.template_variables.update(_variables(live=True))
         self._update()
@@ -265,14 +264,14 @@ class Page:
             buttons.append(button)
         return buttons
 
-    def _later(self, task: Callable[[], Any], name: str) -> None:
+    def _later(self, task: Callable[[], None]) -> None:
         """Run a task once after the changes that have arrived."""
-        if name in self._waiting or self._document is None:
+        if task in self._waiting or self._document is None:
             return
-        self._waiting.add(name)
+        self._waiting.add(task)
 
         def run() -> None:
-            self._waiting.remove(name)
+            self._waiting.remove(task)
             task()
 
         self._document.add_timeout_callback(run, WAIT_MS)
@@ -289,22 +288,22 @@ class Page:
             self._state.settings.pop(name, None)
         else:
             self._state.settings[name] = f"{new:.6g}" if isinstance(new, float | int) else new.strip() or "null"
-        self._later(self._update, "pair")
+        self._later(self._update)
 
     def _opened(self, attr: str, old: Any, new: str) -> None:
         with self._reported():
             self._state, self._shown = self._choices[new](), None
-            self._later(self._update, "pair")
+            self._later(self._update)
 
     def _chosen_part(self, attr: str, old: Any, new: str) -> None:
         if not self._syncing and "-" in new:
             self._state.part = new[new.index("-") :]
-            self._later(self._update, "pair")
+            self._later(self._update)
 
     def _typed(self, attr: str, old: Any, new: str) -> None:
         if not self._syncing:
             self._state.add(new.split())
-            self._later(self._update, "pair")
+            self._later(self._update)
 
     def _sync(self) -> None:
         """Set the controls to the values of the pair, in one message to the browser."""
@@ -338,7 +337,7 @@ class Page:
         command = _text_box("command", render_macro("wrapped", self._state.command))
         models = [self._facts, self._plan, command, *self._pictures.values(), *self._curves.values()]
         title, variables = f"{shown.row['source']} as raw frames", _variables(live=False)
-        template = page_template(TEMPLATE)
+        template = page_template(PAGE_TEMPLATE)
         return str(file_html(models, INLINE, title=title, template=template, template_variables=variables))
 
 
@@ -346,22 +345,12 @@ def _text_box(name: str, text: str = "") -> Div:
     return Div(name=name, text=text, sizing_mode="stretch_width", stylesheets=[render_page("explorer_texts.css")])
 
 
-SHOWN_SHARES = {
-    "saturated in the clean frame": "saturated",
-    "clean below black": "clean_clipped_low",
-    "clean above white": "clean_clipped_high",
-    "noisy clipped at 0": "noisy_clipped_low",
-    "noisy clipped at the top": "noisy_clipped_high",
-}
-"""Columns that count sites, by what the page calls them."""
-
-
-def _facts(shown: Shown, transfer: str) -> dict[str, str]:
+def _pair_facts(shown: Shown, transfer: str) -> dict[str, str]:
     """Numbers of the pair, by what the page calls them."""
     row, sites, camera = shown.row, shown.clean.size, shown.plan.camera
     return {
         "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
-        **{name: f"{int(row[column] or 0) / sites:.3%}" for name, column in SHOWN_SHARES.items()},
+        **{MEANINGS[column]: f"{int(row[column] or 0) / sites:.3%}" for column in SITE_COLUMNS},
         "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
         "noise of the pair": transfer,
         "effects": ", ".join(shown.plan.noise.effects),

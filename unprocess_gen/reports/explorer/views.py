@@ -53,11 +53,11 @@ def view(shown: Shown, window: Window, common: bool, most: tuple[int, int] = VIE
     """
     side = block_side(window, most)
     white = float(np.iinfo(shown.srgb.dtype).max)
-    source = shown.srgb[window] if side == 1 else _means(shown.srgb[window].astype(np.float32), side)
+    source = shown.srgb[window] if side == 1 else _block_means(shown.srgb[window].astype(np.float32), side)
     frames = {"clean": shown.clean, "noisy": shown.noisy}
     columns: Columns = {"source": _words(source / white)}
     for name, frame in frames.items():
-        raw, developed = _drawn(frame, shown, window, side)
+        raw, developed = _window_pictures(frame, shown, window, side)
         light = np.sqrt(np.clip(to_light(raw, shown.plan), 0, 1)) if common else stretch(raw)[0]
         columns[name] = _words(light)
         columns[f"{name}_developed"] = _words(developed if common else stretch(developed, least=1e-6)[0])
@@ -68,7 +68,7 @@ def view(shown: Shown, window: Window, common: bool, most: tuple[int, int] = VIE
     return columns
 
 
-def _means(values: NDArray[Any], side: int) -> NDArray[Any]:
+def _block_means(values: NDArray[Any], side: int) -> NDArray[Any]:
     """Average square blocks that fit into an image."""
     height, width = (length // side for length in values.shape[:2])
     return np.asarray(
@@ -76,20 +76,20 @@ def _means(values: NDArray[Any], side: int) -> NDArray[Any]:
     )
 
 
-def _planes(frame: NDArray[Any], side: int) -> Float:
+def _plane_means(frame: NDArray[Any], side: int) -> Float:
     """Average the four planes of a mosaic over blocks, ``[h, w, 4]``."""
     rows, columns = (length // side * side for length in frame.shape)
     planes = [frame[y:rows:2, x:columns:2].astype(np.float32) for y in (0, 1) for x in (0, 1)]
-    return np.stack([_means(plane, side // 2) for plane in planes], axis=-1)
+    return np.stack([_block_means(plane, side // 2) for plane in planes], axis=-1)
 
 
-def _drawn(frame: MosaicArray, shown: Shown, window: Window, side: int) -> tuple[MosaicArray, Float]:
+def _window_pictures(frame: MosaicArray, shown: Shown, window: Window, side: int) -> tuple[MosaicArray, Float]:
     """Return a window of a frame in DN, and developed."""
     if side == 1:
         has_all_colours = min(frame.shape) > 1
         raw = frame[window]
         return raw, develop_detail(frame, shown.plan, window) if has_all_colours else np.zeros((*raw.shape, 3))
-    planes = _planes(frame[window], side)
+    planes = _plane_means(frame[window], side)
     rgb = panels.planes_to_rgb(planes, shown.plan.sensor.pattern)
     return planes.mean(axis=-1), process(to_light(rgb, shown.plan), shown.plan)
 
@@ -98,7 +98,7 @@ def _saturated(mask: NDArray[np.bool_], shape: tuple[int, ...], shown: Shown, si
     """Return the share of saturated sites in each channel, ``[h, w, 3]``."""
     if side == 1:
         return panels.colour_sites(mask.astype(float), shown.plan.sensor.pattern)
-    return panels.planes_to_rgb(_planes(mask, side), shown.plan.sensor.pattern)
+    return panels.planes_to_rgb(_plane_means(mask, side), shown.plan.sensor.pattern)
 
 
 def _words(values: Float) -> NDArray[np.uint32]:

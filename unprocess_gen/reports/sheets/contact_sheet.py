@@ -34,7 +34,7 @@ from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import CODE_RANGE, Float, Plan, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row, read_columns
 from unprocess_gen.pipeline.progress import with_bar
-from unprocess_gen.reports.encoding import png
+from unprocess_gen.reports.encoding import picture_png
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs
@@ -108,7 +108,7 @@ def _is_marked(path: Path, mark: bytes) -> bool:
 
 
 def _marked_png(picture: Picture, mark: bytes) -> bytes:
-    content = png(picture)
+    content = picture_png(picture)
     return content[:PNG_HEADER_BYTES] + mark + content[PNG_HEADER_BYTES:]
 
 

@@ -27,7 +27,7 @@ STRIP_PX = (120, 180)
 
 PER_ROW = 4
 MARGIN_PX, LINE_PX = 10, 17
-PAPER, INK, EMPTY = 250, 20, 225
+PAPER_GREY, INK_GREY, EMPTY_GREY = 250, 20, 225
 """Grey levels of the sheet, of text, and of panels without a picture."""
 
 FONT, FONT_SCALE, CHARACTER_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.42, 10
@@ -122,7 +122,7 @@ def lay_out(
     return np.vstack(bands)
 
 
-def _blank(height: int, width: int, grey: int = PAPER) -> Picture:
+def _blank(height: int, width: int, grey: int = PAPER_GREY) -> Picture:
     return np.full((height, width, 3), grey, dtype=np.uint8)
 
 
@@ -136,7 +136,7 @@ def _beside(boxes: Sequence[Picture], width: int) -> Picture:
 
 
 def _centred(values: Float | None, panel_px: tuple[int, int]) -> Picture:
-    box = _blank(*panel_px, grey=EMPTY)
+    box = _blank(*panel_px, grey=EMPTY_GREY)
     if values is not None:
         picture = byte_codes(values)
         top, left = ((most - length) // 2 for most, length in zip(panel_px, picture.shape, strict=False))
@@ -150,5 +150,7 @@ def _text(paragraphs: Sequence[str], width_px: int) -> Picture:
     box = _blank(LINE_PX * len(lines) + MARGIN_PX // 2, width_px)
     for number, line in enumerate(lines, start=1):
         shown = line.encode("ascii", "replace").decode()
-        cv2.putText(box, shown, (0, number * LINE_PX - 4), FONT, FONT_SCALE, (INK, INK, INK), 1, cv2.LINE_AA)
+        cv2.putText(
+            box, shown, (0, number * LINE_PX - 4), FONT, FONT_SCALE, (INK_GREY, INK_GREY, INK_GREY), 1, cv2.LINE_AA
+        )
     return box

@@ -96,7 +96,7 @@ class DngColour:
             return self.white_xy or D50
         last = before = D50
         for _ in range(MOST_ITERATIONS):
-            before, last = last, _xy(transform(invert(self.matrix_at(last)), self.neutral))
+            before, last = last, _chromaticity(transform(invert(self.matrix_at(last)), self.neutral))
             if abs(last[0] - before[0]) + abs(last[1] - before[1]) < CLOSE:
                 return last
         return (last[0] + before[0]) / 2, (last[1] + before[1]) / 2
@@ -128,7 +128,7 @@ def temperature(white: XY) -> float:
     raise AssertionError("the last line returns")
 
 
-def _xy(xyz: Neutral) -> XY:
+def _chromaticity(xyz: Neutral) -> XY:
     total = xyz[0] + xyz[1] + xyz[2]
     if not (total > 0 and xyz[1] > 0):
         raise ValueError("the white point has no chromaticity")

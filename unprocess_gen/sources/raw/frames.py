@@ -66,7 +66,7 @@ def _photograph(config: SourceConfig, frame: RawFrame) -> Photograph:
         facts.iso or 0.0,
         facts.exposure_s or 0.0,
     )
-    codes = np.repeat(frame.pixels[..., None], 3, axis=2) if config.shrink == 1 else _means(frame, pattern, source)
+    codes = np.repeat(frame.pixels[..., None], 3, axis=2) if config.shrink == 1 else _cell_means(frame, pattern, source)
     noise = _own_noise(facts, config.raw, (black[1], white[1])) if config.shrink == 1 else None
     sensor = file_sensor(pattern, black, white)
     lossy = LOSSY.get(facts.compression or 0)
@@ -80,7 +80,7 @@ def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
     if raw.pattern is None or raw.black_dn is None or raw.white_dn is None:
         needed = "source.raw.pattern, source.raw.black_dn and source.raw.white_dn"
         raise SourceError("unsupported", f"a {suffix[1:].upper()} file states no levels and no pattern; give {needed}")
-    pixels = _picture(config, content) if suffix in PICTURE_SUFFIXES else _npy(content)
+    pixels = _picture(config, content) if suffix in PICTURE_SUFFIXES else _read_npy(content)
     if pixels.dtype != np.uint16 or pixels.ndim != 2 or not pixels.size:
         actual = f"{pixels.dtype} {list(pixels.shape)}"
         raise SourceError("unsupported", f"contains {actual}; expected a mosaic [H, W] of uint16")
@@ -89,7 +89,7 @@ def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
     return RawFrame(np.ascontiguousarray(pixels), RawMetadata(pattern=raw.pattern))
 
 
-def _npy(content: bytes) -> NDArray[Any]:
+def _read_npy(content: bytes) -> NDArray[Any]:
     try:
         pixels: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
         return pixels.astype(pixels.dtype.newbyteorder("="))
@@ -148,13 +148,13 @@ def file_sensor(pattern: str, black: Levels, white: Levels) -> SensorPlan:
     return SensorPlan("RGGB" if pattern == XTRANS else pattern, levels[1].bit_length(), *levels)
 
 
-def _means(frame: RawFrame, pattern: str, source: SourcePlan) -> NDArray[np.uint16]:
+def _cell_means(frame: RawFrame, pattern: str, source: SourcePlan) -> NDArray[np.uint16]:
     """Return the means of the sites of each colour in each cell, as codes [H, W, 3]; incomplete cells are left out."""
     cell = XTRANS_CELL if pattern == XTRANS else source.shrink
     height, width = (side // cell for side in frame.pixels.shape)
     if not min(height, width):
         raise SourceError("too_small", f"has less than one cell of {cell} x {cell} sites (source.shrink)")
-    pixels, planes = frame.pixels[: height * cell, : width * cell], _planes(frame, pattern)
+    pixels, planes = frame.pixels[: height * cell, : width * cell], _tile_planes(frame, pattern)
     light, counts = np.zeros((height, width, 3)), [0, 0, 0]
     for y in range(cell):
         for x in range(cell):
@@ -167,7 +167,7 @@ def _means(frame: RawFrame, pattern: str, source: SourcePlan) -> NDArray[np.uint
     return np.clip(codes, 0, 65535).astype(np.uint16)
 
 
-def _planes(frame: RawFrame, pattern: str) -> Sequence[Sequence[int]]:
+def _tile_planes(frame: RawFrame, pattern: str) -> Sequence[Sequence[int]]:
     """Return the packed plane of each site of the CFA tile."""
     if frame.xtrans is not None:
         return [[(0, 1, 3, 1)[colour] for colour in row] for row in frame.xtrans.tolist()]

@@ -116,11 +116,11 @@ def tags_of(content: bytes, check: bool = True) -> RawMetadata:
             pages = list(tiff_pages(file))
             raw = next((page for page in pages if page.tags.valueof(262) in (CFA, LINEAR)), pages[0])
             if check:
-                _check_image(raw, len(content))
+                _check_mosaic(raw, len(content))
             exif = pages[0].tags.valueof(34665)
-            tags = {tag.code: _numbers(tag) for page in (pages[0], raw) for tag in page.tags}
+            tags = {tag.code: _tag_values(tag) for page in (pages[0], raw) for tag in page.tags}
             text = pages[0].tags.valueof(50708) or pages[0].tags.valueof(272) or ""
-            return _facts(tags, exif if isinstance(exif, Mapping) else {}, str(text).strip("\0 "))
+            return _tag_facts(tags, exif if isinstance(exif, Mapping) else {}, str(text).strip("\0 "))
     except (tifffile.TiffFileError, ValueError, KeyError, IndexError, TypeError, ZeroDivisionError):
         return RawMetadata()
 
@@ -131,7 +131,7 @@ def tiff_pages(file: Any) -> Iterator[Any]:
         yield from (first, *(getattr(first, "pages", ()) or ()))
 
 
-def _check_image(page: Any, size: int) -> None:
+def _check_mosaic(page: Any, size: int) -> None:
     """Raise SourceError unless a page is a complete mosaic of integers."""
     ends = [start + count for start, count in zip(page.dataoffsets, page.databytecounts, strict=False)]
     if max(ends, default=0) > size:
@@ -150,7 +150,7 @@ def _require(library: str, path: Path, key: str) -> None:
     require(library, use, "calibrate", ", or convert the frames to NPY")
 
 
-def _facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model: str) -> RawMetadata:
+def _tag_facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model: str) -> RawMetadata:
     """Collect facts from the tags of TIFF and DNG by code, and from the tags of EXIF by name."""
     black, white = tags.get(50714, ()), tags.get(50717)
     names = ("ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed", "RecommendedExposureIndex")
@@ -173,12 +173,12 @@ def _facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model
         exposure_s=float(seconds) if seconds else None,
         model=model or None,
         noise_profile=tags.get(51041),
-        colour=_colour(tags) if 50721 in tags else None,
+        colour=_dng_colour(tags) if 50721 in tags else None,
         compression=int(tags[259][0]) if tags.get(259) else None,
     )
 
 
-def _colour(tags: Mapping[int, tuple[float, ...]]) -> DngColour:
+def _dng_colour(tags: Mapping[int, tuple[float, ...]]) -> DngColour:
     """Collect the colour tags of a DNG; ValueError if one has another number of values."""
     codes = [code for code in (50721, 50722) if code in tags]
     lights = (tags.get(code, (0.0,))[0] for code in (50778, 50779))
@@ -195,7 +195,7 @@ def _colour(tags: Mapping[int, tuple[float, ...]]) -> DngColour:
     )
 
 
-def _numbers(tag: Any) -> tuple[float, ...]:
+def _tag_values(tag: Any) -> tuple[float, ...]:
     """Return the values of a tag as numbers, rationals divided; none for text."""
     values = tuple(tag.value) if isinstance(tag.value, tuple | bytes) else (tag.value,)
     if not all(isinstance(value, int | float) for value in values):
