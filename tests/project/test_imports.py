@@ -31,8 +31,7 @@ ONLY_IN = {
     "numba": {"core.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "sources.mosaics", "simulation.reference.isp", "pipeline.worker"),
-        *("reports.dataset_page.page", "reports.sheets.contact_sheet", "reports.sheets.panels"),
-        *("reports.benchmark.complete_runs", "reports.explorer.views", "reports.sweep_page", "camera_noise"),
+        *("reports.encoding", "reports.explorer.views", "reports.sheets.panels", "camera_noise"),
     },
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},
