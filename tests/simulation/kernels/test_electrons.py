@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any, cast
 
 import pytest
 from helpers.cases import slow_except
@@ -17,6 +18,9 @@ from helpers.flats import (
 
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
+from unprocess_gen.simulation.kernels.electrons import Electrons
+from unprocess_gen.simulation.kernels.render import _render
+from unprocess_gen.simulation.pair import make_pair
 
 TWO_NUMBERS = {
     "imx385_iso1600": (), "imx385_iso3200": (), "imx385_iso25600": (), "brooks2019": (), "none": (),
@@ -53,6 +57,14 @@ def everything(settings: Settings) -> Plan:
     """Return a plan with every effect on, for images of any size."""
     group = ("noise=nikon_d850", "scene=long_exposure", "noise.iso=1600")
     return with_physics(planned(settings, picture(), *group, forced=True), frame_size=(4096, 4096))
+
+
+def test_correlated_rows_use_the_machine_code_of_other_noise(everything: Plan) -> None:
+    """A signature of its own takes three seconds to compile for each dtype of codes and frames."""
+    for correlation in (0.0, 0.5):
+        make_pair(picture(), with_physics(everything, row_correlation=correlation))
+    electrons = [noise for _, _, noise, *_ in cast(Any, _render).signatures if noise.instance_class is Electrons]
+    assert len({str(noise) for noise in electrons}) == 1
 
 
 # Each effect ----------------------------------------------------------------------------------------------------------

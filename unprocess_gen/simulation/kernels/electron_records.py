@@ -91,7 +91,7 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, 
         **(members | {"numbers": numbers}),
         columns_dn=columns_dn,
         base_dn=(first.black_dn + base_dn).astype(np.float32).reshape(len(frames), 2, columns),
-        rows_dn=np.zeros(1),
+        rows_dn=np.zeros((1, 1)),  # two dimensions as with correlated rows: the same machine code
         rows_step=0,
         fixed_columns_dn=_fixed_columns(first.fixed_columns, columns, origin[1]),
         sites_dn=NO_OFFSETS,
