@@ -164,12 +164,13 @@ def share_estimate(count: int, sites: int) -> Estimate:
 
 def _dead(results: Sequence[IsoResult], black_dn: float) -> tuple[Estimate | None, Estimate | None]:
     """Return share of dead pixels and their value relative to black, from the brightest flats."""
-    bright = [flat for result in results for flat in usable(result.flats) if flat.is_bright]
+    bright = [flat for result in results for flat in usable(result.flats) if flat.dead_dn is not None]
     if not bright:
         return None, None
     flat = max(bright, key=lambda flat: flat.signal_dn / math.sqrt(float(flat.measured.variance.mean())))
-    share = share_estimate(len(flat.dead_dn), 4 * flat.measured.sites)
-    if not len(flat.dead_dn) or not black_dn:
+    dead_dn, sites = np.asarray(flat.dead_dn), 4 * flat.measured.sites
+    share = share_estimate(len(dead_dn), sites)
+    if not len(dead_dn) or not black_dn:
         return share, None
-    level = flat.dead_dn / black_dn
+    level = dead_dn / black_dn
     return share, estimate(min(float(np.median(level)), 1.0), float(level.std()) / math.sqrt(len(level)), 0.0)

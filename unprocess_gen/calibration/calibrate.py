@@ -23,7 +23,6 @@ from unprocess_gen.calibration.profile import (
     measured_yaml,
     unknown_numbers,
 )
-from unprocess_gen.calibration.stated_noise import TAG_PRECISION, StatedNoise, stated_estimates, stated_yaml
 from unprocess_gen.config.limits import NAME
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
@@ -92,15 +91,11 @@ def _merged(notes: Iterable[str]) -> list[str]:
 
 def write_profile(calibration: Calibration, to: Path, two_parameter: bool = False) -> None:
     """Write the profile and, with the suffix .json, the list of all estimates."""
-    _write(to, measured_yaml(calibration, to.stem, two_parameter), estimates_json(estimates(calibration)))
+    write_files(to, measured_yaml(calibration, to.stem, two_parameter), estimates_json(estimates(calibration)))
 
 
-def write_stated_profile(stated: StatedNoise, to: Path) -> None:
-    """Write the profile of NoiseProfile tags and, with the suffix .json, the list of all estimates."""
-    _write(to, stated_yaml(stated, to.stem), estimates_json(stated_estimates(stated), TAG_PRECISION.digits))
-
-
-def _write(to: Path, profile: str, listed: str) -> None:
+def write_files(to: Path, profile: str, listed: str) -> None:
+    """Write the text of a profile, and of a list of estimates next to it."""
     for path, text in {to: profile, to.with_suffix(".json"): listed}.items():
         with machine_errors(path):
             path.write_text(text, encoding="utf-8")

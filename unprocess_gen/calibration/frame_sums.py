@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float
-from unprocess_gen.statistics.mosaics import TILE, neighbour_products
+from unprocess_gen.statistics.mosaics import TILE, neighbour_products, planes_of
 from unprocess_gen.statistics.scores import Score
 
 WINDOW = 11
@@ -106,7 +106,7 @@ class FrameSums:
 
     def add(self, pixels: NDArray[np.uint16]) -> None:
         """Add a frame, uint16 [H, W]."""
-        planes = [pixels[y::2, x::2] for y, x in TILE]
+        planes = planes_of(pixels)
         self._codes += [np.bincount(plane.reshape(-1), minlength=2**16) for plane in planes]
         self._variances.append(float(np.mean(np.diff(pixels[::4, ::2].astype(np.float32), axis=1) ** 2)) / 2)
         self._rows.append([plane.mean(axis=1) for plane in planes])
@@ -132,7 +132,8 @@ class FrameSums:
         own_rows, own_columns = rows - means[..., None], columns - means[..., None]
         mean_frame = self.mean_frame()
         variances = (self._squares - self._sum.astype(np.float64) ** 2 / count) / (count - 1)
-        planes = [_plane(mean_frame[y::2, x::2], variances[y::2, x::2], count) for y, x in TILE]
+        both = zip(planes_of(mean_frame), planes_of(variances), strict=True)
+        planes = [_plane(mean, own, count) for mean, own in both]
         mean_dn, total, total_error, patterns, good = (np.array(values) for values in zip(*planes, strict=True))
         row_variance = rows.var(axis=0, ddof=1).mean(axis=1)
         variance = (total - row_variance) * width / (width - 1)

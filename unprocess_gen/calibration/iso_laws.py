@@ -91,17 +91,18 @@ def std_law(isos: Sequence[float], stds: Sequence[Estimate], precision: Precisio
         if coefficients is not None:
             filled = dict(zip(powers, coefficients, strict=True))
             return ["root", *(rounded(filled.get(power, 0.0), digits) for power in range(max(powers) + 1))]
-    least = 1e-3 * max(values)
-    pairs = ((iso, rounded(value or least, digits)) for iso, value in zip(isos, values, strict=True))
-    return ["by_iso", *itertools.chain(*pairs)]
+    return _table(isos, [rounded(value or 1e-3 * max(values), digits) for value in values])
 
 
 def shape_law(isos: Sequence[float], shapes: Sequence[float]) -> Any:
     """Return shapes as a number or as a table ``by_iso``."""
     if len(isos) == 1:
         return round(shapes[0], 4)
-    pairs = ((iso, round(shape, 4)) for iso, shape in zip(isos, shapes, strict=True))
-    return ["by_iso", *itertools.chain(*pairs)]
+    return _table(isos, [round(shape, 4) for shape in shapes])
+
+
+def _table(isos: Sequence[float], values: Sequence[float]) -> list[Any]:
+    return ["by_iso", *itertools.chain(*zip(isos, values, strict=True))]
 
 
 def black_law(isos: Sequence[float], blacks: Sequence[Sequence[float]], by_colour: bool) -> Any:

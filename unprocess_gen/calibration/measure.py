@@ -15,7 +15,7 @@ from unprocess_gen.calibration.gain import Estimate, Transfer, combined, emva_ga
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fit_shape, histograms, joined_histogram
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
-from unprocess_gen.statistics.mosaics import TILE
+from unprocess_gen.statistics.mosaics import planes_of
 
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""
@@ -55,19 +55,18 @@ class Dark:
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """Flats of one level: frames, noise, number of the darks of the nearest exposure, and values of dead pixels, DN.
+    """Flats of one level: frames, noise, the darks of the nearest exposure, and True if values reach white.
 
     ``signals_dn`` are the means of the planes minus the means of the darks; light is rarely neutral in raw values.
-    ``is_bright`` if it shows dead pixels, ``is_full`` if values reach white.
+    ``dead_dn`` are the values of dead pixels; None if the light is too weak to show them.
     """
 
     frames: list[Capture]
     measured: Measured
-    dark: int
-    dead_dn: Float
-    is_bright: bool
+    dark: Dark
     is_full: bool
     signals_dn: Float
+    dead_dn: Float | None
 
     @property
     def signal_dn(self) -> float:
@@ -115,8 +114,8 @@ def measure_iso(
     if known is None:
         _check_levels(iso, flats, sensor, quick)
     shapes, histogram = _shapes(dark, watch)
-    checks.check_dark_noise(dark.frames, sensor, _rounded_std(dark.measured, shapes[0]))
-    curves = [_curve(plane, darks, usable(flats), shapes[0]) for plane in range(4)] if flats else []
+    checks.check_dark_noise(dark.frames, sensor, math.sqrt(float(_variances(dark.measured, shapes[0]).mean())))
+    curves = _curves(usable(flats), shapes[0]) if flats else []
     gains, has_colours = ([known], False) if known else fit_gain(curves, sensor.span_dn)
     numbers = {"dn_per_e": gains}
     if curves:
@@ -132,8 +131,8 @@ def measure_iso(
         flats=flats,
         shapes=shapes,
         histogram=histogram,
-        prnu_squares=_prnu_squares(usable(flats), darks, watch) if flats else [],
-        full_well_dn=_full_well(flats, sensor, gains, has_colours) if flats else None,
+        prnu_squares=_prnu_squares(usable(flats), watch) if flats else [],
+        full_well_dn=_full_well(flats, sensor, gains, has_colours),
         notes=notes,
     )
 
@@ -151,7 +150,7 @@ def _darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> 
             notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
             continue
         checks.check_dark(frames, captures.sensor, measured, notes)
-        patterns = [high_passed(plane) for plane in _planes(sums.mean_frame())]
+        patterns = [high_passed(plane) for plane in planes_of(sums.mean_frame())]
         threshold = FAR * max(*(robust_std(pattern)[1] for pattern in patterns), 0.05)
         hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
         darks.append(Dark(frames, measured, hot / SMOOTH, threshold / SMOOTH))
@@ -188,10 +187,6 @@ def _summed(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSum
     return sums
 
 
-def _planes(mosaic: Float) -> list[Float]:
-    return [mosaic[y::2, x::2] for y, x in TILE]
-
-
 def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch, notes: list[str]) -> list[Flat]:
     """Measure the levels that are not saturated, in ascending order."""
     sensor, flats = captures.sensor, []
@@ -199,20 +194,18 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
         sums = _summed(frames, sensor, watch)
         measured = sums.measure()
         seconds = frames[0].exposure_s or 0.0
-        nearest = min(range(len(darks)), key=lambda number: abs(darks[number].exposure_s - seconds))
-        dark = darks[nearest].measured
-        signals = measured.mean_dn - dark.mean_dn
-        full_share = float(measured.codes[:, int(sensor.white_dn) :].sum() / measured.codes.sum())
+        dark = min(darks, key=lambda dark: abs(dark.exposure_s - seconds))
+        signals = measured.mean_dn - dark.measured.mean_dn
+        full_share, dead = float(measured.codes[:, int(sensor.white_dn) :].sum() / measured.codes.sum()), None
         if full_share > FULL_SHARE:
             notes.append(f"{checks.place(frames)}: {full_share:.2%} of the values are at white; left out of fits")
         else:
-            checks.check_flat(frames, sensor, measured, dark, notes)
-        dead, is_bright = np.zeros(0), DEAD_SIGNAL * sensor.span_dn < signals.min()
-        if is_bright:
-            limits = dark.mean_dn + DEAD_RESPONSE * signals
-            planes = zip(_planes(sums.mean_frame()), limits, strict=True)
+            checks.check_flat(frames, sensor, measured, dark.measured, notes)
+        if signals.min() > DEAD_SIGNAL * sensor.span_dn:
+            limits = dark.measured.mean_dn + DEAD_RESPONSE * signals
+            planes = zip(planes_of(sums.mean_frame()), limits, strict=True)
             dead = np.concatenate([plane[plane < limit] for plane, limit in planes])
-        flats.append(Flat(frames, measured, nearest, dead, is_bright, full_share > FULL_SHARE, signals))
+        flats.append(Flat(frames, measured, dark, full_share > FULL_SHARE, signals, dead))
     return sorted(flats, key=lambda flat: flat.signal_dn)
 
 
@@ -247,35 +240,26 @@ def _shapes(dark: Dark, watch: Watch) -> tuple[list[ReadShape], Histogram]:
     return [first, *(fit_shape(histogram, first) for histogram in counts)], together
 
 
-def _rounded_std(measured: Measured, shape: ReadShape) -> float:
-    """Return the noise of darks without the noise of rounding."""
-    variance = float(measured.variance.mean()) - ROUNDING_DN2
-    return math.sqrt(variance) if variance > ROUNDED_STD_DN**2 else shape.std_dn
+def _variances(measured: Measured, shape: ReadShape) -> Float:
+    """Return the variance of a site without rounding, from the fitted distribution where rounding distorts it."""
+    variances = measured.variance - ROUNDING_DN2
+    return np.where(variances > ROUNDED_STD_DN**2, variances, shape.std_dn**2)
 
 
-def _variance(measured: Measured, plane: int, shape: ReadShape) -> float:
-    """Return the variance of a site, rounding included; from the fitted distribution where rounding distorts it."""
-    variance = float(measured.variance[plane])
-    return variance if variance - ROUNDING_DN2 > ROUNDED_STD_DN**2 else shape.std_dn**2 + ROUNDING_DN2
-
-
-def _curve(plane: int, darks: Sequence[Dark], flats: Sequence[Flat], shape: ReadShape) -> Transfer:
-    """Return the photon transfer curve of a plane."""
-    pairs = [(flat.measured, darks[flat.dark].measured) for flat in flats]
-    return Transfer(
-        signal=np.array([flat.mean_dn[plane] - dark.mean_dn[plane] for flat, dark in pairs]),
-        variance=np.array([flat.variance[plane] - _variance(dark, plane, shape) for flat, dark in pairs]),
-        error=np.array([flat.error[plane] for flat, _ in pairs]),
-        dark_error=np.array([dark.error[plane] for _, dark in pairs]),
-        dark=np.array([flat.dark for flat in flats]),
-    )
+def _curves(flats: Sequence[Flat], shape: ReadShape) -> list[Transfer]:
+    """Return the photon transfer curve of each plane."""
+    variances = [flat.measured.variance - ROUNDING_DN2 - _variances(flat.dark.measured, shape) for flat in flats]
+    signals, errors = [flat.signals_dn for flat in flats], [flat.measured.error for flat in flats]
+    dark_errors, darks = [flat.dark.measured.error for flat in flats], np.array([id(flat.dark) for flat in flats])
+    by_plane = np.array([signals, variances, errors, dark_errors]).transpose(2, 0, 1)
+    return [Transfer(signal, variance, error, dark, darks) for signal, variance, error, dark in by_plane]
 
 
 def _dark_numbers(measured: Measured, sensor: Sensor, shapes: Sequence[ReadShape]) -> dict[str, list[Estimate]]:
     """Return the estimates that darks give."""
     columns, fixed_column = measured.column, measured.fixed_column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
-    variances = np.array([_variance(measured, plane, shapes[0]) - ROUNDING_DN2 - temporal for plane in range(4)])
+    variances = _variances(measured, shapes[0]) - temporal
     errors = np.hypot(measured.error, columns[1] if temporal else 0.0)
     row, (correlation, error) = root_estimate(*measured.row), measured.row_correlation
     dsnu = float((measured.fixed - max(fixed_column[0], 0.0)).mean())
@@ -323,7 +307,7 @@ def usable(flats: Sequence[Flat]) -> list[Flat]:
     return [flat for flat, is_below in zip(below, is_rising.all(axis=1), strict=True) if is_below]
 
 
-def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) -> list[tuple[float, float]]:
+def _prnu_squares(flats: Sequence[Flat], watch: Watch) -> list[tuple[float, float]]:
     """Return the square of the PRNU of each plane, and its standard error, from the mean of all frames of all levels.
 
     Frames have the weight signal/variance, which gives the mean of frame/signal the least noise. The variance of its
@@ -335,16 +319,16 @@ def _prnu_squares(flats: Sequence[Flat], darks: Sequence[Dark], watch: Watch) ->
     for flat, weight in zip(flats, weights, strict=True):
         for frame in watch(flat.frames):
             total = total + np.float32(weight) * frame.pixels()
+    dark = flats[-1].dark.measured
     scales = counts * weights @ [flat.signals_dn for flat in flats]
-    for plane, ((y, x), scale) in enumerate(zip(TILE, scales, strict=True)):
+    for plane, (sums, scale) in enumerate(zip(planes_of(total), scales, strict=True)):
         share = counts * np.square(weights) / scale**2
         rows = share @ [max(flat.measured.row[0], 0.0) for flat in flats] * (1 - 1 / WINDOW)
-        pattern = high_passed(total[y::2, x::2] / scale)
+        pattern = high_passed(sums / scale)
         distance, std = robust_std(pattern)
         pattern = pattern[distance <= FAR * std]
         noise = share @ [flat.measured.variance[plane] for flat in flats]
         dark_factor = float(counts @ weights / scale) ** 2
-        dark = darks[flats[-1].dark].measured
         square = (float(pattern.var()) - rows) / SMOOTH - noise - dark_factor * dark.fixed[plane]
         error = math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt((counts - 1).sum()))
         squares.append((square, math.hypot(error, dark_factor * dark.fixed_error[plane])))

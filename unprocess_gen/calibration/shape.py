@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.core.types import Float
-from unprocess_gen.statistics.mosaics import TILE
+from unprocess_gen.statistics.mosaics import planes_of
 from unprocess_gen.statistics.scores import NORMAL_95
 
 NORMAL_SHAPE = 0.1349
@@ -74,7 +74,7 @@ def histograms(frames: Iterable[NDArray[np.uint16]], columns: Float, std_dn: flo
     width, half = std_dn / PARTS, PARTS * REACH
     counts = np.zeros((4, 2 * half + 1))
     for pixels in frames:
-        planes = np.stack([pixels[y::2, x::2] for y, x in TILE]).astype(np.float32)
+        planes = np.stack(planes_of(pixels)).astype(np.float32)
         rows = planes.mean(axis=2, keepdims=True, dtype=np.float64)
         levels = rows.mean(axis=1, keepdims=True)
         # planes of a row share its offset

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from unprocess_gen.calibration.captures import Sensor, common, joined_sha256
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.iso_laws import Precision, gain_law, joined_branches, rounded, std_law
-from unprocess_gen.calibration.profile import MARK, NamedNumber, profile_head, profile_yaml, provenance
+from unprocess_gen.calibration.profile import MARK, NamedNumber, estimates_json, profile_head, profile_yaml, provenance
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
@@ -168,15 +168,15 @@ def _spreads(isos: Sequence[StatedIso]) -> dict[str, float]:
     }
 
 
-def stated_estimates(stated: StatedNoise) -> list[NamedNumber]:
-    """Return the list of estimates; the tags state no intervals."""
+def stated_json(stated: StatedNoise) -> str:
+    """Return the list of estimates as JSON; the tags state no intervals."""
     named = []
     for iso, a, b, _ in stated.isos:
         for site, plane in ((None, 1), ("R", 0), ("Gr", 1), ("Gb", 1), ("B", 2)):
             named += [NamedNumber("dn_per_e", iso, site, unknown(a[plane]))]
             named += [NamedNumber("b_dn2", iso, site, unknown(b[plane]))]
         named.append(NamedNumber("read_std_dn", iso, None, unknown(math.sqrt(b[1]))))
-    return named
+    return estimates_json(named, TAG_PRECISION.digits)
 
 
 def stated_yaml(stated: StatedNoise, name: str) -> str:

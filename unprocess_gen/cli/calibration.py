@@ -45,12 +45,12 @@ def calibrate(call: Call) -> int:
 
 def _stated(folder: Path, to: Path) -> int:
     """Write the profile that NoiseProfile tags state."""
-    from unprocess_gen.calibration.calibrate import write_stated_profile
-    from unprocess_gen.calibration.stated_noise import read_stated_noise
+    from unprocess_gen.calibration.calibrate import write_files
+    from unprocess_gen.calibration.stated_noise import read_stated_noise, stated_json, stated_yaml
 
     stated = read_stated_noise(folder)
     _report_notes(stated.notes)
-    write_stated_profile(stated, to)
+    write_files(to, stated_yaml(stated, to.stem), stated_json(stated))
     for iso, a, b, *_ in stated.isos:
         print_result(f"ISO {iso:g}: a {short_number(a[1], 4)} DN, b {short_number(b[1], 4)} DN² (stated)")
     _report_profile(to, [result.iso for result in stated.isos])

@@ -30,6 +30,11 @@ def plane_names(pattern: str) -> list[str]:
     return [colour if colour != "G" else "Gr" if "R" in row else "Gb" for row in rows for colour in row]
 
 
+def planes_of(mosaic: Any) -> list[Any]:
+    """Return the planes of a mosaic of even sides, as views."""
+    return [mosaic[y::2, x::2] for y, x in TILE]
+
+
 def neighbour_products(z: Any) -> dict[str, list[float]]:
     """Return the sums of the products of z at pairs of sites, for each distance of `NEIGHBOURS`.
 
