@@ -129,7 +129,12 @@ class Camera:
     @property
     def truth(self) -> dict[str, Any]:
         """Return the numbers of the row of a dark of one second."""
-        return dict(self.pair(0, 1.0, 0).row)
+        return dark_row(self)
+
+
+@functools.cache
+def dark_row(camera: Camera) -> dict[str, Any]:
+    return dict(camera.pair(0, 1.0, 0).row)
 
 
 def frames(

@@ -132,7 +132,7 @@ def _hot(results: Sequence[IsoResult], sensor: Sensor, full_well_e: float) -> tu
     The currents are exponentially distributed (the profile's law), so those above a threshold have the mean of all plus
     the threshold. Full pixels are censored: they add to the sum of the currents, but not to their number.
     """
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
     measured = list[tuple[int, float, int, float]]()
     for result in results:
@@ -150,16 +150,16 @@ def _hot(results: Sequence[IsoResult], sensor: Sensor, full_well_e: float) -> tu
     share = share_estimate(count, 4 * results[0].dark.measured.sites)
     if not known:
         return share, None
-    mean, ends = total / known, 2 * total / chi2.ppf((0.975, 0.025), 2 * known)
+    mean, ends = total / known, total / gammaincinv(known, (0.975, 0.025))
     return share.scaled(math.exp(min(least / mean, 1.0))), Estimate(mean, *map(float, ends))
 
 
 def share_estimate(count: int, sites: int) -> Estimate:
     """Return the share of rare pixels with its exact Poisson interval."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
-    low = chi2.ppf(0.025, 2 * count) / 2 if count else 0.0
-    return Estimate(count / sites, float(low) / sites, float(chi2.ppf(0.975, 2 * count + 2)) / 2 / sites)
+    low = float(gammaincinv(count, 0.025)) if count else 0.0
+    return Estimate(count / sites, low / sites, float(gammaincinv(count + 1, 0.975)) / sites)
 
 
 def _dead(results: Sequence[IsoResult], black_dn: float) -> tuple[Estimate | None, Estimate | None]:

@@ -110,19 +110,19 @@ def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape
     """Fit a normal distribution and Tukey's lambda to a histogram."""
     from scipy.optimize import minimize, minimize_scalar
 
-    counts, values = histogram.counts, histogram.centres
-    is_end = np.abs(values) == values[-1]
+    used, end = histogram.counts > 0, histogram.centres[-1:]
+    counts, values = histogram.counts[used], histogram.centres[used]
 
-    def likelihoods(log_std: float, shape: float | None = None) -> Float:
-        std = math.exp(log_std)
-        tail = cumulative(std, shape)(values[:1])
-        return np.maximum(np.where(is_end, tail, probabilities(values, std, shape)), FLOOR)
+    def likelihoods(values: Float, log_std: float, shape: float | None = None) -> Float:
+        below = cumulative(math.exp(log_std), shape)
+        inner = below(values + 0.5) - below(values - 0.5)
+        return np.maximum(np.where(np.abs(values) == end, below(-end), inner), FLOOR)
 
     def surprise(log_std: float, shape: float | None = None) -> float:
         """Return the negative logarithm of the likelihood."""
         if shape is not None and not LEAST_SHAPE < shape < LARGEST_SHAPE:
             return math.inf
-        return -float(counts @ np.log(likelihoods(log_std, shape)))
+        return -float(counts @ np.log(likelihoods(values, log_std, shape)))
 
     first = math.log(math.sqrt(float(counts @ values**2 / counts.sum())))
     normal = minimize_scalar(surprise, bounds=(first - 1, first + 1), method="bounded", options={"xatol": 1e-6})
@@ -137,17 +137,23 @@ def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape
         for begin in starts
     ]
     best = min(results, key=lambda result: float(result.fun))
-    # Fisher's information of both numbers
-    steps, expected = np.diag(STEPS), counts.sum() * np.where(is_end, 1.0, histogram.width) * likelihoods(*best.x)
-    slopes = [(likelihoods(*(best.x + step)) - likelihoods(*(best.x - step))) / 2 / step.sum() for step in steps]
-    relative = np.stack(slopes) / likelihoods(*best.x)
-    error = math.sqrt(np.linalg.inv(relative * expected @ relative.T)[1, 1])
+    error = _error_of_shape(best.x, lambda numbers: likelihoods(histogram.centres, *numbers), histogram)
     pull = float(best.x[1] - NORMAL_SHAPE) / histogram.sites
     systematic = abs(pull) * (1 if pull < 0 else 4) + _rounding_error(math.exp(best.x[0]), best.x[1])
     shape, half = float(best.x[1]) + ROW_FACTOR * pull, math.hypot(NORMAL_95 * error, systematic)
     normal_std, tukey_std_dn = np.exp([normal.x, best.x[0]]) * math.sqrt(histogram.sites / (histogram.sites - 1))
     interval = Estimate(shape, shape - half, shape + half)
     return ReadShape(float(normal_std), float(tukey_std_dn), interval, bool(best.fun < normal.fun - EVIDENCE))
+
+
+def _error_of_shape(best: Float, likelihoods: Callable[[Float], Float], histogram: Histogram) -> float:
+    """Return the standard error of λ, from Fisher's information of both numbers."""
+    expected, total = likelihoods(best), histogram.counts.sum()
+    slopes = [(likelihoods(best + step) - likelihoods(best - step)) / 2 / step.sum() for step in np.diag(STEPS)]
+    weights = np.full(len(expected), histogram.width)
+    weights[[0, -1]] = 1.0  # these have all values beyond
+    relative = np.stack(slopes) / expected
+    return math.sqrt(np.linalg.inv(relative * weights * expected * total @ relative.T)[1, 1])
 
 
 def _rounding_error(std: float, shape: float) -> float:
