@@ -43,24 +43,24 @@ def test_help_and_version_import_nothing_slow() -> None:
 
 
 KEEPING = """
-import resource, sys
+import resource
 import numpy as np
 from unprocess_gen.pipeline.worker import keep_memory
-if sys.argv[1] == "keep":
-    keep_memory()
-faults = [resource.getrusage(resource.RUSAGE_SELF).ru_minflt]
-for _ in range(9):
-    array = np.ones(40_000_000, dtype=np.uint8)
-    del array
-    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
-print(faults[-1] - faults[1])
+def faults():
+    counts = []
+    for _ in range(9):
+        array = np.ones(40_000_000, dtype=np.uint8)
+        del array
+        counts.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+    return counts[-1] - counts[0]
+given_back = faults()
+keep_memory()
+print(given_back, faults())
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
 def test_worker_reuses_memory_of_the_previous_image() -> None:
-    def faults(how: str) -> int:
-        command = [sys.executable, "-c", KEEPING, how]
-        return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-
-    assert faults("keep") < 40 <= faults("give back") / 4
+    done = subprocess.run([sys.executable, "-c", KEEPING], capture_output=True, text=True, check=True)
+    given_back, kept = map(int, done.stdout.split())
+    assert kept < 40 <= given_back / 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 from unprocess_gen.config.option_files import conf_dir
@@ -12,7 +13,7 @@ from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 def default_options() -> dict[str, str | None]:
     """Return the default option of each group that has option files; None if that is no option."""
-    entries = read_yaml_mapping(conf_dir() / "config.yaml")["defaults"]
+    entries = _read("config")["defaults"]
     chosen = {group: option for entry in entries if isinstance(entry, dict) for group, option in entry.items()}
     return {group: option for group, option in chosen.items() if group in GROUPS}
 
@@ -29,8 +30,14 @@ def default_values(group: str) -> dict[str, Any]:
 
 def _written(group: str) -> dict[str, Any]:
     """Read what the primary config and the default option of a group set."""
-    written: dict[str, Any] = read_yaml_mapping(conf_dir() / "config.yaml")
+    written = _read("config")
     option = default_options().get(group)
     if group:
         written = written.get(group, {})
-    return written if option is None else read_yaml_mapping(conf_dir() / group / f"{option}.yaml") | written
+    return written if option is None else _read(f"{group}/{option}") | written
+
+
+@cache
+def _read(option: str) -> dict[str, Any]:
+    """Read a file of ``conf/`` once; callers leave the mapping as it is."""
+    return read_yaml_mapping(conf_dir() / f"{option}.yaml")

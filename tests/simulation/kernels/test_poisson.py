@@ -262,9 +262,10 @@ CELLS = 64
 """Cells of √rate below rate 16 in which counts are tested."""
 
 
-@pytest.mark.parametrize(
-    "rate_error", slow_except((-0.8 * FLOAT32_RATE, 0.8 * FLOAT32_RATE), (-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE))
-)
+RATE_ERRORS = slow_except((-0.8 * FLOAT32_RATE, 0.8 * FLOAT32_RATE), (-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE))
+
+
+@pytest.mark.parametrize("rate_error", RATE_ERRORS)
 @pytest.mark.parametrize(
     ("inside", "dense"),
     [
@@ -282,9 +283,13 @@ def test_counts_of_low_rates_are_within_their_bounds(inside: tuple[float, ...], 
     assert found == {}
 
 
-@pytest.mark.parametrize("rate_error", [-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE])
+@pytest.mark.parametrize("rate_error", RATE_ERRORS)
 @pytest.mark.parametrize(
-    "rate", [5.0, 5.1, 6.3, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21]
+    "rate",
+    slow_except(
+        (5.0, 8.1, 25.0, 64.0, 1234.5, 2.0**21),
+        (5.0, 5.1, 6.3, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21),
+    ),
 )
 def test_counts_by_expansion_are_within_their_bounds(rate: float, rate_error: float) -> None:
     assert wrong(rate, 20_000, rate_error) == 0

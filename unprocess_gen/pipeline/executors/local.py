@@ -29,11 +29,13 @@ from unprocess_gen.pipeline.worker import commit_provisional, make_and_commit
 
 def effective_jobs(n_jobs: int, tasks: int) -> int:
     """Number of workers to start: -1 means all cores that this process may use, and there are no more than tasks."""
+    if tasks <= 1:
+        return 1  # without joblib, whose import takes 0.15 s
     if n_jobs == -1:
         from joblib import cpu_count
 
         n_jobs = cpu_count()
-    return max(1, min(n_jobs, tasks))
+    return min(n_jobs, tasks)
 
 
 def own_cores() -> int:
