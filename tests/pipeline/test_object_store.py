@@ -27,7 +27,7 @@ from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
-from unprocess_gen.core.object_store import PREFIX, ObjectPath
+from unprocess_gen.core.object_store import TEMPORARY_PREFIX, ObjectPath
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.shards import ShardWriter
 from unprocess_gen.pipeline import workspace as workspaces
@@ -140,7 +140,7 @@ def test_killed_run_ends_as_if_undisturbed(
     with running(*arguments, "n_jobs=1", cwd=tmp_path) as process:
         assert process.wait() == 0, process.communicate()
     assert_same(out, undisturbed)
-    assert not list(scratch.glob(f"{PREFIX}*"))
+    assert not list(scratch.glob(f"{TEMPORARY_PREFIX}*"))
 
 
 def test_committed_shards_are_not_made_twice(
@@ -361,4 +361,4 @@ def test_signal_ends_a_run_without_leftovers(
         wait_for(lambda: any("shard-00001.tar" in path for _, path in proxy.requests))
         process.send_signal(signal.SIGTERM)
         assert process.wait() == 143
-    assert not list(scratch.glob(f"{PREFIX}*"))
+    assert not list(scratch.glob(f"{TEMPORARY_PREFIX}*"))
