@@ -30,6 +30,7 @@ class Numbers:
     row_std_dn: float = 1.2
     black_error_dn: float = 0.5
     prnu_std: float = 0.0
+    dsnu_std_dn: float = 0.0
     dark_e_per_s: float = 0.0
     hot_share: float = 0.0
     hot_e_per_s: float = 0.0
@@ -65,6 +66,7 @@ def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequ
     pattern = 1 + rng.normal(0, numbers.prnu_std, (side, side))
     defects = np.random.default_rng([seed, 1])
     hot = (defects.random((side, side)) < numbers.hot_share) * defects.exponential(numbers.hot_e_per_s, (side, side))
+    offsets = defects.normal(0, numbers.dsnu_std_dn, (side, side))
     gains, colours = (np.tile([rgb[:2], rgb[1:]], (side // 2, side // 2)) for rgb in (numbers.gains, numbers.light))
     gains = gains * numbers.dn_per_e
     for place, shot in enumerate(shots):
@@ -73,7 +75,7 @@ def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequ
         light = shot.light * (WHITE - BLACK) / numbers.dn_per_e * pattern * colours
         electrons = np.minimum(rng.poisson(light + dark + hot * seconds), numbers.full_well_e) - dark
         rows = rng.normal(0, numbers.row_std_dn, (side, 1))
-        noise = rng.normal(BLACK + numbers.black_error_dn, numbers.read_std_dn, (side, side)) + rows
+        noise = rng.normal(BLACK + numbers.black_error_dn, numbers.read_std_dn, (side, side)) + rows + offsets
         np.save(folder / f"{place}.npy", np.clip(np.rint(electrons * gains + noise), 0, WHITE).astype(np.uint16))
         kind = f"flat,800,{shot.seconds},{shot.light:.2f}" if shot.light else f"dark,800,{shot.seconds},"
         lines.append(f"{place}.npy,{kind},{shot.celsius}")

@@ -18,6 +18,8 @@ from unprocess_gen.core.types import Float
 from unprocess_gen.statistics.mosaics import TILE, neighbour_products, planes_of
 from unprocess_gen.statistics.scores import Score
 
+ROUNDING_DN2 = 1 / 12
+"""Variance of the rounding of values whose noise is not weak."""
 WINDOW = 11
 """Side of the squares of sites of a plane whose mean is subtracted before fixed patterns are measured."""
 SMOOTH = 1 - 1 / WINDOW**2
@@ -93,6 +95,11 @@ class Measured:
         """Sites of a plane."""
         return self.shape[0] * self.shape[1]
 
+    @property
+    def dsnu(self) -> Float:
+        """Variance of the fixed pattern of the sites of each plane, without that of columns."""
+        return np.asarray(self.fixed - max(self.fixed_column[0], 0.0))
+
 
 class FrameSums:
     """Sums over frames of equal light: of the values and of their squares, relative to the first frame."""
@@ -141,7 +148,8 @@ class FrameSums:
         row, correlation = _line_offsets(own_rows, 2, float(variance.mean()) / width / 2)
         column, _ = _line_offsets(own_columns, 1, per_column / 2)
         temporal = (variance * SMOOTH + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
-        offsets = own_columns.mean(axis=0)
+        offsets, fixed = own_columns.mean(axis=0), (patterns - temporal) / SMOOTH
+        still = per_column / count + max(float(fixed.mean()), 0.0) / height
         return Measured(
             count=count,
             shape=(height, width),
@@ -153,10 +161,10 @@ class FrameSums:
             total=total - means.var(axis=0, ddof=1),
             row=row,
             column=column,
-            fixed_column=_fixed_offsets(offsets, per_column / count, max(column[0], 0.0) / count),
+            fixed_column=_fixed_offsets(offsets, still, max(column[0], 0.0) / count),
             row_correlation=correlation,
-            fixed=(patterns - temporal) / SMOOTH,
-            fixed_error=np.sqrt(2 / good) * patterns + total_error / count,
+            fixed=fixed,
+            fixed_error=np.sqrt(2 / good) * patterns + total_error / count + _ripple(variance, fixed),
             codes=self._codes,
             correlation=_correlation(self._pair),
             shading=_block_means(mean_frame),
@@ -195,6 +203,12 @@ def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, flo
     sites, own = float(is_good.sum()), inner[is_good]
     error = float(own.std()) / math.sqrt(sites)
     return float(mean[edge:-edge, edge:-edge][is_good].mean()), float(own.mean()), error, pattern[is_good].var(), sites
+
+
+def _ripple(variance: Float, fixed: Float) -> Float:
+    """Return the largest error of the variance of a fixed pattern by the rounding of values, whose phase is unknown."""
+    pattern = np.maximum(fixed, 0.0)
+    return np.asarray(4 * pattern * np.exp(-2 * math.pi**2 * np.clip(variance + pattern - ROUNDING_DN2, 0, 9)))
 
 
 def _line_offsets(lines: Float, axis: int, noise: float) -> tuple[tuple[float, float], tuple[float, float]]:

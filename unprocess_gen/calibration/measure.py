@@ -10,7 +10,16 @@ import numpy as np
 
 from unprocess_gen.calibration import checks
 from unprocess_gen.calibration.captures import Capture, CaptureSet, Sensor
-from unprocess_gen.calibration.frame_sums import FAR, SMOOTH, WINDOW, FrameSums, Measured, high_passed, robust_std
+from unprocess_gen.calibration.frame_sums import (
+    FAR,
+    ROUNDING_DN2,
+    SMOOTH,
+    WINDOW,
+    FrameSums,
+    Measured,
+    high_passed,
+    robust_std,
+)
 from unprocess_gen.calibration.gain import Estimate, Transfer, combined, emva_gain, estimate, fit_gain, root_estimate
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fit_shape, histograms, joined_histogram
 from unprocess_gen.core.errors import ConfigError
@@ -20,7 +29,6 @@ from unprocess_gen.statistics.mosaics import planes_of
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""
 
-ROUNDING_DN2 = 1 / 12
 LEAST_FRAMES, LEAST_LEVELS = 2, 4
 DARKEST_LEVEL = 0.1
 """Largest signal of the darkest level, as a fraction of white."""
@@ -114,7 +122,8 @@ def measure_iso(
     if known is None:
         _check_levels(iso, flats, sensor, quick)
     shapes, histogram = _shapes(dark, watch)
-    checks.check_dark_noise(dark.frames, sensor, math.sqrt(float(_variances(dark.measured, shapes[0]).mean())))
+    spread = _variances(dark.measured, shapes[0])[0] + np.maximum(dark.measured.dsnu, 0.0)  # both are dither
+    checks.check_dark_noise(dark.frames, sensor, math.sqrt(float(spread.mean())))
     curves = _curves(usable(flats), shapes[0]) if flats else []
     gains, has_colours = ([known], False) if known else fit_gain(curves, sensor.span_dn)
     numbers = {"dn_per_e": gains}
@@ -233,24 +242,28 @@ def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor, quick: bool
 
 def _shapes(dark: Dark, watch: Watch) -> tuple[list[ReadShape], Histogram]:
     """Fit the distribution of the read noise of all planes, then of each plane."""
-    std = math.sqrt(float(dark.measured.variance.mean()))
-    counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.measured.column_offsets, std)
+    counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.measured)
     together = joined_histogram(counts)
     first = fit_shape(together)
     return [first, *(fit_shape(histogram, first) for histogram in counts)], together
 
 
-def _variances(measured: Measured, shape: ReadShape) -> Float:
-    """Return the variance of a site without rounding, from the fitted distribution where rounding distorts it."""
-    variances = measured.variance - ROUNDING_DN2
-    return np.where(variances > ROUNDED_STD_DN**2, variances, shape.std_dn**2)
+def _variances(measured: Measured, shape: ReadShape) -> tuple[Float, Float]:
+    """Return the variance of a site without rounding, and its error.
+
+    Where rounding distorts the variance, it follows from the fitted distribution and the fixed pattern.
+    """
+    variances, errors = measured.variance - ROUNDING_DN2, np.hypot(measured.error, measured.fixed_error)
+    is_weak = variances <= ROUNDED_STD_DN**2
+    return np.where(is_weak, shape.std_dn**2, variances), np.where(is_weak, errors, measured.error)
 
 
 def _curves(flats: Sequence[Flat], shape: ReadShape) -> list[Transfer]:
     """Return the photon transfer curve of each plane."""
-    variances = [flat.measured.variance - ROUNDING_DN2 - _variances(flat.dark.measured, shape) for flat in flats]
+    dark_variances, dark_errors = zip(*(_variances(flat.dark.measured, shape) for flat in flats), strict=True)
+    variances = np.array([flat.measured.variance - ROUNDING_DN2 for flat in flats]) - dark_variances
     signals, errors = [flat.signals_dn for flat in flats], [flat.measured.error for flat in flats]
-    dark_errors, darks = [flat.dark.measured.error for flat in flats], np.array([id(flat.dark) for flat in flats])
+    darks = np.array([id(flat.dark) for flat in flats])
     by_plane = np.array([signals, variances, errors, dark_errors]).transpose(2, 0, 1)
     return [Transfer(signal, variance, error, dark, darks) for signal, variance, error, dark in by_plane]
 
@@ -259,13 +272,12 @@ def _dark_numbers(measured: Measured, sensor: Sensor, shapes: Sequence[ReadShape
     """Return the estimates that darks give."""
     columns, fixed_column = measured.column, measured.fixed_column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
-    variances = _variances(measured, shapes[0]) - temporal
-    errors = np.hypot(measured.error, columns[1] if temporal else 0.0)
+    variances, errors = _variances(measured, shapes[0])
+    variances, errors = variances - temporal, np.hypot(errors, columns[1] if temporal else 0.0)
     row, (correlation, error) = root_estimate(*measured.row), measured.row_correlation
-    dsnu = float((measured.fixed - max(fixed_column[0], 0.0)).mean())
     return {
         "read_std_dn": [
-            root_estimate(float(variances.mean()), float(np.linalg.norm(measured.error)) / 4),
+            root_estimate(float(variances.mean()), float(np.linalg.norm(errors)) / 4),
             *map(root_estimate, variances.tolist(), errors.tolist()),
         ],
         "read_shape": [shape.interval for shape in shapes],
@@ -273,7 +285,7 @@ def _dark_numbers(measured: Measured, sensor: Sensor, shapes: Sequence[ReadShape
         "row_correlation": [estimate(correlation, error) if row.value else estimate(0.0, 1.0)],
         "column_std_dn": [root_estimate(*fixed_column)],
         "column_temporal_std_dn": [root_estimate(*columns)],
-        "dsnu_std_dn": [root_estimate(dsnu, float(np.linalg.norm(measured.fixed_error)) / 4)],
+        "dsnu_std_dn": [root_estimate(float(measured.dsnu.mean()), float(np.linalg.norm(measured.fixed_error)) / 4)],
         "black_error_dn": [
             estimate(float(mean) - sensor.black_dn, float(error))
             for mean, error in zip(_with_mean(measured.mean_dn), _black_errors(measured, variances), strict=True)

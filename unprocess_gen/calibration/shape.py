@@ -2,7 +2,8 @@
 
 The value of a site is rounded: P(r) = F((r + ½)/s) - F((r - ½)/s) for its difference r from μ, where F is a normal
 distribution or Tukey's lambda. μ is the mean of the site's row in its frame plus the offset of its column; neither
-widens the histogram of r.
+widens the histogram of r. The fixed pattern of sites does: F is that of the sum with a normal distribution of the
+pattern's standard deviation.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.calibration.frame_sums import Measured
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.core.types import Float
@@ -37,11 +39,12 @@ EVIDENCE = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """Counts of r in bins of a width (DN) around 0, and the number of sites whose mean is subtracted."""
+    """Counts of r in bins of a width (DN) around 0; sites whose mean is subtracted; deviation of the fixed pattern."""
 
     counts: Float
     width: float
     sites: int
+    pattern_dn: float
 
     @property
     def centres(self) -> Float:
@@ -69,9 +72,11 @@ class ReadShape:
         return self.tukey_std_dn if self.is_tukey else self.normal_std_dn
 
 
-def histograms(frames: Iterable[NDArray[np.uint16]], columns: Float, std_dn: float) -> list[Histogram]:
-    """Return the histogram of each plane; ``columns`` [4, W/2] are offsets, ``std_dn`` about the standard deviation."""
-    width, half = std_dn / PARTS, PARTS * REACH
+def histograms(frames: Iterable[NDArray[np.uint16]], measured: Measured) -> list[Histogram]:
+    """Return the histogram of each plane of the frames that were measured."""
+    columns, is_seen = measured.column_offsets, measured.dsnu > 2 * measured.fixed_error
+    patterns = np.where(is_seen, measured.dsnu, 0.0)
+    width, half = math.sqrt(float((measured.variance + patterns).mean())) / PARTS, PARTS * REACH
     counts = np.zeros((4, 2 * half + 1))
     for pixels in frames:
         planes = np.stack(planes_of(pixels)).astype(np.float32)
@@ -82,12 +87,14 @@ def histograms(frames: Iterable[NDArray[np.uint16]], columns: Float, std_dn: flo
         rest = planes - (levels + offsets + columns[:, None, :]).astype(np.float32)
         places = np.clip(np.rint(rest / np.float32(width)), -half, half).astype(np.int32) + half
         counts += [np.bincount(place.ravel(), minlength=2 * half + 1) for place in places]
-    return [Histogram(total, width, 2 * columns.shape[1]) for total in counts]
+    deviations = np.sqrt(patterns).tolist()
+    return [Histogram(own, width, 2 * columns.shape[1], std) for own, std in zip(counts, deviations, strict=True)]
 
 
 def joined_histogram(parts: Sequence[Histogram]) -> Histogram:
     """Return the histogram of all planes."""
-    return Histogram(np.sum([part.counts for part in parts], axis=0), parts[0].width, parts[0].sites)
+    pattern_dn = math.sqrt(sum(part.pattern_dn**2 for part in parts) / len(parts))
+    return Histogram(np.sum([part.counts for part in parts], axis=0), parts[0].width, parts[0].sites, pattern_dn)
 
 
 def cumulative(std: float, shape: float | None) -> Callable[[Float], Float]:
@@ -108,14 +115,17 @@ def probabilities(values: Float, std: float, shape: float | None) -> Float:
 
 def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape:
     """Fit a normal distribution and Tukey's lambda to a histogram."""
+    from scipy.ndimage import gaussian_filter1d
     from scipy.optimize import minimize, minimize_scalar
 
-    used, end = histogram.counts > 0, histogram.centres[-1:]
+    used, end = (histogram.counts > 0) | (histogram.pattern_dn > 0), histogram.centres[-1:]
     counts, values = histogram.counts[used], histogram.centres[used]
 
     def likelihoods(values: Float, log_std: float, shape: float | None = None) -> Float:
         below = cumulative(math.exp(log_std), shape)
         inner = below(values + 0.5) - below(values - 0.5)
+        if histogram.pattern_dn > 0:  # all bins are used
+            inner = gaussian_filter1d(inner, histogram.pattern_dn / histogram.width, mode="constant", truncate=REACH)
         return np.maximum(np.where(np.abs(values) == end, below(-end), inner), FLOOR)
 
     def surprise(log_std: float, shape: float | None = None) -> float:
@@ -124,7 +134,8 @@ def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape
             return math.inf
         return -float(counts @ np.log(likelihoods(values, log_std, shape)))
 
-    first = math.log(math.sqrt(float(counts @ values**2 / counts.sum())))
+    whole = float(counts @ values**2 / counts.sum())
+    first = math.log(max(whole - histogram.pattern_dn**2, whole / 64)) / 2
     normal = minimize_scalar(surprise, bounds=(first - 1, first + 1), method="bounded", options={"xatol": 1e-6})
     starts = [(math.log(start.tukey_std_dn), start.shape)] if start else [(normal.x, 0.1), (normal.x, -0.2)]
     results = [
