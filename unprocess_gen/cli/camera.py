@@ -17,8 +17,6 @@ def camera(call: Call) -> int:
     from unprocess_gen.sources.raw.options import camera_options, check_options
 
     assert call.path is not None
-    if call.words:
-        raise ConfigError(f"camera: {call.words[0]}: unexpected; expected one raw file")
     file = local_path(call.path, f"camera: {call.path} is in an object store; expected a local file")
     if not file.is_file():
         raise ConfigError(f"camera {file}: no such file; expected a raw file")

@@ -14,8 +14,7 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from unprocess_gen import __version__
@@ -40,11 +39,8 @@ def main() -> int:
         os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and for the workers
     arguments = sys.argv[1:]
     with checked_streams(), SIGNALS:
-        with _reported(arguments) as done:
-            done.code = run(arguments)
-        with _reported(arguments) as flushed:
-            sys.stdout.flush()
-        return flushed.code or done.code
+        code = _exit_code(lambda: run(arguments), arguments)
+        return _exit_code(sys.stdout.flush, arguments) or code
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -65,10 +61,10 @@ def run(arguments: Sequence[str]) -> int:
     with logging_to("quiet" in values, "verbose" in values, values.get("log_file")):
         LOGGER.debug("unprocess_gen %s, Python %s: %s", __version__, sys.version.split()[0], list(arguments))
         module, function = verb.run.split(".")
-        with _reported(arguments) as done:  # before the log file is closed
-            done.code = getattr(import_module(f"unprocess_gen.cli.{module}"), function)(call)
-        RESULTS.info("exit code %d", done.code)
-        return done.code
+        # errors are reported before the log file is closed
+        code = _exit_code(lambda: getattr(import_module(f"unprocess_gen.cli.{module}"), function)(call), arguments)
+        RESULTS.info("exit code %d", code)
+        return code
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:
@@ -121,33 +117,24 @@ def _refuse_late_verb(arguments: Sequence[str]) -> None:
         raise ConfigError(f"{verb}: the verb must be the first word: {shlex.join(['gen-dataset', verb, *others])}")
 
 
-class _Outcome:
-    """Exit code of a step."""
-
-    code = 0
-
-
-@contextmanager
-def _reported(arguments: Sequence[str]) -> Iterator[_Outcome]:
-    """Report what ends a step in one line, and provide the exit code. Bugs rise."""
-    outcome = _Outcome()
+def _exit_code(step: Callable[[], int | None], arguments: Sequence[str]) -> int:
+    """Run a step, report what ends it in one line, and return its exit code. Bugs rise."""
     try:
-        yield outcome
+        return step() or 0
     except BrokenPipeError:
-        outcome.code = BROKEN_PIPE
+        return BROKEN_PIPE
     except KeyboardInterrupt:
-        outcome.code = _report_signal(signal.SIGINT, arguments)
+        return _report_signal(signal.SIGINT, arguments)
     except TerminationSignal as error:
-        outcome.code = _report_signal(error.number, arguments)
+        return _report_signal(error.number, arguments)
     except Exception as error:
         if SIGNALS.received is not None:  # OmegaConf and LLVM may fail in their own way when they are interrupted
-            outcome.code = _report_signal(SIGNALS.received, arguments)
-        elif isinstance(error, UnprocessGenError | PermissionError):
-            outcome.code = report_error(error)
-        else:
-            if LOGGER.handlers:
-                RESULTS.error("unexpected error", exc_info=error)
-            raise
+            return _report_signal(SIGNALS.received, arguments)
+        if isinstance(error, UnprocessGenError | PermissionError):
+            return report_error(error)
+        if LOGGER.handlers:
+            RESULTS.error("unexpected error", exc_info=error)
+        raise
 
 
 def _report_signal(number: int, arguments: Sequence[str]) -> int:

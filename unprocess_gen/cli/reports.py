@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import compose
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from unprocess_gen.core.paths import AnyPath
     from unprocess_gen.core.roots import Root
     from unprocess_gen.reports.estimate import RunEstimate
-
-Option = TypeVar("Option")
 
 
 def plan(call: Call) -> int:

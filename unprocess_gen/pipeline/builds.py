@@ -10,7 +10,7 @@ from __future__ import annotations
 import posixpath
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from importlib.resources import files
 from pathlib import Path
 
 import msgspec
@@ -80,9 +80,7 @@ class Build:
         if not self.recipe.photographs:
             return None
         require("skimage", f"build {self.name}: the photographs need scikit-image", "photos")
-        spec = find_spec("skimage")
-        assert spec is not None and spec.origin is not None
-        folder = Path(spec.origin).parent / "data"
+        folder = Path(str(files("skimage") / "data"))
         for name, digest in {str(row["source"]): row["source_sha256"] for row in self.rows()}.items():
             actual = _digest_text(folder / name)
             if actual != digest:

@@ -7,6 +7,7 @@ chromaticity, order of the search), Adobe's DNG SDK 1.4 is followed. Only + − 
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -116,16 +117,15 @@ def temperature(white: XY) -> float:
     """
     scale = 1.5 - white[0] + 6.0 * white[1]
     u, v = 2.0 * white[0] / scale, 3.0 * white[1] / scale
-    last = 0.0
-    for number in range(1, len(_ISOTHERMS)):
-        mired, u0, v0, slope = _ISOTHERMS[number]
-        distance = ((v - v0) - slope * (u - u0)) / math.sqrt(1.0 + slope * slope)
-        if distance <= 0.0 or number == len(_ISOTHERMS) - 1:
-            below = -min(distance, 0.0)
-            share = 0.0 if number == 1 else below / (last + below)
-            return 1e6 / max(_ISOTHERMS[number - 1][0] * share + mired * (1 - share), 10.0)
-        last = distance
-    raise AssertionError("the last line returns")
+    distance = math.inf
+    for (lower, *_), (upper, u0, v0, slope) in itertools.pairwise(_ISOTHERMS):
+        ends = lower, upper
+        above, distance = distance, ((v - v0) - slope * (u - u0)) / math.sqrt(1.0 + slope * slope)
+        if distance <= 0.0:
+            break
+    below = -min(distance, 0.0)
+    share = below / (above + below)
+    return 1e6 / max(ends[0] * share + ends[1] * (1 - share), 10.0)
 
 
 def _chromaticity(xyz: Neutral) -> XY:
