@@ -258,7 +258,7 @@ def test_overview_without_photographs_shows_the_reason_and_the_frames(few: Path,
     without = contact_sheet.contact_sheet(few, ["00000000"], source=tmp_path)
 
     left, height = panels.STRIP_PX[1] + 2 * panels.MARGIN_PX, panels.STRIP_PX[0]
-    assert (without[:, :left] < panels.EMPTY - 100).any()  # text of the reason
+    assert (without[:, :left] < panels.EMPTY_GREY - 100).any()  # text of the reason
     np.testing.assert_array_equal(without[-height:, left:], with_source[-height:, left:])
 
 

@@ -71,25 +71,29 @@ STANDARD = (
 """Flags of every verb."""
 
 
-def _hydra(names: tuple[str, ...], text: str, *choices: str, value: bool = False) -> Argument:
-    metavar = "{" + ",".join(choices) + "}" if choices else "VALUE" if value else ""
-    return Argument(names, text, metavar, completes="" if choices else "files", choices=choices)
+def choice(names: tuple[str, ...], text: str, *choices: str, required: bool = False) -> Argument:
+    """Return an argument whose value is one of some words."""
+    return Argument(names, text, f"{{{','.join(choices)}}}", required=required, choices=choices)
+
+
+def _hydra_value(names: tuple[str, ...], text: str) -> Argument:
+    return Argument(names, text, "VALUE", completes="files")
 
 
 INFORMATION = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 COMPLETION_TEXT = "Hydra's completion of settings; see gen-dataset completion"
 HYDRA_FLAGS = (
-    _hydra(("-m", "--multirun"), "sweep over comma-separated values"),
-    _hydra(("-c", "--cfg"), "print the settings and stop", "job", "hydra", "all"),
-    _hydra(("-cd", "--config-dir"), "add a folder of your own options", value=True),
-    _hydra(("-cn", "--config-name"), "use another primary config", value=True),
-    _hydra(("-cp", "--config-path"), "use another folder for the primary config", value=True),
-    _hydra(("-p", "--package"), "with --cfg: print only this part of the settings", value=True),
-    _hydra(("--resolve",), "with --cfg: resolve interpolations"),
-    _hydra(("-i", "--info"), "print information about Hydra and stop", *INFORMATION),
-    _hydra(("-r", "--run"), "run once; the default"),
-    _hydra(("-sc", "--shell-completion"), COMPLETION_TEXT, value=True),
-    _hydra(("--hydra-help",), "print Hydra's help and stop"),
+    Argument(("-m", "--multirun"), "sweep over comma-separated values"),
+    choice(("-c", "--cfg"), "print the settings and stop", "job", "hydra", "all"),
+    _hydra_value(("-cd", "--config-dir"), "add a folder of your own options"),
+    _hydra_value(("-cn", "--config-name"), "use another primary config"),
+    _hydra_value(("-cp", "--config-path"), "use another folder for the primary config"),
+    _hydra_value(("-p", "--package"), "with --cfg: print only this part of the settings"),
+    Argument(("--resolve",), "with --cfg: resolve interpolations"),
+    choice(("-i", "--info"), "print information about Hydra and stop", *INFORMATION),
+    Argument(("-r", "--run"), "run once; the default"),
+    _hydra_value(("-sc", "--shell-completion"), COMPLETION_TEXT),
+    Argument(("--hydra-help",), "print Hydra's help and stop"),
 )
 """Flags of Hydra, for the verbs that take settings."""
 

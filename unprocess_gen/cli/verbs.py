@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import date
 
-from unprocess_gen.cli.arguments import SOURCE, Argument, PlaceArgument, Verb
+from unprocess_gen.cli.arguments import SOURCE, Argument, PlaceArgument, Verb, choice
 
 
 def _integer(name: str, text: str, low: int | None = None, metavar: str = "N", *, required: bool = False) -> Argument:
@@ -37,10 +37,6 @@ def _file(flag: str, text: str, metavar: str = "FILE", *, required: bool = False
 
 def _folder(flag: str, text: str, metavar: str = "FOLDER", *, required: bool = False) -> Argument:
     return Argument((flag,), text, metavar, _local_path, "a local folder", "folders", required)
-
-
-def _enum(name: str, text: str, *choices: str, required: bool = False) -> Argument:
-    return Argument((name,), text, f"{{{','.join(choices)}}}", required=required, choices=choices)
 
 
 def _composing(name: str, summary: str, run: str, *arguments: Argument, resumes: bool = False) -> Verb:
@@ -203,7 +199,9 @@ _VERBS = (
         "reports.export",
         (
             _folder("--to", "write to FOLDER", required=True),
-            _enum("--format", "files of NumPy or TIFF, HDF5, or LMDB", "npy", "tiff", "hdf5", "lmdb", required=True),
+            choice(
+                ("--format",), "files of NumPy or TIFF, HDF5, or LMDB", "npy", "tiff", "hdf5", "lmdb", required=True
+            ),
         ),
         PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
         resumes=True,
@@ -217,8 +215,8 @@ _VERBS = (
             OUT,
             _integer("n_jobs", "number of worker processes; -1: all cores"),
             Argument(("executor",), "what runs the workers: local or dask", "NAME"),
-            _enum(
-                "output.frames",
+            choice(
+                ("output.frames",),
                 "false: only the manifest; true: also the frames of a manifest without frames",
                 "true",
                 "false",
@@ -248,8 +246,8 @@ _VERBS = (
         (
             _file("--to", "write the profile to FILE.yaml, and all estimates to FILE.json", required=True),
             _file("--report", "draw curves, histograms and maps in PAGE (HTML)", "PAGE"),
-            _enum(
-                "--from",
+            choice(
+                ("--from",),
                 "make the profile from NoiseProfile tags of DNG files, or from darks alone",
                 "noise_profile",
                 "darks",
