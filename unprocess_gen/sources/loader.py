@@ -49,15 +49,14 @@ def list_photographs(config: SourceConfig) -> Listing:
         names = (synthetic.clip_listing if config.clips else synthetic.listing)(config.limit)
         scenes = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
         return Listing(number_clips(None, scenes) if config.clips else scenes)
-    video = () if config.kind == "raw" else config.video
-    include = [*(config.include or ()), *(video if config.clips else ())]
+    if config.kind == "raw":
+        config = replace(config, video=())
+    include = [*(config.include or ()), *(config.video if config.clips else ())]
     if config.list is None:
-        listed = list_folder(place, include, config.recursive, config.limit, () if config.clips else video)
+        listed = list_folder(place, include, config.recursive, config.limit, () if config.clips else config.video)
     else:
         listed = list_file(place, config.list, config.limit)
     numbered = number_twins(place, listed.sources)
-    if config.kind == "raw":
-        config = replace(config, video=())
     if not config.clips:
         return replace(listed, sources=numbered)
     _refuse_remote_videos(config, place, numbered)
@@ -153,13 +152,11 @@ def _refuse_remote_videos(config: SourceConfig, root: Root, sources: Iterable[So
     """Refuse videos in an object store: each worker would download every video once."""
     is_video = matcher(config.video)
     video = next((source for source in sources if is_video(source.path)), None)
-    if video is not None:
-        refusal = (
+    if video is not None and is_remote(root):
+        raise ConfigError(
             f"{place_setting(root)}: {video.name} is a video in an object store; expected folders of frames; copy "
             "the videos to a local folder, or omit them with source.video=[]"
         )
-        if is_remote(root):
-            raise ConfigError(refusal)
 
 
 def _framed(config: SourceConfig, sources: Iterable[Source]) -> Iterator[Source]:
