@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 from unprocess_gen.config.composition import OptionFolders
 from unprocess_gen.config.interpretation import entry_config
@@ -71,10 +71,8 @@ def _open_sources(start: Exploration) -> Choices:
         limit = {"source.limit": str(source.index + 1)} if config.place is None else {}
         return replace(start, settings=start.settings | limit, index=source.index)
 
-    return {
-        f"{source.index} {source.name}": lambda source=source: opened(source)  # type: ignore[misc]
-        for source in list_photographs(config).sources[:SOURCES_LISTED]
-    }
+    sources = list_photographs(config).sources[:SOURCES_LISTED]
+    return {f"{source.index} {source.name}": partial(opened, source) for source in sources}
 
 
 def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices:
@@ -84,10 +82,7 @@ def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices
             raise ConfigError(f"--keys {keys}: {row['key']} has no pair ({row['reason']}); expected a row with a pair")
     if not rows:
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
-    return {
-        f"{row['key']} {row['source']}": lambda row=row: _open_row(folder, row, start)  # type: ignore[misc]
-        for row in itertools.islice(rows, SOURCES_LISTED)
-    }
+    return {f"{row['key']} {row['source']}": partial(_open_row, folder, row, start) for row in rows[:SOURCES_LISTED]}
 
 
 def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
