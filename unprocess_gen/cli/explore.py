@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import check_overrides, option_folders
@@ -11,9 +10,6 @@ from unprocess_gen.cli.messages import print_result, print_results
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.paths import any_path
-
-if TYPE_CHECKING:
-    from unprocess_gen.reports.explorer.opening import Choices
 
 CHOOSING = {"--config-dir", "--config-name", "--config-path"}
 """Flags of Hydra that choose where options are; the others make no sense for a page."""
@@ -32,18 +28,6 @@ def explore(call: Call) -> int:
         raise ConfigError(f"--port {port}: is no port; expected 0 to {HIGHEST_PORT}")
     check_overrides(call.overrides)
     from unprocess_gen.reports.explorer import server
-
-    choices = _choices(call)
-    if "save" in call.values:
-        to = Path(call.values["save"])
-        server.save(choices, to)
-        print_result(to)
-        return 0
-    server.serve(choices, port, "no_browser" not in call.values, _print_address)
-    return 0
-
-
-def _choices(call: Call) -> Choices:
     from unprocess_gen.reports.explorer.opening import open_place
 
     place = call.path
@@ -52,7 +36,14 @@ def _choices(call: Call) -> Choices:
     if place is not None and place.is_dir() and (place / "sweep.csv").is_file():
         raise ConfigError(f"explore: {place}: is the folder of a sweep; expected one of its datasets")
     folders = option_folders(call.hydra)
-    return open_place(place, call.values.get("keys"), call.overrides, call.hydra_arguments, folders)
+    choices = open_place(place, call.values.get("keys"), call.overrides, call.hydra_arguments, folders)
+    if "save" in call.values:
+        to = Path(call.values["save"])
+        server.save(choices, to)
+        print_result(to)
+        return 0
+    server.serve(choices, port, "no_browser" not in call.values, _print_address)
+    return 0
 
 
 def _print_address(address: str) -> None:

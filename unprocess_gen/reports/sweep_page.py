@@ -27,8 +27,7 @@ from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.report_files import check_page_file, require_libraries, write_files
 from unprocess_gen.reports.sheets import panels
-from unprocess_gen.reports.sheets.contact_sheet import develop_detail
-from unprocess_gen.simulation.reference.isp import to_light
+from unprocess_gen.reports.sheets.contact_sheet import common_stretch, develop_detail
 
 JPEG_QUALITY = 70
 COLUMNS_ACROSS = 5
@@ -121,16 +120,17 @@ def _pictures(folder: Path) -> tuple[tuple[tuple[str, str], ...], Float]:
         return (), np.zeros(0)
     clean, noisy, row = pairs[0]
     plan, frames = plan_from_row(row), [mosaic_dn(frame, row) for frame in (clean, noisy)]
-    shape = frames[0].shape
-    window = panels.detail_window(shape, panels.STRIP_PX)
-    raw = [np.sqrt(np.clip(to_light(frame[window], plan), 0, 1)) for frame in frames]
-    drawn = {"clean raw": raw[0], "noisy raw": raw[1]}
-    if min(shape) > 1:
-        drawn["noisy, developed"] = develop_detail(frames[1], plan, window)
+    window = panels.detail_window(frames[0].shape, panels.STRIP_PX)
+    raw = [common_stretch(frame[window], plan) for frame in frames]
+    drawn = {"clean raw": raw[0], "noisy raw": raw[1], "noisy, developed": develop_detail(frames[1], plan, window)}
     signal_dn = np.linspace(plan.sensor.black_level_dn, plan.sensor.white_level_dn, CURVE_LEVELS)
     std_dn = noise_std(signal_dn, noise_law(plan)).astype(np.float64)
-    jpegs = {title: picture_jpeg(panels.byte_codes(picture), JPEG_QUALITY) for title, picture in drawn.items()}
-    return tuple((title, data_uri(content, "jpeg")) for title, content in jpegs.items()), std_dn
+    pictures = (
+        (title, data_uri(picture_jpeg(panels.byte_codes(picture), JPEG_QUALITY), "jpeg"))
+        for title, picture in drawn.items()
+        if picture is not None
+    )
+    return tuple(pictures), std_dn
 
 
 def _curve_points(std_dn: Float, highest_dn: float) -> str:

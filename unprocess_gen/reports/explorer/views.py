@@ -13,7 +13,7 @@ from unprocess_gen.reports.explorer.exploration import Shown
 from unprocess_gen.reports.noise_check.checks import pair_sums
 from unprocess_gen.reports.photon_transfer import fit_sums
 from unprocess_gen.reports.sheets import panels
-from unprocess_gen.reports.sheets.contact_sheet import develop_detail, stretch
+from unprocess_gen.reports.sheets.contact_sheet import common_stretch, develop_detail, stretch
 from unprocess_gen.reports.sheets.panels import MosaicArray, Window
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.isp import process, to_light
@@ -58,7 +58,7 @@ def view(shown: Shown, window: Window, common: bool, most: tuple[int, int] = VIE
     columns: Columns = {"source": _words(source / white)}
     for name, frame in frames.items():
         raw, developed = _window_pictures(frame, shown, window, side)
-        light = np.sqrt(np.clip(to_light(raw, shown.plan), 0, 1)) if common else stretch(raw)[0]
+        light = common_stretch(raw, shown.plan) if common else stretch(raw)[0]
         columns[name] = _words(light)
         columns[f"{name}_developed"] = _words(developed if common else stretch(developed, least=1e-6)[0])
         columns[f"{name}_dn"] = raw if raw.dtype == np.uint16 else raw.astype(np.float32)
@@ -86,9 +86,8 @@ def _plane_means(frame: NDArray[Any], side: int) -> Float:
 def _window_pictures(frame: MosaicArray, shown: Shown, window: Window, side: int) -> tuple[MosaicArray, Float]:
     """Return a window of a frame in DN, and developed."""
     if side == 1:
-        has_all_colours = min(frame.shape) > 1
-        raw = frame[window]
-        return raw, develop_detail(frame, shown.plan, window) if has_all_colours else np.zeros((*raw.shape, 3))
+        raw, developed = frame[window], develop_detail(frame, shown.plan, window)
+        return raw, np.zeros((*raw.shape, 3)) if developed is None else developed
     planes = _plane_means(frame[window], side)
     rgb = panels.planes_to_rgb(planes, shown.plan.sensor.pattern)
     return planes.mean(axis=-1), process(to_light(rgb, shown.plan), shown.plan)

@@ -157,16 +157,14 @@ def _frame_panels(name: str, raw: MosaicArray, planes: Float, plan: Plan, window
     sensor, overview, detail = plan.sensor, planes.mean(axis=-1), raw[window]
     stretched, ranges = zip(*map(stretch, (overview, detail)), strict=True)
     white_dn = sensor.black_level_dn + (sensor.white_level_dn - sensor.black_level_dn) * plan.scene.exposure
-    common = (np.sqrt(np.clip(to_light(dn, plan), 0, 1)) for dn in (overview, detail))
+    common = (common_stretch(dn, plan) for dn in (overview, detail))
     rgb = process(to_light(panels.planes_to_rgb(planes, sensor.pattern), plan), plan)
-    has_all_colours = min(raw.shape) > 1
-    developed = rgb, develop_detail(raw, plan, window) if has_all_colours else None
     return [
         SheetPanel(f"{name} raw, own stretch", f"{ranges[0]} (averaged), {ranges[1]} (detail)", *stretched),
         SheetPanel(
             f"{name} raw, common stretch", f"{sensor.black_level_dn} to {white_dn:.5g} DN, square root", *common
         ),
-        SheetPanel(f"{name} raw, developed", "with the parameters of the row", *developed),
+        SheetPanel(f"{name} raw, developed", "with the parameters of the row", rgb, develop_detail(raw, plan, window)),
     ]
 
 
@@ -183,12 +181,22 @@ def stretch(dn: MosaicArray, least: float = 1.0) -> tuple[Float, str]:
     return np.clip((dn - low) / max(high - low, least), 0, 1), f"{low:.5g} to {high:.5g} DN"
 
 
+def common_stretch(dn: MosaicArray, plan: Plan) -> Float:
+    """Stretch a frame from black to white of the darkened scene, square root, the same for every frame of a scene."""
+    return np.sqrt(np.clip(to_light(dn, plan), 0, 1))
+
+
 DEMOSAIC_REACH_PX = 2
 """Distance from which sites influence a demosaicked pixel (`isp.KERNELS`)."""
 
 
-def develop_detail(raw: MosaicArray, plan: Plan, window: Window) -> Float:
-    """Develop the detail with a border as wide as the demosaicking filter, as if the complete frame were developed."""
+def develop_detail(raw: MosaicArray, plan: Plan, window: Window) -> Float | None:
+    """Develop the detail with a border as wide as the demosaicking filter, as if the complete frame were developed.
+
+    A frame of one row or column lacks a colour: it is not developed.
+    """
+    if min(raw.shape) == 1:
+        return None
     y, x = (max(0, part.start - DEMOSAIC_REACH_PX) for part in window)  # even, as the reach is
     rows, columns = window
     bordered = develop(raw[y : rows.stop + DEMOSAIC_REACH_PX, x : columns.stop + DEMOSAIC_REACH_PX], plan)
