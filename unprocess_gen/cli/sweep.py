@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import os
-import uuid
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.core.errors import RESUME, DamageError
+from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.core.output_paths import enclosing_dataset
-from unprocess_gen.core.paths import local_path
+from unprocess_gen.core.paths import LocalPath, local_path
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -125,17 +126,13 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
     """
     if not out.is_dir() or enclosing_dataset(out) is not None:  # every job was refused
         return
-    try:
+    with machine_errors(out, RESUME):
         lock = LockFile(out / "sweep.csv.lock")
         lock.acquire(wait=True)  # several processes may sweep into one folder
         try:
             _update_table(out / "sweep.csv", jobs)
         finally:
             lock.release()
-    except OSError as error:
-        from unprocess_gen.core.files import machine_error  # imports NumPy, too slow for --help
-
-        raise machine_error(error, out, RESUME) from error
 
 
 def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:
@@ -148,15 +145,11 @@ def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:
             row["seconds"] = seconds
         rows[job.folder] = row
     keys = swept_keys(rows.values())
-    temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
-    try:
-        with temporary.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.DictWriter(stream, [*FIRST_COLUMNS, *keys, *LAST_COLUMNS], restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows.values())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, [*FIRST_COLUMNS, *keys, *LAST_COLUMNS], restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows.values())
+    LocalPath(path).write(table.getvalue().encode(), str(path.parent))
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
