@@ -221,7 +221,7 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
 def _any_path(path: str | None) -> AnyPath | None:
     if path is None:
         return None
-    from unprocess_gen.core.paths import any_path  # imports NumPy, too slow for --help
+    from unprocess_gen.core.paths import any_path  # --help needs no paths
 
     return any_path(path)
 

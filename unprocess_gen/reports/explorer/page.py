@@ -166,17 +166,8 @@ class Page:
 
     def _draw_view(self) -> None:
         assert self._shown is not None
-        window = self._window()
-        columns = views.view(self._shown, window, self._stretch.value == STRETCHES[0], self._most)
-        side, (height, width) = views.block_side(window, self._most), columns["clean"].shape
-        self._pixels.data = {
-            **{name: [array] for name, array in columns.items()},
-            "x": [window[1].start],
-            "y": [window[0].start],
-            "dw": [width * side],
-            "dh": [height * side],
-            "note": ["of this site" if side == 1 else f"means of {side} × {side} sites; zoom in for single sites"],
-        }
+        columns = views.view(self._shown, self._window(), self._stretch.value == STRETCHES[0], self._most)
+        self._pixels.data = {name: [value] for name, value in columns.items()}
 
     def _draw_statistics(self, shown: Shown) -> None:
         transfer = views.photon_transfer(shown)

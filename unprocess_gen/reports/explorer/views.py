@@ -31,7 +31,7 @@ PICTURES = {
 VIEW_PX = (360, 480)
 """Most rows and columns of a picture; of a larger window, means of blocks are drawn."""
 
-Columns = dict[str, NDArray[Any]]
+Columns = dict[str, Any]
 
 
 def whole(shape: tuple[int, ...]) -> Window:
@@ -39,19 +39,19 @@ def whole(shape: tuple[int, ...]) -> Window:
     return slice(0, shape[0]), slice(0, shape[1])
 
 
-def block_side(window: Window, most: tuple[int, int] = VIEW_PX) -> int:
+def _block_side(window: Window, most: tuple[int, int]) -> int:
     """Return the side of the blocks of sites that become one pixel: 1, or an even number."""
     side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, most, strict=True))
     return side + side % 2 if side > 1 else 1
 
 
-def view(shown: Shown, window: Window, common: bool, most: tuple[int, int] = VIEW_PX) -> Columns:
-    """Return the pictures of a window as RGBA words ``[h, w]``, and the values under the pointer.
+def view(shown: Shown, window: Window, common: bool, most: tuple[int, int]) -> Columns:
+    """Return the pictures of a window as RGBA words ``[h, w]``, their place, and the values under the pointer.
 
     With ``common``, raw frames are drawn from black to white (square root) and developed ones as photographs; else each
     picture is stretched by itself.
     """
-    side = block_side(window, most)
+    side = _block_side(window, most)
     white = float(np.iinfo(shown.srgb.dtype).max)
     source = shown.srgb[window] if side == 1 else _block_means(shown.srgb[window].astype(np.float32), side)
     frames = {"clean": shown.clean, "noisy": shown.noisy}
@@ -65,7 +65,10 @@ def view(shown: Shown, window: Window, common: bool, most: tuple[int, int] = VIE
     columns["saturated"] = _words(_saturated(shown.saturated[window], columns["clean"].shape, shown, side))
     for channel, name in enumerate("rgb"):
         columns[name] = np.rint(source[..., channel]).astype(np.uint16)
-    return columns
+    height, width = columns["clean"].shape
+    note = "of this site" if side == 1 else f"means of {side} × {side} sites; zoom in for single sites"
+    place = {"x": window[1].start, "y": window[0].start, "dw": width * side, "dh": height * side}
+    return columns | place | {"note": note}
 
 
 def _block_means(values: NDArray[Any], side: int) -> NDArray[Any]:
