@@ -341,7 +341,7 @@ def _pair_facts(shown: Shown, transfer: str) -> dict[str, str]:
     row, sites, camera = shown.row, shown.clean.size, shown.plan.camera
     return {
         "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
-        **{MEANINGS[column]: f"{int(row[column] or 0) / sites:.3%}" for column in SITE_COLUMNS},
+        **{MEANINGS[column].removesuffix(", sites"): f"{int(row[column] or 0) / sites:.3%}" for column in SITE_COLUMNS},
         "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
         "noise of the pair": transfer,
         "effects": ", ".join(shown.plan.noise.effects),
