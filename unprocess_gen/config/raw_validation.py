@@ -24,7 +24,7 @@ def check_raw_source(config: Config) -> None:
             kind, advice = ("photographs", "use source.shrink") if is_raw else ("raw sources", "set source.kind=raw")
             raise refusal(f"source.{name}", setting, f"is for {kind}; expected {value_text(value)}, or {advice}")
     if is_raw:
-        _check_levels(config)
+        _check_raw_levels(config)
         _check_own_noise(config)
         _check_targets(config)
         return
@@ -39,7 +39,7 @@ def require_photographs(source: SourceConfig, caller: str) -> None:
         raise refusal("source.kind", "raw", problem)
 
 
-def _check_levels(config: Config) -> None:
+def _check_raw_levels(config: Config) -> None:
     raw = config.source.raw
     if config.sensor.pattern == MONO:
         raise refusal("sensor.pattern", MONO, "raw sources have the light behind filters; choose a Bayer pattern")

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError, SourceError
-from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.errors import ConfigError, SourceChangedError, SourceError
+from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.sources.raw.decode import decode_raw
 
@@ -33,21 +33,20 @@ def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
     Raises ConfigError or MachineError.
     """
     suffix = path.suffix.lower()
-    try:
+    with machine_errors(path):
         content = path.read_bytes()
-        if suffix in RAW_FILES:
-            return _read_raw(path, key, content)
+    if suffix in RAW_FILES:
+        return _read_raw(path, key, content)
+    try:
         if suffix == ".npy":
             pixels: Any = np.load(io.BytesIO(content), allow_pickle=False)
         else:
             pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except OSError as error:
-        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, EOFError, cv2.error) as error:
         raise ConfigError(f"{key}: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
     if pixels is None:
         raise ConfigError(f"{key}: {path} cannot be decoded; expected {suffix[1:].upper()}")
-    _check_array(path, key, pixels, numbers)
+    _check_numbers(path, key, pixels, numbers)
     return Mosaic(np.ascontiguousarray(pixels))
 
 
@@ -57,12 +56,11 @@ def map_mosaic(path: Path, key: str, numbers: bool = False) -> NDArray[Any]:
     The result is array, [H, W]. Raises ConfigError or MachineError.
     """
     try:
-        pixels: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    except OSError as error:
-        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
+        with machine_errors(path):
+            pixels: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, EOFError) as error:  # an edited row can name any file of the folder
         raise ConfigError(f"{key}: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
-    _check_array(path, key, pixels, numbers)
+    _check_numbers(path, key, pixels, numbers)
     return pixels
 
 
@@ -74,7 +72,7 @@ def even_sides(pixels: NDArray[Any]) -> NDArray[Any]:
     return pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
 
 
-def _check_array(path: Path, key: str, pixels: NDArray[Any], numbers: bool) -> None:
+def _check_numbers(path: Path, key: str, pixels: NDArray[Any], numbers: bool) -> None:
     """Raise ConfigError unless an array is a mosaic of 16-bit integers, or with ``numbers`` of integers or floats."""
     allowed = pixels.dtype.kind in "iuf" if numbers else pixels.dtype == np.uint16
     if not allowed or pixels.ndim != 2:

@@ -127,7 +127,7 @@ class Exploration:
         config = self.composition.config(self.overrides)
         require_photographs(config.source, "explore")
         source = _listed_sources(config.source)[self.index]
-        sha256, photograph = _photograph(config.source, source, config.output.layout)
+        sha256, photograph = _loaded_source(config.source, source, config.output.layout)
         settings = PairSettings.read(config)
         image = plan_pixels(settings, photograph, source, sha256)
         is_cut, several = config.source.patch is not None, len(image.plans) > 1
@@ -176,5 +176,5 @@ def _listed_sources(config: SourceConfig) -> tuple[Source, ...]:
 
 
 @functools.lru_cache(maxsize=1)
-def _photograph(config: SourceConfig, source: Source, layout: str) -> tuple[str, Photograph]:
+def _loaded_source(config: SourceConfig, source: Source, layout: str) -> tuple[str, Photograph]:
     return load_source(config, source, layout)

@@ -66,7 +66,7 @@ def decode_raw(content: bytes, max_pixels: int = 2**40) -> RawFrame:
 
 def _decode_with_libraw(content: bytes, facts: RawMetadata, max_pixels: int) -> RawFrame:
     with opened_by_libraw(content) as raw:
-        _check_size(raw.sizes.width, raw.sizes.height, max_pixels)
+        _check_pixels(raw.sizes.width, raw.sizes.height, max_pixels)
         side = len(raw.raw_pattern)
         if side not in (2, XTRANS_CELL) or raw.num_colors != 3:
             raise SourceError("unsupported", f"has a CFA of {side} x {side} sites and {raw.num_colors} colours")
@@ -87,7 +87,7 @@ def _decode_jpeg_xl(content: bytes, facts: RawMetadata, max_pixels: int) -> RawF
         page: Any = next(page for page in tiff_pages(file) if page.tags.valueof(262) == CFA)
         height, width = page.shape
         area = facts.area or (0, 0, height, width)
-        _check_size(area[3] - area[1], area[2] - area[0], max_pixels)
+        _check_pixels(area[3] - area[1], area[2] - area[0], max_pixels)
         rows, columns = (int(page.tags.valueof(code) or 1) for code in (50975, 52547))
         try:
             stored = page.asarray()
@@ -110,6 +110,6 @@ def _visible(stored: NDArray[np.uint16], area: tuple[int, int, int, int]) -> NDA
     return stored[top:bottom, left:right].copy()
 
 
-def _check_size(width: int, height: int, max_pixels: int) -> None:
+def _check_pixels(width: int, height: int, max_pixels: int) -> None:
     if width * height > max_pixels:
         raise SourceError("too_large", f"has {width} x {height} pixels; expected source.max_pixels={max_pixels}")

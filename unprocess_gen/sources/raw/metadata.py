@@ -13,7 +13,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.libraries import require
 from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, matrix
 from unprocess_gen.sources.raw.colour import LIGHT_K, DngColour
@@ -84,7 +85,7 @@ def read_metadata(path: Path, key: str) -> RawMetadata:
     tags = read_tags(path, key)
     _require("rawpy", path, key)
     try:
-        with opened_by_libraw(path.read_bytes()) as raw:
+        with machine_errors(path), opened_by_libraw(path.read_bytes()) as raw:
             if raw.raw_pattern.shape != (2, 2):
                 raise SourceError("unsupported", "contains no Bayer mosaic; expected a CFA pattern of 2x2 sites")
             return tags.completed(decoder_facts(raw))
@@ -98,10 +99,8 @@ def read_tags(path: Path, key: str) -> RawMetadata:
     Raises ConfigError or MachineError.
     """
     _require("tifffile", path, key)
-    try:
+    with machine_errors(path):
         return tags_of(path.read_bytes(), check=False)
-    except OSError as error:
-        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def tags_of(content: bytes, check: bool = True) -> RawMetadata:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from unprocess_gen.config.limits import CAMERA_LAWS, NAME
 from unprocess_gen.config.schema import RawConfig
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
-from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.simulation.reference import colour
@@ -66,14 +66,13 @@ def camera_options(file: Path, name: str) -> CameraOptions:
     """
     if file.suffix.lower() not in RAW_FILES:
         raise ConfigError(f"camera {file}: is no raw file; expected a file as {', '.join(RAW_FILES)}")
-    try:
+    with machine_errors(file):
         content = file.read_bytes()
+    try:
         frame, tags = decode_raw(content), tags_of(content)
         matrix, gains = camera_colours(frame.metadata)
         pattern = file_pattern(frame, RawConfig())
         black, white = file_levels(frame.metadata, pattern, RawConfig())
-    except OSError as error:
-        raise MachineError(f"{file}: cannot be read ({error.strerror or error})") from error
     except SourceError as error:
         raise ConfigError(f"camera {file}: {error.text}") from error
     if matrix is None:
