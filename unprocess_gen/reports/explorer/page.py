@@ -165,7 +165,8 @@ class Page:
         return parts[0], parts[1]
 
     def _draw_view(self) -> None:
-        assert self._shown is not None
+        if self._shown is None:  # the first settings are wrong
+            return
         columns = views.view(self._shown, self._window(), self._stretch.value == STRETCHES[0], self._most)
         self._pixels.data = {name: [value] for name, value in columns.items()}
 
@@ -198,7 +199,8 @@ class Page:
 
     def _move(self, zoom: float, right: float, down: float) -> None:
         """Zoom around the centre, or move by a share of the window; a zoom of 0 shows the complete frame."""
-        assert self._shown is not None
+        if self._shown is None:
+            return
         height, width = self._shown.clean.shape
         if not zoom:
             self._go(views.whole((height, width)))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import socket
 import threading
 import webbrowser
 from collections.abc import Callable
@@ -21,15 +23,13 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
     The server has a thread of its own, because an event loop drops exceptions that a signal raises in its callbacks.
     ConfigError if the port is taken. Port 0 is any free one.
     """
-    from bokeh.server.util import bind_sockets
-
     try:
-        sockets, port = bind_sockets(HOST, port)
+        with socket.create_server((HOST, port)) as probe:
+            port = probe.getsockname()[1]
     except OSError as error:
-        problem = f"cannot be used ({error.strerror}); expected a free port; choose another, or leave --port out"
+        reason = os.strerror(error.errno or 0)
+        problem = f"cannot be used ({reason}); expected a free port; choose another, or leave --port out"
         raise ConfigError(f"--port {port}: {problem}") from None
-    for socket in sockets:
-        socket.close()
     ready = threading.Event()
     thread = threading.Thread(target=_run, args=(choices, port, ready), daemon=True)
     thread.start()
