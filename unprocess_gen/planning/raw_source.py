@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import CameraPlan, Plan, RawParts, SourcePlan
@@ -24,19 +24,12 @@ def with_raw_sensor(config: Config, raw: RawParts | None) -> Config:
     """
     if raw is None:
         return config
-    sensor, file = config.sensor, raw.sensor
+    sensor = config.sensor
     if sensor.levels == "source":
-        return replace(
-            config,
-            sensor=replace(
-                sensor,
-                bits=file.bits,
-                black_level_dn=file.black_level_dn,
-                white_level_dn=file.white_level_dn,
-                pattern=file.pattern,
-            ),
-        )
-    return replace(config, sensor=replace(sensor, pattern=file.pattern)) if raw.source.shrink == 1 else config
+        sensor = replace(sensor, **asdict(raw.sensor))
+    elif raw.source.shrink == 1:
+        sensor = replace(sensor, pattern=raw.sensor.pattern)
+    return replace(config, sensor=sensor)
 
 
 def own_noise(raw: RawParts, exposure: float, span_dn: float) -> SourcePlan:

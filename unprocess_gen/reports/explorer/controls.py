@@ -13,9 +13,13 @@ from unprocess_gen.config.schema import all_settings
 from unprocess_gen.config.settings import Setting
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects import EFFECTS
+from unprocess_gen.simulation.reference.colour import CAMERAS
+
+WEIGHTS = {f"camera.weights.{name}": number for number, name in enumerate(CAMERAS)}
+"""Names of the controls of ``camera.weights``, one for each camera, and their places in the list."""
 
 SECTIONS = {
-    "Camera": ("body", "camera", "camera.weights"),
+    "Camera": ("body", "camera", *WEIGHTS),
     "Gains and highlights": (
         *("gains", "gains.light", "gains.red", "gains.blue", "gains.inverse_rgb"),
         *("gains.highlight", "gains.threshold"),
@@ -31,29 +35,21 @@ SECTIONS = {
 }
 """Groups and keys by the title of their section."""
 
-WEIGHTS = ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
-
 
 SLIDERS = {
     "gains.red": (0.5, 4),
     "gains.blue": (0.5, 4),
     "gains.inverse_rgb": (0.3, 2.2),
     "gains.threshold": (0, 0.99),
-    **{f"camera.weights.{name}": (0, 1) for name in WEIGHTS},
+    **dict.fromkeys(WEIGHTS, (0, 1)),
 }
-"""Ends of sliders by key; the weights have a slider for each camera."""
+"""Ends of sliders by key."""
 
 NONE = "(none)"
 DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}
 """Keys of which sliders show the value in the plan, which may be drawn."""
 
 SETTINGS: dict[str, Setting] = {f"{group}.{name}".lstrip("."): setting for group, name, setting in all_settings()}
-
-
-def names_of(section: str) -> list[str]:
-    """Return the names of the controls of a section."""
-    weights = [f"camera.weights.{name}" for name in WEIGHTS]
-    return [name for key in SECTIONS[section] for name in (weights if key == "camera.weights" else [key])]
 
 
 def widget(name: str, folders: list[Any]) -> InputWidget:
@@ -77,8 +73,8 @@ def shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], co
     """Return the value of a control: an option, the number in the plan, or the text of a setting."""
     if name in DRAWN:
         return float(getattr(plan.camera, DRAWN[name]))
-    if name.startswith("camera.weights."):
-        return plan.camera.weights[WEIGHTS.index(name.rpartition(".")[2])]
+    if name in WEIGHTS:
+        return plan.camera.weights[WEIGHTS[name]]
     group, _, key = name.rpartition(".")
     if name not in SETTINGS:
         return choices.get(name) or NONE

@@ -7,6 +7,7 @@ A page on a server recomputes its pair when a control changes; a saved page show
 from __future__ import annotations
 
 import base64
+import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -33,7 +34,7 @@ from bokeh.resources import INLINE
 from unprocess_gen.core.errors import UnprocessGenError
 from unprocess_gen.reports.dataset_page.statistics import MEANINGS, SITE_COLUMNS
 from unprocess_gen.reports.explorer import views
-from unprocess_gen.reports.explorer.controls import NONE, SECTIONS, SETTINGS, WEIGHTS, names_of, shown_value, widget
+from unprocess_gen.reports.explorer.controls import NONE, SECTIONS, SETTINGS, WEIGHTS, shown_value, widget
 from unprocess_gen.reports.explorer.exploration import Exploration, Shown
 from unprocess_gen.reports.explorer.opening import Choices
 from unprocess_gen.reports.html_pages import page_template, render_macro, render_page
@@ -217,11 +218,8 @@ class Page:
         self._document = document
         document.title, document.template = "unprocess_gen explorer", page_template(PAGE_TEMPLATE)
         roots = [self._message, self._facts, self._plan, *self._pictures.values(), *self._curves.values()]
-        self._widgets = {
-            name: widget(name, self._state.composition.own_folders)
-            for section in SECTIONS
-            for name in names_of(section)
-        }
+        folders, names = self._state.composition.own_folders, itertools.chain(*SECTIONS.values())
+        self._widgets = {name: widget(name, folders) for name in names}
         for name, control in self._widgets.items():
             control.name = name
             control.on_change("value", partial(self._changed, name))
@@ -272,8 +270,8 @@ class Page:
     def _changed(self, name: str, attr: str, old: Any, new: Any) -> None:
         if self._syncing:
             return
-        if name.startswith("camera.weights."):
-            values = [f"{self._widgets[f'camera.weights.{camera}'].value:.6g}" for camera in WEIGHTS]
+        if name in WEIGHTS:
+            values = [f"{self._widgets[weight].value:.6g}" for weight in WEIGHTS]
             self._state.settings["camera.weights"] = f"[{','.join(values)}]"
         elif name not in SETTINGS:
             self._state.choose(name, None if new == NONE else new)
@@ -311,7 +309,7 @@ class Page:
             if isinstance(value, float) and not control.start <= value <= control.end:
                 control.update(start=min(value, control.start), end=max(value, control.end))
             control.value = value
-            control.disabled = name.startswith("camera.weights.") and shown.config.camera.law != "convex"
+            control.disabled = name in WEIGHTS and shown.config.camera.law != "convex"
         self._part.update(options=list(shown.keys), value=str(shown.row["key"]), disabled=len(shown.keys) == 1)
         document.unhold()
         self._syncing = False
@@ -355,7 +353,7 @@ def _variables(live: bool) -> dict[str, Any]:
     """Values of the template."""
     return {
         "live": live,
-        "sections": {section: names_of(section) for section in SECTIONS},
+        "sections": SECTIONS,
         "pictures": views.PICTURES,
         "curves": PLOTS,
         "moves": [f"move_{number}" for number in range(len(MOVES))],

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.config.limits import MAX_GAIN, MIN_GAIN
 from unprocess_gen.config.raw_validation import by_plane
 from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
@@ -31,8 +32,6 @@ XTRANS = "XTRANS"
 """Value of the column ``raw_pattern`` for tiles of 6 x 6 sites."""
 LONGEST_CAMERA_NAME = 64
 """Characters of the name of a camera in a row."""
-LEAST_GAIN, MOST_GAIN = 1e-3, 1e3
-"""Gains beyond which the white balance of a file is an error."""
 
 
 def read_raw_source(config: SourceConfig, content: bytes, name: str) -> Photograph:
@@ -210,7 +209,7 @@ def camera_colours(facts: RawMetadata) -> tuple[colour.Matrix | None, tuple[floa
         gains = facts.gains if tags is None else tags.gains() or facts.gains
         if matrix is not None:
             colour.rgb2cam(matrix)
-        if gains is not None and not all(LEAST_GAIN <= gain <= MOST_GAIN for gain in gains):
+        if gains is not None and not all(MIN_GAIN <= gain <= MAX_GAIN for gain in gains):
             raise ValueError(f"the gains {gains[0]:g} and {gains[1]:g}")
     except (ValueError, ZeroDivisionError, OverflowError) as error:
         raise SourceError("corrupt", f"its colour tags contradict each other ({error})") from error
