@@ -93,14 +93,11 @@ class Page:
 
     def _picture(self, name: str) -> Any:
         size = {"width": 300, "height": 200, "sizing_mode": "scale_width", "min_border": 0}
-        ranges = {"x_range": self._x, "y_range": self._y, "outline_line_color": None}
-        drawn = figure(name=name, toolbar_location=None, tools=[PanTool(), ResetTool()], **size, **ranges)
-        drawn.axis.visible = drawn.grid.visible = False
+        ranges = {"x_range": self._x, "y_range": self._y, "outline_line_color": None, "toolbar_location": None}
         wheel = WheelZoomTool()
-        drawn.add_tools(wheel)
-        drawn.toolbar.active_scroll = wheel
-        place = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
-        renderer = drawn.image_rgba(image=name, source=self._pixels, **place)
+        drawn = figure(name=name, tools=[PanTool(), ResetTool(), wheel], active_scroll=wheel, **size, **ranges)
+        drawn.axis.visible = drawn.grid.visible = False
+        renderer = drawn.image_rgba(name, "x", "y", "dw", "dh", source=self._pixels)
         tips = [
             ("site", "column $x{%d}, row $y{%d}"),
             ("source", "@r, @g, @b"),
@@ -148,7 +145,7 @@ class Page:
             height, width = shown.clean.shape
             for drawn in self._pictures.values():
                 drawn.aspect_ratio = width / height
-            self._go(views.whole(shown.clean.shape))
+            self._go(0, width, 0, height)
         self._draw_view()
         self._draw_statistics(shown)
         self._command.value = self._state.command
@@ -194,9 +191,9 @@ class Page:
 
     # -------------------------------------------------------------------------------------------------------- controls
 
-    def _go(self, window: tuple[slice, slice]) -> None:
-        self._x.update(start=window[1].start, end=window[1].stop)
-        self._y.update(start=window[0].stop, end=window[0].start)
+    def _go(self, left: float, right: float, top: float, bottom: float) -> None:
+        self._x.update(start=left, end=right)
+        self._y.update(start=bottom, end=top)
 
     def _move(self, zoom: float, right: float, down: float) -> None:
         """Zoom around the centre, or move by a share of the window; a zoom of 0 shows the complete frame."""
@@ -204,14 +201,13 @@ class Page:
             return
         height, width = self._shown.clean.shape
         if not zoom:
-            self._go(views.whole((height, width)))
+            self._go(0, width, 0, height)
             return
         x, y = (self._x.start + self._x.end) / 2, (self._y.start + self._y.end) / 2
         half = max(abs(self._x.end - self._x.start) / zoom, SMALLEST_PX) / 2
         tall = half * height / width
         x, y = x + right * half, y + down * tall
-        self._x.update(start=x - half, end=x + half)
-        self._y.update(start=y + tall, end=y - tall)
+        self._go(x - half, x + half, y - tall, y + tall)
 
     def document(self, document: Document) -> None:
         """Fill a document of the server."""

@@ -34,11 +34,6 @@ VIEW_PX = (360, 480)
 Columns = dict[str, Any]
 
 
-def whole(shape: tuple[int, ...]) -> Window:
-    """Return the window of a complete frame."""
-    return slice(0, shape[0]), slice(0, shape[1])
-
-
 def _block_side(window: Window, most: tuple[int, int]) -> int:
     """Return the side of the blocks of sites that become one pixel: 1, or an even number."""
     side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, most, strict=True))
