@@ -17,7 +17,7 @@ from unprocess_gen.config.recomposition import Recomposition
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.libraries import require
-from unprocess_gen.core.types import PACKED, DarkPixels, Pair, Patch, Photograph, Plan, Row, Source, Srgb
+from unprocess_gen.core.types import PACKED, DarkPixels, Pair, Photograph, Plan, Row, Source, Srgb
 from unprocess_gen.dataset import dng
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import pair_row, row_json
@@ -49,7 +49,6 @@ class Shown:
     config: Config
     srgb: Srgb
     plan: Plan
-    patch: Patch
     pair: Pair
     clean: MosaicArray
     noisy: MosaicArray
@@ -150,7 +149,7 @@ class Exploration:
             saturated = unpack(saturated, plan.sensor.pattern)
         lines = tuple(_plan_lines(settings, source, sha256, image, plan, pair))
         keys = tuple(parts)
-        return Shown(config, srgb, plan, patch, pair, *frames, saturated, row, keys, lines, image.dark_folder)
+        return Shown(config, srgb, plan, pair, *frames, saturated, row, keys, lines, image.dark_folder)
 
 
 def _plan_lines(

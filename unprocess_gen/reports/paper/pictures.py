@@ -56,9 +56,9 @@ def small_photograph(srgb: Srgb) -> FloatImage:
     return block_means(srgb) / float(np.iinfo(srgb.dtype).max)
 
 
-def green_sites(raw: Frame, pattern: str, most: int = MOST_PX) -> FloatImage:
+def green_sites(raw: Frame, pattern: str) -> FloatImage:
     """A green site of every tile, or of every few tiles of a large mosaic: not averaged, so that its noise shows."""
-    step = 2 * max(1, -(-max(raw.shape) // (2 * most)))
+    step = 2 * max(1, -(-max(raw.shape) // (2 * MOST_PX)))
     return np.asarray(raw[::step, tile(pattern)[0].index(1) :: step], dtype=np.float64)
 
 
