@@ -15,7 +15,6 @@ from pathlib import Path
 
 import grimp
 
-from unprocess_gen.cli.help import description
 from unprocess_gen.config.schema import GROUPS, Config, group_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import value_text
@@ -111,7 +110,7 @@ def _reachable(package: str) -> set[str]:
 def keys_of_help() -> str:
     """Return the JSON text of the keys that ``gen-dataset --help`` lists."""
     top = {
-        f"{name}={value_text(getattr(Config, name))}": description(setting)
+        f"{name}={value_text(getattr(Config, name))}": setting.description
         for name, setting in settings_of(Config).items()
     }
     groups = {group: list(group_settings(group)) for group in GROUPS}

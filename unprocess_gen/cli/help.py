@@ -10,7 +10,6 @@ from pathlib import Path
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.settings import Setting
 from unprocess_gen.config.values import value_text
 
 WIDTH = 100
@@ -114,18 +113,11 @@ def group_help(group: str, conf: Path) -> str:
         chosen = f" with {group}={option}" if option != "default" else ""
         title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"
         lines = [
-            _two_columns(f"{name}={value_text(values[name])}"[: WIDTH - 2], description(setting))
+            _two_columns(f"{name}={value_text(values[name])}"[: WIDTH - 2], setting.description)
             for name, setting in settings.items()
         ]
         parts.append("\n".join([title, *lines]))
     return "\n\n".join(parts) + "\n"
-
-
-def description(setting: Setting) -> str:
-    """Return meaning, unit, allowed values and the meaning of null in one line."""
-    unit = f", in {setting.unit}" if setting.unit else ""
-    null = f"; null: {setting.null}" if setting.null else ""
-    return f"{setting.meaning}{unit}. Allowed: {setting.limit}{null}"
 
 
 def _hanging(start: str, text: str) -> str:

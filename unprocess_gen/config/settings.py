@@ -49,6 +49,13 @@ class Setting:
         text = str(self.limit)
         return f"{text} or null" if self.null and "null" not in text else text
 
+    @property
+    def description(self) -> str:
+        """Return meaning, unit, allowed values and the meaning of null in one line."""
+        unit = f", in {self.unit}" if self.unit else ""
+        null = f"; null: {self.null}" if self.null else ""
+        return f"{self.meaning}{unit}. Allowed: {self.limit}{null}"
+
     def check(self, key: str, value: Any) -> None:
         """Check a value by itself; limits that depend on other settings are checked by `validation`."""
         if not (value is None and self.null) and not self.limit.allows(value):

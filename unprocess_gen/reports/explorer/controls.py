@@ -62,11 +62,10 @@ def widget(name: str, folders: list[Any]) -> InputWidget:
         options = group_options(name, conf_dir(), *folders)
         summary = "; ".join(f"{option}: {option_summary(name, option)}" for option in group_options(name))
         return Select(title=name, options=[*([NONE] if name == "body" else []), *options], description=summary or None)
-    meaning = f"{setting.meaning}{f', in {setting.unit}' if setting.unit else ''}. Allowed: {setting.allowed}"
     if isinstance(setting.limit, Choice):
         words = [*(["null"] if setting.null else []), *setting.limit.words]
-        return Select(title=name, options=words, description=meaning)
-    return TextInput(title=name, description=meaning)
+        return Select(title=name, options=words, description=setting.description)
+    return TextInput(title=name, description=setting.description)
 
 
 def shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], config: Any, plan: Plan) -> Any:
