@@ -40,7 +40,7 @@ OUTSIDE_OUTPUT = {
     *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
     "simulation/effects/expectation.py",  # the noise check compares datasets with it
     "config/noise_validation.py",  # a logarithm decides only whether a config is refused
-    *("dataset/dng.py", "reports", "calibration", "torch.py", "camera_noise.py"),
+    *("dataset/dng.py", "reports", "calibration", "statistics", "torch.py", "camera_noise.py"),
 }
 """Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables
 with a checked SHA-256, the formulas of the reference, its inverse, measurements, drawings and exports."""
