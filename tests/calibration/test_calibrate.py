@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,9 @@ import pytest
 import yaml
 from helpers.captures import Camera, Numbers, Shot, draw, record, with_levels
 from helpers.commands import RunMain
+
+from unprocess_gen.calibration.calibrate import calibrate
+from unprocess_gen.reports.formatting import short_number
 
 Estimates = dict[tuple[str, float | None, str | None], dict[str, Any]]
 
@@ -132,15 +136,43 @@ def test_fixed_pattern_is_neither_read_nor_column_noise(read_std_dn: float, cali
 
 
 def test_two_numbers_of_several_isos(calibrated: Any, tmp_path: Path) -> None:
-    """``--two-parameter`` with several ISOs writes branches of gain and noise without light."""
+    """``--two-parameter`` with several ISOs writes branches of gain and noise without light; the page shows all."""
+    page = tmp_path / "page.html"
     folder = with_levels(draw(tmp_path / "captures", Numbers(), 0, side=64))
     other = with_levels(draw(tmp_path / "other", Numbers(4.0, 9.0), 1, side=64))
     lines = (other / "captures.csv").read_text(encoding="utf-8").splitlines()[1:]
     with (folder / "captures.csv").open("a", encoding="utf-8") as file:
         file.writelines(f"../other/{line.replace(',800,', ',1600,')}\n" for line in lines)
-    (branch,) = yaml.safe_load(calibrated(folder, "--two-parameter").read_text(encoding="utf-8"))["branches"]
+    profile = calibrated(folder, "--two-parameter", "--report", str(page))
+    (branch,) = yaml.safe_load(profile.read_text(encoding="utf-8"))["branches"]
     assert (branch["iso"], branch["read_law"]) == ([800, 1600], "gaussian")
     assert branch.keys() == {"iso", "dn_per_e", "read_law", "read_std_dn"}
+    text, gain = page.read_text(encoding="utf-8"), estimates(profile)["dn_per_e", 800, None]
+    assert all(short_number(gain[end], 4) in text for end in ("value", "low", "high"))
+    for part in ("Against ISO", "photon transfer, residuals, histogram", "spectra", "Next to known sensors"):
+        assert part in text
+    assert "8 to 14 times too small" in " ".join(text.split())
+
+
+def test_folder_without_list_is_read_by_metadata(calibrated: Any, tmp_path: Path) -> None:
+    """Names state the kind, metadata the rest, flats of nearly the same light are a level: the numbers of the list."""
+    levels = (0.03, 0.08, 0.16, 0.25)
+    folder = record(tmp_path / "captures", Camera("sony_a7s2", 3200, side=64), darks=3, flats=3, levels=levels)
+    listed = estimates(calibrated(folder))
+    (folder / "captures.csv").unlink()
+    assert estimates(calibrated(folder)) == listed
+
+
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
+    peaks, side = [], 256
+    for darks in (4, 24):
+        shots = [*[Shot(0.0)] * darks, *(Shot(light) for light in (0.05, 0.1, 0.2, 0.3) for _ in range(2))]
+        folder = with_levels(draw(tmp_path / f"{darks}", Numbers(), 0, side, shots))
+        tracemalloc.start()
+        calibrate(folder)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 4 * 2 * side**2  # four frames of uint16
 
 
 @pytest.mark.skipif(EMVA is None, reason="the real frames of EMVA 1288 are not on this machine")

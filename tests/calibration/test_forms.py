@@ -184,11 +184,15 @@ def check_darks(
 
 
 def test_darks_alone_give_a_profile(run_main: RunMain, tmp_path: Path) -> None:
-    """The gain is that of the tags or stated, and `plan` shows which."""
+    """The gain is that of the tags, of a calibrated profile or stated, and `plan` shows which."""
     camera = Camera("sony_a7s2", 3200, side=128)
     gain = camera.truth["dn_per_e"]
+    other, estimate = tmp_path / "other.yaml", {"name": "dn_per_e", "iso": 3200, "site": None, "unit": "DN/e"}
+    other.write_text((conf_dir() / "noise" / "sony_a7s2.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    other.with_suffix(".json").write_text(json.dumps([estimate | {"low": 0.98 * gain, "high": 1.02 * gain}]))
     ways = {
         "NoiseProfile tags of the darks": (),
+        "uncertainty: 2.00% (95 %)": ("--gain", other),
         "gain stated by --dn-per-e": ("--dn-per-e", f"0.1@100,{gain}@3200"),
     }
     for source, flags in ways.items():
@@ -217,6 +221,7 @@ def test_darks_of_every_profile(profile: str, iso: float, run_main: RunMain, tmp
         (("--from", "darks", "--gain", "imx385_iso1600"), "expected a physical profile"),
         (("--from", "darks", "--gain", "darks/captures.csv"), "captures.csv"),
         (("--from", "darks", "--quick"), "--quick: not for --from darks"),
+        (("--from", "noise_profile", "--gain", "canon_70d"), "--gain: not for --from noise_profile"),
         (("--gain", "canon_70d"), "--gain: not for captures with flats"),
         (("--from", "photographs"), "invalid choice"),
     ],

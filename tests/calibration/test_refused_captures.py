@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -43,12 +44,17 @@ def shots(darks: int = 4, levels: tuple[float, ...] = LEVELS) -> Iterator[Shot]:
     yield from (Shot("flat", level, number) for level in levels for number in range(2))
 
 
-def write(folder: Path, shots: Iterator[Shot], change: Change = lambda shot, pixels: pixels) -> Path:
+def write(
+    folder: Path, shots: Iterator[Shot], change: Change = lambda shot, pixels: pixels, suffix: str = ".npy"
+) -> Path:
     folder.mkdir()
     lines = [HEADER]
     for place, shot in enumerate(shots):
-        name = f"{place:02d}.npy"
-        np.save(folder / name, change(shot, shot.pixels()).astype(np.uint16))
+        name, pixels = f"{place:02d}{suffix}", change(shot, shot.pixels()).astype(np.uint16)
+        if suffix == ".npy":
+            np.save(folder / name, pixels)
+        else:
+            cv2.imwrite(str(folder / name), pixels)
         level = f"{shot.signal:g}" if shot.kind == "flat" else ""
         lines.append(f"{name},{shot.kind},100,0.01,{level},{BLACK},{2**shot.bits - 1},{shot.bits},RGGB")
     (folder / "captures.csv").write_text("\n".join(lines) + "\n")
@@ -85,6 +91,10 @@ FAULTS: dict[str, tuple[Change, str]] = {
     "several ISOs": (
         lambda shot, pixels: replace(shot, iso=300).pixels() if (shot.kind, shot.number) == ("dark", 1) else pixels,
         "of one ISO and exposure",
+    ),
+    "several exposures": (
+        lambda shot, pixels: replace(shot, signal=2 * shot.signal).pixels() if shot.number == 1 else pixels,
+        "one exposure in steady light",
     ),
     "twins": (
         lambda shot, pixels: replace(shot, number=0).pixels() if shot.kind == "flat" else pixels,
@@ -132,9 +142,13 @@ def test_too_few_frames_are_refused(few: str, run_main: RunMain, tmp_path: Path)
 
 
 def test_sound_frames_are_accepted(run_main: RunMain, tmp_path: Path) -> None:
-    folder = write(tmp_path / "captures", shots())
+    folder = write(tmp_path / "captures", shots(), suffix=".tif")
     done = run_main("calibrate", folder, "--to", tmp_path / "mine.yaml")
     assert done.code == 0, done.err
+    profile = yaml.safe_load((tmp_path / "mine.yaml").read_text(encoding="utf-8"))
+    assert profile["name"] == "mine"
+    assert (profile["dark_e_per_s"], profile["full_well_e"]) == (None, None)
+    assert "dark_e_per_s is null: the captures do not show it" in done.err
     done = run_main("calibrate", folder, "--to", tmp_path / "mine.yaml", "--two-parameter")
     assert done.code == 0, done.err
     profile = yaml.safe_load((tmp_path / "mine.yaml").read_text(encoding="utf-8"))
@@ -143,7 +157,7 @@ def test_sound_frames_are_accepted(run_main: RunMain, tmp_path: Path) -> None:
 
 
 def test_quick_frames_give_wider_interval(run_main: RunMain, tmp_path: Path) -> None:
-    folder = write(tmp_path / "captures", shots(darks=2, levels=LEVELS[2:3]))
+    folder = write(tmp_path / "captures", shots(darks=2, levels=LEVELS[2:3]), suffix=".png")
     refused(run_main, folder, "--quick")
     assert run_main("calibrate", folder, "--to", tmp_path / "mine.yaml", "--quick").code == 0
 
