@@ -97,10 +97,12 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
     """Refuse darks that are clipped, contain light or differ; warn of doubtful ones."""
     variances, mean_variance = dark.frame_variances, float(dark.variance.mean()) / dark.sites
     light = abs(float(dark.mean_dn.mean()) - sensor.black_dn) / sensor.span_dn
+    # a variance has half as many differences as a plane has sites, and neighbouring ones share a site
+    ratio = Score(float(variances.max() / max(variances.min(), 1e-9)), 1.0, 12 / dark.sites)
     scores = {
         "light in darks": Score(light, 1.0, mean_variance / sensor.span_dn**2),
         "clipped black": clipped_black(dark),
-        "frames differ": Score(float(variances.max() / max(variances.min(), 1e-9)), 1.0, 6 / dark.sites),
+        "frames differ": ratio,
     }
     _check(frames, scores | _pixel_scores(dark), notes)
 

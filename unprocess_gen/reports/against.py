@@ -65,9 +65,9 @@ class Comparison(NamedTuple):
     def __str__(self) -> str:
         name, iso, site, number = self.measured
         assert number is not None and self.profile is not None
-        place = "".join([f"ISO {iso:g}: " if iso else "", f"site {site}: " if site else ""])
+        prefix = "".join([f"ISO {iso:g}: " if iso else "", f"site {site}: " if site else ""])
         unit = self.measured.unit and f" {self.measured.unit}"
-        text = f"{place}{name} of the frames is {short_number(number.value, 4)}{unit}"
+        text = f"{prefix}{name} of the frames is {short_number(number.value, 4)}{unit}"
         text += f" ({short_number(number.low, 4)} to {short_number(number.high, 4)})"
         if self.verdict == LACKS:
             return f"{text}; the profile lacks it: effect {EFFECT_OF_NUMBER[name]} is missing in the dataset"
@@ -78,6 +78,11 @@ class Comparison(NamedTuple):
         off += f" or {abs(self.percent):.1f} %" if name not in ABSOLUTE else ""
         errors = f"{abs(self.score.errors):,.0f} standard errors"
         return f"{text}, {off} {side} that of the profile, {short_number(self.profile, 4)} ({errors})"
+
+    @property
+    def place(self) -> tuple[str, float | None]:
+        """Name and ISO of the number."""
+        return self.measured.name, self.measured.iso
 
     @property
     def percent(self) -> float:
@@ -105,12 +110,8 @@ class Comparisons(NamedTuple):
     def differences(self) -> list[Comparison]:
         """Numbers that differ; sites are left out of a number that differs at all sites together."""
         differing = [line for line in self.numbers if line.verdict not in (AGREES, NOT_COMPARED)]
-        whole = {(line.measured.name, line.measured.iso) for line in differing if line.measured.site is None}
-        return [
-            line
-            for line in differing
-            if line.measured.site is None or (line.measured.name, line.measured.iso) not in whole
-        ]
+        whole = {line.place for line in differing if line.measured.site is None}
+        return [line for line in differing if line.measured.site is None or line.place not in whole]
 
 
 def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: frames) -> Comparisons:
