@@ -110,6 +110,11 @@ def test_damaged_targets_are_found_and_repaired(stored: Path, run_main: RunMain)
         assert shard.read_bytes() == intact
 
 
+def test_plan_names_the_targets(run_main: RunMain) -> None:
+    planned = run_main("plan", *RECIPE, TARGET_KEYS, "source.limit=1", "n_jobs=1")
+    assert "targets   linear_rgb, srgb, variance, noise_std" in planned.out.splitlines()
+
+
 def test_plan_states_the_bytes(stored: Path, settings: Settings) -> None:
     from unprocess_gen.pipeline.run import resolve
     from unprocess_gen.pipeline.sizes import estimate_shards

@@ -22,6 +22,7 @@ from unprocess_gen.reports.estimate import RunEstimate, SourceEstimate
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.expectation import Site
+from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.sources.listing import place_text, unmatched_sentence
 
 
@@ -39,6 +40,7 @@ def format_estimate(estimate: RunEstimate) -> str:
         + (" or more, with complete clips" if config.output.clips == TOGETHER else ""),
         *_labelled("splits", [_split_sentence(config, len(run.sources))]),
         *_patch_lines(config, read),
+        *_labelled("targets", [", ".join(config.output.targets)]),
         f"bytes     {about}{estimate.bytes:,} in shards, {byte_size(estimate.bytes)}{basis}",
         f"disk      {byte_size(estimate.free_bytes)} free"
         + ("" if estimate.free_bytes > estimate.bytes else ": NOT ENOUGH"),
@@ -57,7 +59,7 @@ def _entry_lines(estimate: RunEstimate) -> list[str]:
     config, dark_frames = estimate.run.config, estimate.run.settings.dark_frames
     readable = [source for source in estimate.source_estimates if source.levels]
     if config.mixture is None:
-        return noise_lines(config, readable, dark_frames)
+        return [*_pattern_lines(config), *noise_lines(config, readable, dark_frames)]
     total, sources, lines = sum(entry.weight for entry in config.mixture), len(estimate.run.sources), list[str]()
     for number, entry in enumerate(interpretation.entry_configs(config)):
         weight = config.mixture[number].weight
@@ -65,6 +67,7 @@ def _entry_lines(estimate: RunEstimate) -> list[str]:
         drawn = "" if estimate.entries is None else f", {estimate.entries.count(number)} in this listing"
         names = f"camera={entry.camera.name} noise={entry.noise.name} scene={entry.scene.name}"
         lines += _labelled("mixture", [f"entry {number}, {names}; {expected}{drawn}"])
+        lines += _pattern_lines(entry)
         lines += noise_lines(entry, [image for image in readable if image.levels[0].mixture == number], dark_frames)
     return lines
 
@@ -106,6 +109,12 @@ def _patch_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[st
     places = f"{rule.count} at random places" if rule.kind == "random" else f"a grid, {rule.stride} apart"
     counts = value_range([source.patches for source in readable])
     return [f"patches   {rule.side} x {rule.side}, {places}: {counts} per image; {unused:.1%} of the pixels unused"]
+
+
+def _pattern_lines(config: Config) -> list[str]:
+    """State that a sensor has no colour filters; nothing for others."""
+    is_mono = config.sensor.pattern == MONO
+    return ["pattern   MONO: no colour filters; each site is the mean of the three channels"] if is_mono else []
 
 
 def _failure_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
