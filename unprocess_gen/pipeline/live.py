@@ -40,7 +40,7 @@ from unprocess_gen.sources.pixel_cache import PixelCache
 
 REDRAWS = ("noise", "all", "none")
 
-KEPT_CROPS, NEW_CROPS = 1024, 4
+KEPT_CROPS, NEW_CROPS = KEPT, 4
 """Numbers of pairs whose records are kept, 25 kB each; and of those that are new in each epoch, or whose pixels have 16
 bits, 5 MB each."""
 
