@@ -135,18 +135,28 @@ def test_fixed_pattern_is_neither_read_nor_column_noise(read_std_dn: float, cali
     assert abs(found["read_shape", 800, None]["value"] - 0.1349) < 0.02
 
 
-def test_two_numbers_of_several_isos(calibrated: Any, tmp_path: Path) -> None:
-    """``--two-parameter`` with several ISOs writes branches of gain and noise without light; the page shows all."""
-    page = tmp_path / "page.html"
-    folder = with_levels(draw(tmp_path / "captures", Numbers(), 0, side=64))
-    other = with_levels(draw(tmp_path / "other", Numbers(4.0, 9.0), 1, side=64))
+def two_isos(folder: Path) -> Path:
+    """Draw captures of ISO 800 and 1600."""
+    captures = with_levels(draw(folder / "captures", Numbers(), 0, side=64))
+    other = with_levels(draw(folder / "other", Numbers(4.0, 9.0), 1, side=64))
     lines = (other / "captures.csv").read_text(encoding="utf-8").splitlines()[1:]
-    with (folder / "captures.csv").open("a", encoding="utf-8") as file:
+    with (captures / "captures.csv").open("a", encoding="utf-8") as file:
         file.writelines(f"../other/{line.replace(',800,', ',1600,')}\n" for line in lines)
-    profile = calibrated(folder, "--two-parameter", "--report", str(page))
+    return captures
+
+
+def test_two_numbers_of_several_isos(calibrated: Any, tmp_path: Path) -> None:
+    """``--two-parameter`` with several ISOs writes branches of gain and noise without light."""
+    profile = calibrated(two_isos(tmp_path), "--two-parameter")
     (branch,) = yaml.safe_load(profile.read_text(encoding="utf-8"))["branches"]
     assert (branch["iso"], branch["read_law"]) == ([800, 1600], "gaussian")
     assert branch.keys() == {"iso", "dn_per_e", "read_law", "read_std_dn"}
+
+
+@pytest.mark.slow
+def test_page_shows_estimates_with_intervals_and_figures(calibrated: Any, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    profile = calibrated(two_isos(tmp_path), "--report", str(page))
     text, gain = page.read_text(encoding="utf-8"), estimates(profile)["dn_per_e", 800, None]
     assert all(short_number(gain[end], 4) in text for end in ("value", "low", "high"))
     for part in ("Against ISO", "photon transfer, residuals, histogram", "spectra", "Next to known sensors"):
@@ -164,7 +174,7 @@ def test_folder_without_list_is_read_by_metadata(calibrated: Any, tmp_path: Path
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
-    peaks, side = [], 256
+    peaks, side = [], 128
     for darks in (4, 24):
         shots = [*[Shot(0.0)] * darks, *(Shot(light) for light in (0.05, 0.1, 0.2, 0.3) for _ in range(2))]
         folder = with_levels(draw(tmp_path / f"{darks}", Numbers(), 0, side, shots))
