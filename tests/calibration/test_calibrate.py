@@ -121,17 +121,19 @@ def test_numbers_of_the_body_are_measured(light: tuple[float, float, float], cal
     assert {row["unit"] for row in found.values() if row["name"] == "full_well_e"} == {"e"}
 
 
-@pytest.mark.parametrize("read_std_dn", [0.45, 1.0])
-def test_fixed_pattern_is_neither_read_nor_column_noise(read_std_dn: float, calibrated: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("read_std_dn", "column_std_dn"), [(0.45, 0.0), (1.0, 0.0), (1.0, 0.4)])
+def test_fixed_pattern_is_neither_read_nor_column_noise(
+    read_std_dn: float, column_std_dn: float, calibrated: Any, tmp_path: Path
+) -> None:
     """A fixed pattern almost as strong as the noise is separated from it, above rounding and below."""
-    truth = {"dn_per_e": 0.1, "read_std_dn": read_std_dn, "dsnu_std_dn": 0.8 * read_std_dn, "column_std_dn": 0.0}
-    numbers = Numbers(0.1, read_std_dn, 0.0, dsnu_std_dn=0.8 * read_std_dn)
+    truth = {"read_std_dn": read_std_dn, "dsnu_std_dn": 0.8 * read_std_dn, "column_std_dn": column_std_dn}
+    numbers = Numbers(0.1, row_std_dn=0.0, **truth)
     found = estimates(calibrated(with_levels(draw(tmp_path / "captures", numbers, 0, side=192))))
-    for name, true in truth.items():
+    for name, true in {"dn_per_e": 0.1, **truth}.items():
         row = found[name, 800, None]
         low, high = (row["value"] + 2 * (row[end] - row["value"]) for end in ("low", "high"))  # 4 standard errors
         assert low <= true <= high, row
-        assert max(high - true, true - low) < 0.08 * max(true, read_std_dn), row  # no wide interval hides an error
+        assert max(high - true, true - low) < 0.15 * max(true, read_std_dn), row  # no wide interval hides an error
     assert abs(found["read_shape", 800, None]["value"] - 0.1349) < 0.02
 
 

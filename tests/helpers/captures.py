@@ -31,6 +31,7 @@ class Numbers:
     black_error_dn: float = 0.5
     prnu_std: float = 0.0
     dsnu_std_dn: float = 0.0
+    column_std_dn: float = 0.0
     dark_e_per_s: float = 0.0
     hot_share: float = 0.0
     hot_e_per_s: float = 0.0
@@ -66,7 +67,7 @@ def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequ
     pattern = 1 + rng.normal(0, numbers.prnu_std, (side, side))
     defects = np.random.default_rng([seed, 1])
     hot = (defects.random((side, side)) < numbers.hot_share) * defects.exponential(numbers.hot_e_per_s, (side, side))
-    offsets = defects.normal(0, numbers.dsnu_std_dn, (side, side))
+    offsets = defects.normal(0, numbers.dsnu_std_dn, (side, side)) + defects.normal(0, numbers.column_std_dn, side)
     gains, colours = (np.tile([rgb[:2], rgb[1:]], (side // 2, side // 2)) for rgb in (numbers.gains, numbers.light))
     gains = gains * numbers.dn_per_e
     for place, shot in enumerate(shots):
