@@ -156,10 +156,9 @@ def test_photograph_of_other_bytes_is_refused_in_one_line(
     (tmp_path / "skimage/data").mkdir(parents=True)
     (tmp_path / "skimage/data/astronaut.png").write_bytes(b"other")
     (tmp_path / "skimage/__init__.py").touch()
-    monkeypatch.setitem(sys.modules, "skimage", None)
     spec = importlib.util.spec_from_file_location("skimage", tmp_path / "skimage/__init__.py")
-    for module in (libraries, builds):
-        monkeypatch.setattr(module, "find_spec", lambda name: spec)
+    assert spec is not None
+    monkeypatch.setitem(sys.modules, "skimage", importlib.util.module_from_spec(spec))
     done = run_main("build", SMALL, "--to", "here")
     assert (done.code, len(done.err.splitlines())) == (5, 1)
     assert (
