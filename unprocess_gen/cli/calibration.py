@@ -13,7 +13,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import local_path
 from unprocess_gen.reports.formatting import counted, short_number
 
-STATED, DARKS = ORIGINS = ("noise_profile", "darks")
+STATED, DARKS = "noise_profile", "darks"
 """What a profile is made from, if not from flats and darks."""
 NOT_FOR = {
     "noise_profile": ("report", "quick", "keep_darks", "two_parameter", "gain", "dn_per_e"),

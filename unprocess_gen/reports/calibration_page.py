@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
 from collections.abc import Iterable
@@ -22,6 +21,7 @@ from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.types import Float
 from unprocess_gen.planning.noise_profile import evaluate
+from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import require_libraries
@@ -29,9 +29,9 @@ from unprocess_gen.statistics.scores import NORMAL_95
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLOURS = {"R": "#c0392b", "Gr": "#27ae60", "Gb": "#145a32", "B": "#2c6fbb", "": "#444444"}
+DPI = 90
 
 
 def check_page(page: Path) -> None:
@@ -99,12 +99,6 @@ def _sensor_line(name: str, iso: float, gain: float, numbers_dn: Iterable[float]
 # ------------------------------------------------------------------------------------------------------------- figures
 
 
-def _png(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=90)
-    return file.getvalue()
-
-
 def _drawn(result: IsoResult, sites: list[str]) -> bytes:
     """Draw the photon transfer curve with residuals, the histogram, spectra, and the map of the darks, of one ISO."""
     from matplotlib.figure import Figure
@@ -118,7 +112,7 @@ def _drawn(result: IsoResult, sites: list[str]) -> bytes:
     image = axes[0, 2].imshow(measured.shading - np.median(measured.shading), cmap="RdBu_r", aspect="auto")
     axes[0, 2].set(title="fixed pattern of the darks, block means (DN)", xticks=[], yticks=[])
     figure.colorbar(image, ax=axes[0, 2])
-    return _png(figure)
+    return figure_png(figure, DPI)
 
 
 def _draw_spectrum(axes: Axes, name: str, lines: Float) -> None:
@@ -192,4 +186,4 @@ def _against_iso(calibration: Calibration) -> bytes:
             axes.plot(grid, laws, linewidth=0.8, color=f"C{place}")
         axes.set(xscale="log", yscale="log", xlabel="ISO")
         axes.legend()
-    return _png(figure)
+    return figure_png(figure, DPI)

@@ -26,7 +26,7 @@ def alarm_limit(scores: int) -> float:
 
 
 class Score(NamedTuple):
-    """Sum of a statistic over the sites of a pair, minus its expectation.
+    """Sum of a statistic over the sites of a pair, minus its expectation; or a statistic of captures.
 
     Attributes
     ----------

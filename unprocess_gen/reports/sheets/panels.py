@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float, Frame
 from unprocess_gen.simulation.reference.cfa import MONO, tile
+from unprocess_gen.statistics.mosaics import planes_of
 
 Picture = NDArray[np.uint8]
 
@@ -63,8 +64,7 @@ def average_planes(raw: MosaicArray, panel_px: tuple[int, int]) -> Float:
     Planes are averaged before anything is developed, which keeps sheets of large frames fast.
     """
     even = np.pad(raw, [(0, length % 2) for length in raw.shape], mode="reflect")
-    planes = [even[y::2, x::2].astype(np.float32) for y in (0, 1) for x in (0, 1)]
-    return np.stack([fit_image(plane, panel_px) for plane in planes], axis=-1)
+    return np.stack([fit_image(plane.astype(np.float32), panel_px) for plane in planes_of(even)], axis=-1)
 
 
 def planes_to_rgb(planes: Float, pattern: str) -> Float:
