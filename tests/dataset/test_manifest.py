@@ -167,7 +167,6 @@ plans = st.builds(
     ),
     accuracy=st.builds(AccuracyPlan, name=word, methods=st.lists(word, max_size=3).map(tuple)),
     split=st.sampled_from(["", "train", "fold-3"]),
-    mixture=st.none() | st.integers(0, 63),
 )
 names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40).filter(
     BY_NAME["source"].allowed.__contains__
@@ -185,12 +184,10 @@ def test_columns_have_the_order_of_the_contract() -> None:
 (UNMEASURED,) = (column.empty_if for column in COLUMNS if column.name == "source_noise_dn")
 OF_DARK_FRAMES = {column.empty_if for column in COLUMNS if column.name.startswith("dark_") and column.since == "0.2"}
 (NO_LIGHT,) = (column.empty_if for column in COLUMNS if column.name == "cct_k")
-UNMIXED = "there is no mixture, or the source failed"
 OF_RAW = {column.empty_if for column in COLUMNS if "raw" in column.empty_if}
 BY_DEFAULT = {
     *OF_RAW,
     NO_LIGHT,
-    UNMIXED,
     "exposure_ratio is 1, or output.frames is false",
     "it is 0",
     "all are 1",
@@ -222,7 +219,6 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
         "split": (row_of(PHYSICAL.replace(split="val")), passed | absent - {unsplit}),
         "targets": ({**row_of(PHYSICAL), "targets": "srgb:uint8:" + "1" * 32}, passed | absent - {untargeted}),
         "light": (row_of(PHYSICAL.replace(light="a", cct_k=2856.0)), passed | absent - {NO_LIGHT}),
-        "mixture": (row_of(PHYSICAL.replace(mixture=0)), passed | absent - {UNMIXED}),
         "dark frame": (row_of(DARK), passed | absent - OF_DARK_FRAMES),
         "raw": (row_of(RAW), passed | absent - OF_RAW),
         "assumed": (row_of(PHYSICAL.replace(assumed=("prnu_std",))), passed | absent - {unassumed}),
@@ -276,7 +272,7 @@ def test_row_read_from_csv_is_the_row_of_the_same_plan(
 
 @given(plans)
 def test_row_read_from_json_has_the_same_plan(plan: Plan) -> None:
-    assert repr(plan_from_row(json.loads(row_json([row_of(plan)])))) == repr(plan.replace(mixture=None))
+    assert repr(plan_from_row(json.loads(row_json([row_of(plan)])))) == repr(plan)
 
 
 @pytest.mark.parametrize("reason", REASONS)

@@ -23,9 +23,6 @@ from unprocess_gen.core.files import array_xxh3
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
-MIXED = (
-    "mixture=[{weight: 1, noise: imx385_iso3200}, {weight: 1, noise: sony_a7s2, scene: night, sensor: generic_14bit}]"
-)
 KINDS = {
     "two numbers": ("noise=imx385_iso3200",),
     "poisson law": ("noise=heteroscedastic", "noise.a=3", "noise.b=20", "noise.law=poisson"),
@@ -42,7 +39,7 @@ KINDS = {
     "gray mean, no noise": ("noise=none", "gains.highlight=gray_mean", "isp=srgb"),
     "downscaled, dithered": ("noise=imx385_iso3200", "source.downscale=2", "source.dequantize=dither"),
     "targets": ("noise=sony_a7s2", "output.targets=[linear_rgb,variance,noise_std,srgb]"),
-    "mixture, split": (MIXED, "split={train: 0.5, test: 0.5}"),
+    "split": ("noise=imx385_iso3200", "split={train: 0.5, test: 0.5}"),
 }
 Items = list[tuple[str, str, dict[str, Any], dict[str, str]]]
 
@@ -93,7 +90,7 @@ def test_epoch_0_is_the_stored_dataset(made: dict[str, Path], tmp_path: Path) ->
             live = ug.LivePairs(folder, redraw=redraw, cache=tmp_path / "cache", targets=names)
             assert items_of(live) == items_of(stored), (name, redraw)
     for split in ("train", "test"):
-        folder = made["mixture, split"]
+        folder = made["split"]
         if split in {sample.row["split"] for sample in ug.RawPairs(folder)}:
             assert items_of(ug.LivePairs(folder, split=split)) == items_of(ug.RawPairs(folder, split=split))
 
@@ -104,7 +101,7 @@ def test_epoch_0_is_the_stored_dataset(made: dict[str, Path], tmp_path: Path) ->
 def test_loaders_give_the_same_items(workers: int, method: str, made: dict[str, Path], tmp_path: Path) -> None:
     """Persistent workers and two ranks read two epochs in random order; epoch 0 is the stored dataset."""
     data = pytest.importorskip("torch.utils.data", reason="PyTorch is not installed")
-    folders = [made[name] for name in ("two numbers", "night", "dark frames", "mixture, split", "clips")]
+    folders = [made[name] for name in ("two numbers", "night", "dark frames", "split", "clips")]
     live = ug.LivePairs(folders, cache=tmp_path / "cache")
     expected = {(0, number): contents(sample) for number, sample in enumerate(ug.RawPairs(folders))}
     expected |= {(1, number): contents(live[1, number]) for number in range(len(live))}
@@ -126,7 +123,7 @@ def test_loaders_give_the_same_items(workers: int, method: str, made: dict[str, 
 
 def test_default_batches_have_frames_rows_and_targets(made: dict[str, Path]) -> None:
     data = pytest.importorskip("torch.utils.data", reason="PyTorch is not installed")
-    folders = [made[name] for name in ("two numbers", "night", "gray mean, no noise", "mixture, split")]
+    folders = [made[name] for name in ("two numbers", "night", "gray mean, no noise", "split")]
     live = ug.LivePairs(folders, patch=8, targets=["noise_std", "linear_rgb"])
     (clean, noisy, row, targets) = next(iter(data.DataLoader(live, batch_size=len(live), num_workers=1)))
     for number in range(len(live)):

@@ -1,4 +1,4 @@
-"""Raw sources have the uses of photographs: clips, levels, mixtures, parts, clusters, stores, pictures and exports."""
+"""Raw sources have the uses of photographs: clips, levels, parts, clusters, stores, pictures and exports."""
 
 from __future__ import annotations
 
@@ -21,9 +21,7 @@ from unprocess_gen.core.object_store import ObjectPath
 SETTINGS = (
     "source.kind=raw", "source.clips=true", "source.raw.pattern=GRBG", "source.raw.black_dn=[501,500,500,503]",
     "source.raw.white_dn=15001", "source.patch=[random,32,2]", "noise.draws=2", "split={train: 0.5, val: 0.5}",
-    "mixture=[{weight: 1, sensor: generic_12bit, noise.levels: [{a: 1, b: 4}, {a: 3, b: 20}]},"
-    " {weight: 1, noise.levels: [{a: 2, b: 4}, {a: 6, b: 20}]}]",
-    "noise=heteroscedastic", "output.pairs_per_shard=2", "n_jobs=1",
+    "noise=heteroscedastic", "noise.levels=[{a: 2, b: 4}, {a: 6, b: 20}]", "output.pairs_per_shard=2", "n_jobs=1",
 )  # fmt: skip
 
 
@@ -40,7 +38,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_clips_levels_draws_splits_and_mixtures_are_in_the_rows(made: Path) -> None:
+def test_clips_levels_draws_and_splits_are_in_the_rows(made: Path) -> None:
     rows = [pair.row for pair in ug.RawPairs(made / "ds")]
     assert len(rows) == 6 * 2 * 2 * 2
     for clip in "ab":
@@ -48,10 +46,10 @@ def test_clips_levels_draws_splits_and_mixtures_are_in_the_rows(made: Path) -> N
         assert {row["frame"] for row in of_clip} == {0, 1, 2}
         for name in ("patch_y", "patch_x"):
             assert len({row[name] for row in of_clip if row["patch"] == 0}) == 1
-        for name in ("split", "mixture", "bits"):
+        for name in ("split", "bits"):
             assert len({row[name] for row in of_clip}) == 1
     assert {(row["level"], row["draw"]) for row in rows} == {(0, 0), (0, 1), (1, 0), (1, 1)}
-    assert {(row["mixture"], row["bits"], row["black_level_dn"]) for row in rows} <= {(0, 12, 240), (1, 14, 501)}
+    assert {(row["bits"], row["black_level_dn"]) for row in rows} == {(14, 501)}
 
 
 USES = {

@@ -107,7 +107,6 @@ def test_mlcroissant_reads_rows_and_arrays_without_warnings(
     [
         ("noise.draws=2",),
         ("output.frames=false",),
-        ("mixture=[{weight: 1, noise: none}]",),
         ("source.max_pixels=1", "source.max_failed=9"),
     ],
 )

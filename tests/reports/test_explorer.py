@@ -82,8 +82,7 @@ def test_command_generates_the_pair_shown(case: str, photos: Path, tmp_path: Pat
 def test_row_of_a_dataset_opens_with_its_parameters(photos: Path, tmp_path: Path) -> None:
     """Twins, patches and levels too: the pair is that of the row, and its command generates it."""
     settings = ["source.patch=[grid,64]", "noise=nikon_d850", "noise.levels=[200,800]", "noise.draws=2"]
-    mixture = "mixture=[{weight: 1, camera: sony_a7r}, {weight: 1, camera: nexus_6p}]"
-    ug.generate(ug.load_config([f"source.root={photos}", f"out={tmp_path / 'ds'}", "n_jobs=1", mixture, *settings]))
+    ug.generate(ug.load_config([f"source.root={photos}", f"out={tmp_path / 'ds'}", "n_jobs=1", *settings]))
     for key in ("00000001-p0001-l01d01", "00000002-p0000-l00d01"):
         (state,) = explorations(tmp_path / "ds", keys=key)
         shown = state.shown()

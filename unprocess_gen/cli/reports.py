@@ -99,9 +99,6 @@ def _compose_report(call: Call, task: Callable[..., tuple[int, None, list[str]]]
 def _report_folder(config: Config, verb: str) -> Path:
     from unprocess_gen.reports.report_files import check_report_folder
 
-    if config.mixture is not None:
-        problem = "all of its pairs have the same settings; expected null; choose the options of an entry instead"
-        raise ConfigError(f"{verb}: mixture: {problem}")
     out = local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
     check_report_folder(out, verb)
     return out

@@ -8,13 +8,12 @@ Design: ``docs/design/composition_and_sweeps.md``.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +33,12 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from unprocess_gen.config.body_composition import replaced_parts
-from unprocess_gen.config.composition_errors import assignment, explain, unknown_key
-from unprocess_gen.config.defaults import default_options
-from unprocess_gen.config.mixture import read_entries
+from unprocess_gen.config.composition_errors import explain, unknown_key
 from unprocess_gen.config.option_files import OPTIONAL_GROUPS, check_override, conf_dir
-from unprocess_gen.config.raw_composition import FILE_SENSOR, source_overrides
-from unprocess_gen.config.schema import ENTRY_GROUPS, Config, MixtureEntry
+from unprocess_gen.config.raw_composition import source_overrides
+from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import writable_node
-from unprocess_gen.config.validation import entry_errors, validate_config
-from unprocess_gen.config.values import value_text
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
 
@@ -145,8 +141,6 @@ def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
         if "body" in node:
             node.body.replaced = replaced_parts(node, settings)
     config = typed_config(node, overrides)
-    if config.mixture is not None:
-        config = _with_entries(config, node, settings, overrides)
     validate_config(config)
     return config
 
@@ -161,67 +155,6 @@ def typed_config(node: DictConfig, overrides: Sequence[str]) -> Config:
         raise ConfigError(explain(error, overrides)) from error
     assert isinstance(config, Config)
     return config
-
-
-def _with_entries(config: Config, node: DictConfig, settings: Any, overrides: Sequence[str]) -> Config:
-    """Compose each entry of a mixture like a config, with Hydra's ``settings`` of the composed ``node``.
-
-    The groups of the first entry become the groups of the config.
-    """
-    places = {source.provider: Path(source.path) for source in settings.runtime.config_sources if source.path}
-    folders = OptionFolders(places["main"], settings.job.config_name, places.get("command-line"))
-    given = [override for override in settings.overrides.task if override.lstrip("+").partition("=")[0] != "mixture"]
-    if config.source.kind == "raw":  # each entry is composed with what follows from the kind
-        given = [text for text in given if text != FILE_SENSOR and not text.startswith("source.include=")]
-    outside = _settings_outside(node, settings.runtime.choices, given, overrides, folders)
-    entries = []
-    for number, (weight, options, values) in enumerate(read_entries(config.mixture)):
-        with entry_errors(number):
-            for key in (*options, *values):
-                if key in outside:
-                    problem = f"{outside[key]} is set outside of the mixture too; expected one of both; remove one"
-                    raise ConfigError(f"{key}: {problem}")
-            written = [f"{group}={option}" for group, option in options.items()]
-            entry = compose_node([*given, *written], folders)
-            written += [f"{key}={value_text(value)}" for key, value in values.items()]
-            source_overrides(entry, written)  # refuses values that do not apply to raw sources
-            try:
-                entry.merge_with(_nested(values))
-            except (OmegaConfBaseException, *PLAIN_ERRORS) as error:
-                raise ConfigError(explain(error, written)) from error
-            with open_dict(entry):
-                entry.pop("hydra")
-            groups = {group: getattr(typed_config(entry, written), group) for group in ENTRY_GROUPS}
-            entries.append(MixtureEntry(weight, **groups))
-    return replace(config, mixture=tuple(entries), **{group: getattr(entries[0], group) for group in ENTRY_GROUPS})
-
-
-def _nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the values of keys such as ``noise.iso`` by group and name."""
-    groups: dict[str, dict[str, Any]] = {}
-    for key, value in values.items():
-        group, _, name = key.partition(".")
-        groups.setdefault(group, {})[name] = json.loads(json.dumps(value))  # OmegaConf refuses subclasses of dict
-    return groups
-
-
-def _settings_outside(
-    node: DictConfig, choices: DictConfig, given: Sequence[str], overrides: Sequence[str], folders: OptionFolders
-) -> dict[str, str]:
-    """Return the options and keys of a mixture's groups that overrides or the user's files set, as they set them."""
-    chosen = {group: choices[group] for group in ENTRY_GROUPS if choices[group] != default_options()[group]}
-    outside = {
-        group: text for group, name in chosen.items() if (text := f"{group}={name}") != FILE_SENSOR or text in overrides
-    }
-    if any(text.startswith("+") for text in given) or (folders.main, folders.name) != (conf_dir().absolute(), "config"):
-        own = folders.own or (None if folders.main == conf_dir().absolute() else folders.main)
-        plain = compose_node([f"{group}={choices[group]}" for group in ENTRY_GROUPS], OptionFolders(own=own))
-        for group in ENTRY_GROUPS:
-            for name in node[group]:
-                if node[group][name] != plain[group][name]:
-                    outside[f"{group}.{name}"] = f"{group}.{name}={value_text(node[group][name])}"
-    keys = [override.lstrip("+").partition("=")[0] for override in given]
-    return outside | {key: assignment(key, overrides) for key in keys}
 
 
 def is_multirun(node: DictConfig) -> bool:

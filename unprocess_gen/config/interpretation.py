@@ -12,7 +12,6 @@ from unprocess_gen.config import limits
 from unprocess_gen.config.distributions import lowest, parse_drawn
 from unprocess_gen.config.schema import (
     BRANCH_FIELDS,
-    ENTRY_GROUPS,
     BranchConfig,
     Config,
     EffectsConfig,
@@ -74,20 +73,6 @@ def lights(config: Config) -> tuple[tuple[str, float], ...]:
     if isinstance(scene.light, str):
         return ((scene.light, 1.0),)
     return tuple(zip(scene.light[::2], scene.light[1::2], strict=True))
-
-
-# ---------------------------------------------------------------------------------------------------------- mixture
-
-
-def entry_config(config: Config, number: int) -> Config:
-    """Return the config of an entry of a mixture; its ``mixture`` is the number of the entry."""
-    groups = {group: getattr(config.mixture[number], group) for group in ENTRY_GROUPS}
-    return dataclasses.replace(config, mixture=number, **groups)
-
-
-def entry_configs(config: Config) -> tuple[Config, ...]:
-    """Return the configs that images draw from: the configs of the entries of a mixture, or the config itself."""
-    return (config,) if config.mixture is None else tuple(entry_config(config, n) for n in range(len(config.mixture)))
 
 
 # ----------------------------------------------------------------------------------------------------- noise levels

@@ -177,9 +177,6 @@ MAX_ISO = 1e7
 MAX_SPLITS = 16
 """Most splits. Chosen: more than any benchmark has."""
 
-MAX_ENTRIES = 64
-"""Most entries of a mixture, of which each takes 0.2 s to compose."""
-
 BOOLEAN = Limit("true or false")
 """OmegaConf converts and checks it."""
 
@@ -286,13 +283,6 @@ SPLIT = Limit(
 TARGET_NAMES = Limit(
     f"a list without repetitions of {', '.join(TARGETS)}",
     lambda value: set(value) <= set(TARGETS) and len(set(value)) == len(value),
-)
-
-MIXTURE = Limit(
-    f"null, or a list of up to {MAX_ENTRIES} entries such as {{weight: 3, camera: sony_a7r, noise.iso: 3200}}, each "
-    "with a weight above 0",
-    lambda value: isinstance(value, tuple) and 1 <= len(value) <= MAX_ENTRIES,
-    lambda value: value_text(value)[:80],
 )
 
 BLACK_LEVEL = LevelRange("0 to 2^bits - 2", lambda group: (0, 2**group.bits - 2))

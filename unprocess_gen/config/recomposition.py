@@ -53,8 +53,6 @@ class Recomposition:
     def config(self, overrides: Sequence[str]) -> Config:
         """Return the config that `load_config` returns; ConfigError with the sentence of `load_config`."""
         values = [override for override in overrides if _is_value(override)]
-        if any(override.startswith("mixture=") for override in values):  # its entries are composed with all overrides
-            values = []
         try:
             return self._merged(overrides, values)
         except Exception:  # what is wrong is explained by a complete composition

@@ -760,30 +760,6 @@ class BodyConfig(Group):
 
 @documented
 @dataclass(frozen=True)
-class MixtureEntry(Group):
-    """Hold the settings that the images of one entry of ``mixture`` have.
-
-    Attributes
-    ----------
-    weight
-        number of images compared with the weights of the other entries
-    """
-
-    weight: float = key(1.0, Numbers(0, 10**9, open_low=True))
-    camera: CameraConfig = field(default_factory=CameraConfig)
-    gains: GainsConfig = field(default_factory=GainsConfig)
-    isp: IspConfig = field(default_factory=IspConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-
-
-ENTRY_GROUPS = tuple(group.name for group in fields(MixtureEntry) if group.name != "weight")
-"""Groups whose options and keys an entry of ``mixture`` may set."""
-
-
-@documented
-@dataclass(frozen=True)
 class Config(Group):
     """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level.
 
@@ -795,9 +771,6 @@ class Config(Group):
         shares of named parts of the dataset, such as {train: 0.8, val: 0.1, test: 0.1}; the column split names the
         part of each image, which depends on seed and file only: patches, noise levels and frames of a clip stay
         together
-    mixture
-        entries of which each image draws one by weight: options and keys of camera, gains, isp, sensor, noise and
-        scene; the column mixture has the number of the entry; pairs of an image and frames of a clip share it
     out
         folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the
         datasets
@@ -825,7 +798,6 @@ class Config(Group):
     body: BodyConfig = field(default_factory=BodyConfig)
     seed: int = key(0, Integers(0, 2**63 - 1))
     split: Any = key(None, limits.SPLIT, null="no splits", since="0.3")
-    mixture: Any = key(None, limits.MIXTURE, null="the same settings for all images", since="0.3")
     out: str = key("ds", limits.OUTPUT_PLACE, decides_data=False)
     n_jobs: int = key(-1, Integers(1, 1024, other=-1, remark=" or -1 for one per core"), decides_data=False)
     self_test: str = key("stop", Choice("stop", "go_on"), decides_data=False)

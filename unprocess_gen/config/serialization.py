@@ -16,7 +16,6 @@ import yaml
 
 from unprocess_gen.config.interpretation import (
     canonical_patch,
-    entry_configs,
     has_float_clean,
     is_physical,
     saturated_as,
@@ -27,14 +26,11 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import (
-    ENTRY_GROUPS,
     GROUPS,
     NESTED,
     AccuracyConfig,
     Config,
-    MixtureEntry,
     all_settings,
-    frozen,
 )
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
@@ -86,20 +82,11 @@ def source_kind(config: Config) -> str:
 def dataset_yaml(config: Config) -> str:
     """Return the text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
     settings = _canonical_settings(config)
-    if config.mixture is not None:
-        entries = [_canonical_settings(entry) for entry in entry_configs(config)]
-        for entry in entries:
-            settings |= {group: settings[group] | entry[group] for group in ("effects", "accuracy")}
-        varying = [group for group in ENTRY_GROUPS if any(entry[group] != settings[group] for entry in entries)]
-        settings["mixture"] = [
-            {"weight": drawn.weight, **{group: entry[group] for group in varying}}
-            for drawn, entry in zip(config.mixture, entries, strict=True)
-        ]
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
 
 
 def _canonical_settings(config: Config) -> dict[str, Any]:
-    """Return the keys that decide the bytes of a dataset, as mappings; entries of a mixture are left as they are."""
+    """Return the keys that decide the bytes of a dataset, as mappings."""
     settings: dict[str, Any] = recorded(config)
     settings["source"] = {"kind": source_kind(config)} | settings["source"]
     settings["sensor"]["saturated"] = saturated_as(config)
@@ -184,17 +171,7 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
         loaded["source"]["kind"] = kind
     config = _build(Config, loaded, "")
     assert isinstance(config, Config)
-    if config.mixture is not None:
-        config = dataclasses.replace(config, mixture=tuple(_entries(loaded)))
     return config, str(kind)
-
-
-def _entries(loaded: dict[str, Any]) -> Iterator[MixtureEntry]:
-    """Yield the entries of a mixture; an entry has the groups of the config that it lacks itself."""
-    settings_of(Config)["mixture"].check("mixture", frozen(loaded["mixture"]))
-    common = {group: loaded[group] for group in ENTRY_GROUPS}
-    for number, entry in enumerate(loaded["mixture"]):
-        yield _build(MixtureEntry, common | entry if isinstance(entry, dict) else entry, f"mixture[{number}].")
 
 
 def _build(group: type[Any], loaded: Any, prefix: str) -> Any:

@@ -6,13 +6,10 @@ profiles: `noise_validation`.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import itertools
 import math
 import operator
-import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +19,6 @@ from unprocess_gen.config.interpretation import (
     ONLY_WITH_DARK_FRAMES,
     UNCLIPPED,
     effect_switch,
-    entry_configs,
     gain_distributions,
     has_float_clean,
     is_normalised,
@@ -39,13 +35,11 @@ from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, M
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.raw_validation import check_raw_source
 from unprocess_gen.config.schema import (
-    ENTRY_GROUPS,
     PHYSICAL,
     TOGETHER,
     CameraConfig,
     Config,
     EffectsConfig,
-    MixtureEntry,
     NoiseConfig,
     OutputConfig,
     SourceConfig,
@@ -99,9 +93,6 @@ def check_values(config: Config) -> None:
 @functools.lru_cache(maxsize=64)
 def _check_values(config: Config) -> None:
     """Check all values but the seed, once for each config: `unprocess_gen.make_pair` checks it in every call."""
-    if config.mixture is not None:
-        _check_mixture(config)
-        return
     _check_settings(config)
     _check_source(config.source)
     check_raw_source(config)
@@ -119,36 +110,6 @@ def _check_values(config: Config) -> None:
     if executor.address is not None and executor.kind != "dask":
         problem = f"executor={executor.kind} connects to no scheduler; set executor=dask"
         raise refusal("executor.address", executor.address, problem)
-
-
-def _check_mixture(config: Config) -> None:
-    """Check the entries of a mixture like configs, and that all give an image the same number of pairs."""
-    settings_of(Config)["mixture"].check("mixture", config.mixture)
-    pairs: dict[tuple[int, int], int] = {}
-    for number, entry in enumerate(entry_configs(config)):
-        with entry_errors(number):
-            settings_of(MixtureEntry)["weight"].check("weight", config.mixture[number].weight)
-            _check_values(replace(entry, mixture=None))
-            if uses_dark_frames(entry.noise):
-                problem = "the frames are of one camera at one ISO; expected no dark frames in a mixture"
-                raise refusal("noise.dark_frames", entry.noise.dark_frames, f"{problem}; leave one of both out")
-        pairs.setdefault((len(noise_levels(entry.noise)), entry.noise.draws), number)
-    if len(pairs) > 1:
-        (first, number), (other, another) = list(pairs.items())[:2]
-        raise ConfigError(
-            f"mixture[{another}].noise: {other[0]} x {other[1]} pairs of an image (levels x draws), but "
-            f"{first[0]} x {first[1]} of mixture[{number}]; expected the same; set noise.levels and noise.draws for all"
-        )
-
-
-@contextlib.contextmanager
-def entry_errors(number: int) -> Iterator[None]:
-    """Name the entry of a mixture in the ConfigErrors of the body: ``mixture[1].noise=…``."""
-    try:
-        yield
-    except ConfigError as error:
-        has_key = re.match(rf"({'|'.join((*ENTRY_GROUPS, 'weight'))})[.=:]", str(error))
-        raise ConfigError(f"mixture[{number}]{'.' if has_key else ': '}{error}") from error
 
 
 def check_parquet(output: OutputConfig) -> None:

@@ -46,7 +46,6 @@ STREAMS = {
     "dark_frame": 14,
     "dark_dither": 15,
     "dsnu": 16,
-    "mixture": 17,
 }
 """Stream numbers by purpose. Every existing dataset depends on them: add new ones, never renumber."""
 
@@ -319,27 +318,6 @@ def shuffled(length: int, seed: int, epoch: int) -> NDArray[np.int64]:
     key = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
     high, low, _, _ = _outputs(key, length, 0, 0, epoch)
     return np.argsort(high.astype(np.uint64) << np.uint64(32) | low, kind="stable")
-
-
-def mixture_word(key: int, epoch: int = 0) -> int:
-    """Return the random integer that decides the entry of a mixture for an image.
-
-    It consists of the first two words that counter (0, 0) of the stream ``mixture`` gives.
-
-    Parameters
-    ----------
-    key : int
-        Key from `stream_key`.
-    epoch : int
-        Number of the epoch.
-
-    Returns
-    -------
-    int
-        64-bit integer.
-    """
-    high, low, _, _ = _outputs(key, 1, 0, purpose("mixture"), frame_word(0, epoch))
-    return int(high[0]) << 32 | int(low[0])
 
 
 def dark_frame_words(key: int) -> tuple[int, int, int]:

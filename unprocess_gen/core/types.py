@@ -599,8 +599,6 @@ class Plan:
         Methods of the simulation, and format of the frames.
     split : str
         Part of the dataset that the image belongs to; empty without splits. It decides no pixel.
-    mixture : int or None
-        Number of the entry of the mixture whose settings the image has; None without a mixture. It decides no pixel.
     """
 
     seed: int
@@ -614,7 +612,6 @@ class Plan:
     accuracy: AccuracyPlan
     output: OutputPlan = OutputPlan()
     split: str = ""
-    mixture: int | None = None
 
     @property
     def physics(self) -> Physics:

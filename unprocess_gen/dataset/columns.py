@@ -435,8 +435,6 @@ COLUMNS = (
            empty_if="the gains follow from no light (gains.light=null), or the source failed"),
     Column("cct_k", "correlated colour temperature of the light", Range(1000, 25000), CameraPlan, unit="K", since="0.3",
            in_json=False, empty_if="the gains follow from no light (gains.light=null), or the source failed"),
-    Column("mixture", "number of the entry of mixture whose settings the image has, from 0", integers(0, 10**6), Plan,
-           since="0.3", in_json=False, empty_if="there is no mixture, or the source failed"),
     Column("shrink", "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
            integers(1, 4), SourcePlan, since="0.3", empty_if=NO_RAW),
     Column("raw_pattern", "CFA pattern of the raw file", OneOf(("RGGB", "BGGR", "GRBG", "GBRG", "XTRANS")), SourcePlan,

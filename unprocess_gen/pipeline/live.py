@@ -30,7 +30,6 @@ from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, Pla
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.targets import kernels_for, levels_of, noise_law, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
-from unprocess_gen.planning.mixture import config_of_key
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of
 from unprocess_gen.simulation import self_test
@@ -222,7 +221,7 @@ class LivePairs:
         """Return the plan of an epoch, without its number, and the patch."""
         plan, patch = image.plan, image.patch
         if epoch and self._redraw == "all":
-            config, (height, width) = config_of_key(settings.config, plan.stream_key, epoch), srgb.shape[:2]
+            config, (height, width) = settings.config, srgb.shape[:2]
             facts = self._facts.get(number)
             if facts is None:
                 facts = facts_for(config, srgb, image.source.frames, parts_of(plan))

@@ -12,7 +12,6 @@ from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import DarkFrames, Facts, Pair, Patch, Photograph, Plan, Source, Srgb
 from unprocess_gen.planning.effect_selection import facts_for
-from unprocess_gen.planning.mixture import image_config
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.raw_source import with_raw_sensor
 from unprocess_gen.simulation.pair import make_pairs
@@ -82,7 +81,7 @@ class PlannedImage:
 def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, sha256: str) -> PlannedImage:
     """Plan the pairs of a decoded image; ``sha256`` is the digest of the source's bytes."""
     srgb, raw = photograph.srgb, photograph.raw
-    config = with_raw_sensor(image_config(settings.config, *source.stream_identity(sha256)), raw)
+    config = with_raw_sensor(settings.config, raw)
     facts = facts_for(config, srgb, source.frames, raw)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, settings.dark_frames)
     height, width = srgb.shape[:2]

@@ -61,7 +61,6 @@ from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardResult, Tall
 from unprocess_gen.pipeline.verify import expected_samples, shard_rows
 from unprocess_gen.pipeline.worker import make_image
 from unprocess_gen.pipeline.workspace import add_parquet, dataset_facts, dataset_text, fingerprint, read_dataset
-from unprocess_gen.planning.mixture import config_of_key, entry_number
 from unprocess_gen.planning.plan import drawn_light
 from unprocess_gen.sources.dark_frames import NO_PLACES, DarkPlaces, with_dark_places
 
@@ -248,9 +247,8 @@ class _Repair:
         noises = itertools.chain(entry.get("source_noise_dn", ()), itertools.repeat(None))
         for rows, noise in zip(images, noises, strict=False):
             key = plan_from_row(rows[0]).stream_key
-            number = None if config.mixture is None else entry_number(config, key)
-            light, cct_k = drawn_light(config_of_key(config, key), key)
-            drawn = {"source_noise_dn": noise, "mixture": number, "light": light, "cct_k": cct_k or None}
+            light, cct_k = drawn_light(config, key)
+            drawn = {"source_noise_dn": noise, "light": light, "cct_k": cct_k or None}
             yield from ({**row, **drawn} for row in rows)
 
     def _regenerated_rows(self, config: Config) -> Iterator[Row]:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from unprocess_gen.config.bodies import body_sentence
-from unprocess_gen.config.interpretation import entry_configs
 from unprocess_gen.config.schema import TOGETHER, Config, OutputConfig
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -49,7 +48,7 @@ class Run:
     def warnings(self) -> tuple[str, ...]:
         """Collect what the user should know before the run begins, a sentence each."""
         checks = body_sentence, dark_scene_warning, sensor_warning
-        about_noise = [check(entry) for entry in entry_configs(self.config) for check in checks]
+        about_noise = [check(self.config) for check in checks]
         warnings = *self.listing.warnings, shards_warning(self.config, self.sources), *about_noise
         return tuple(dict.fromkeys(filter(None, warnings)))
 

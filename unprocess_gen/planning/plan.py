@@ -162,8 +162,7 @@ class Planner:
     Parameters
     ----------
     config : Config
-        A configuration that `validate_config` accepts, and that does not change; of a mixture, the configuration of one
-        entry (`mixture.image_config`). Its seed is not used.
+        A configuration that `validate_config` accepts, and that does not change. Its seed is not used.
     """
 
     def __init__(self, config: Config) -> None:
@@ -193,7 +192,6 @@ class Planner:
         self._source = types.SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
         self._isp = types.IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
         self._splits: dict[str, float] = config.split or {}
-        self._mixture: int | None = config.mixture
         sensor = config.sensor
         self._sensor = types.SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
         self._output = types.OutputPlan(
@@ -245,7 +243,7 @@ class Planner:
                     uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)
             parts = source, scene, camera, isp, self._sensor, noise, accuracy, self._output
-            yield Plan(seed, key, *parts, split, self._mixture), selection
+            yield Plan(seed, key, *parts, split), selection
 
     def _draw_split(self, seed: int, source_sha256: str) -> str:
         """Name the split of an image, empty without splits; the last one takes what the others leave."""

@@ -28,7 +28,7 @@ from unprocess_gen.calibration.profile import (
     site_names,
 )
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
-from unprocess_gen.config.interpretation import entry_configs, is_physical, noise_distributions
+from unprocess_gen.config.interpretation import is_physical, noise_distributions
 from unprocess_gen.config.noise_validation import check_noise
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
@@ -119,10 +119,6 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
 
     Raises ConfigError or MachineError.
     """
-    noises = {entry.noise for entry in entry_configs(config)}
-    if len(noises) > 1:
-        names = ", ".join(sorted(noise.name for noise in noises))
-        raise ConfigError(f"--against {frames}: the dataset has a mixture of profiles ({names}); expected one profile")
     sensor = config.sensor
     default = Sensor(sensor.bits, sensor.black_level_dn, sensor.white_level_dn, sensor.pattern, (0, 0))
     captures = read_captures(frames, "dark", default)
@@ -186,7 +182,7 @@ class Profile:
         elif len(isos) > 1 or any(distribution.kind != "constant" for distribution in noise_distributions(noise)):
             problem = "is for one ISO" if len(isos) > 1 else "draws its numbers"
             raise ConfigError(f"verify: --against: noise={noise.name} {problem}; expected frames and a profile of one")
-        self.config = dataclasses.replace(config, sensor=levels, noise=noise, mixture=None)
+        self.config = dataclasses.replace(config, sensor=levels, noise=noise)
         for iso in isos:
             try:
                 check_noise(noise, dataclasses.replace(config.scene, iso=iso))

@@ -17,12 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import entry_configs, without_dark_frames
+from unprocess_gen.config.interpretation import without_dark_frames
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.random_streams import stream_key
 from unprocess_gen.core.roots import is_remote
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.targets import FRAME_TARGETS
@@ -35,7 +34,6 @@ from unprocess_gen.pipeline.sizes import HEADERS_READ as SIZE_SAMPLE
 from unprocess_gen.pipeline.sizes import estimate_shards, source_bytes
 from unprocess_gen.pipeline.targets import noise_law, targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
-from unprocess_gen.planning.mixture import entry_number
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
 from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.reports.benchmark.timing import measure_in_turns, thread_ns
@@ -45,7 +43,6 @@ from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import pixels_in_none
-from unprocess_gen.sources.reading import content_sha256
 
 LOGGER = logging.getLogger("unprocess_gen")
 
@@ -105,7 +102,6 @@ class RunEstimate:
     ``start_seconds`` is the time until the first pair: imports, settings, workers, and loading the kernels.
     ``pair_seconds`` is the time to make the pairs with ``n_jobs`` workers, ``disk_seconds`` to write the shards.
     ``tier_ns`` holds the time of a pair in ns per pixel under the chosen accuracy and other tiers, measured now.
-    ``entries`` are the numbers of the mixture's entries that all sources draw; None if not all files were read.
     """
 
     run: Run
@@ -119,7 +115,6 @@ class RunEstimate:
     pair_seconds: float
     disk_seconds: float
     tier_ns: dict[str, float]
-    entries: tuple[int, ...] | None = None
 
     @property
     def exact(self) -> bool:
@@ -151,8 +146,7 @@ def estimate_run(
     n_jobs = min(n_jobs, len(tasks))
     start_seconds = IMPORT_SECONDS * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
     start_seconds += _compile_kernels(without_dark_frames(config), quick.values())
-    entries = _drawn_entries(config, sources)
-    sample = sources if read_all else _sample(sources, entries)
+    sample = sources if read_all else evenly_spaced(sources, SAMPLE)
     estimates = tuple(estimate_source(run.settings, source) for source in with_bar(sample, "photograph"))
     sampled_bytes = sum(source.bytes for source in estimates)
     if len(sample) == len(sources):
@@ -176,33 +170,8 @@ def estimate_run(
         start_seconds=start_seconds,
         pair_seconds=sum(source.seconds for source in estimates) * growth / n_jobs,
         disk_seconds=len(tasks) * COMMIT_SECONDS + size * _seconds_per_byte(folder),
-        tier_ns=_tier_ns(without_dark_frames(entry_configs(config)[0]), estimates, quick),
-        entries=entries,
+        tier_ns=_tier_ns(without_dark_frames(config), estimates, quick),
     )
-
-
-def _drawn_entries(config: Config, sources: Sequence[Source]) -> tuple[int, ...] | None:
-    """Return the entry of a mixture that each source draws, if all files are so few that they are read."""
-    if config.mixture is None or _headers_read(config, sources) < len(sources):
-        return None
-    return tuple(
-        entry_number(config, stream_key(config.seed, *source.stream_identity(_sha256(config, source))))
-        for source in with_bar(sources, "photograph")
-    )
-
-
-def _sha256(config: Config, source: Source) -> str:
-    root = config.source.place
-    return load_source(config.source, source)[0] if root is None else content_sha256(root, source)
-
-
-def _sample(sources: Sequence[Source], entries: Sequence[int] | None) -> list[Source]:
-    """Return evenly spaced sources, and the first one of each entry of a mixture."""
-    sample = {source.index: source for source in evenly_spaced(sources, SAMPLE)}
-    for number in set(entries or ()):
-        first = sources[(entries or ()).index(number)]
-        sample[first.index] = first
-    return [sample[index] for index in sorted(sample)]
 
 
 def _headers_read(config: Config, sources: Sequence[Source]) -> int:
@@ -296,18 +265,16 @@ def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> float:
     seconds that a run spends on its kernels, 0 if they had to be compiled: a run then only loads them.
     """
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
-    entries = entry_configs(config)
-    configs = (*entries, *(replace(entry, accuracy=tier) for tier in tiers for entry in entries))
+    configs = (config, *(replace(config, accuracy=tier) for tier in tiers))
     plans = [plan_pairs(other, "0" * 64, facts=facts_for(other, srgb)) for other in configs]
     needed = [{self_test.kernels(plan) for plan in group} for group in plans]
     missing = {kernels for kernels in set().union(*needed) if not self_test.are_compiled(kernels)}
     if missing:
         LOGGER.info(COMPILING)
     started = time.perf_counter()
-    for group in plans[: len(entries)]:
-        for _ in make_pairs(srgb, group):
-            pass
-    run_kernels = set().union(*needed[: len(entries)])
+    for _ in make_pairs(srgb, plans[0]):
+        pass
+    run_kernels = needed[0]
     for kernels in run_kernels:
         self_test.failures(kernels)  # a run does so before its first pair
     seconds = time.perf_counter() - started

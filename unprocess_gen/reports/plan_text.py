@@ -33,6 +33,7 @@ def format_estimate(estimate: RunEstimate) -> str:
     notes = unmatched_sentence(run.listing.unmatched), *run.listing.warnings, shards_warning(config, run.sources)
     basis = "" if estimate.exact else f", from {estimate.headers} headers (--all reads every source: exact)"
     place = place_text(config.source.place or "the built-in scenes")
+    readable = [source for source in read if source.levels]
     lines = [
         f"sources   {len(run.sources)} in {config.source.list or place}; {len(read)} of them read",
         *(f"          {note}" for note in notes if note),
@@ -49,27 +50,10 @@ def format_estimate(estimate: RunEstimate) -> str:
         f"{format_duration(estimate.disk_seconds)}",
         *_failure_lines(config, read),
         _accuracy_line(config.accuracy, estimate.tier_ns),
-        *_entry_lines(estimate),
+        *_pattern_lines(config),
+        *noise_lines(config, readable, estimate.run.settings.dark_frames),
     ]
     return "\n".join(lines)
-
-
-def _entry_lines(estimate: RunEstimate) -> list[str]:
-    """Scene, noise, effects and warnings, for each entry of a mixture with its share."""
-    config, dark_frames = estimate.run.config, estimate.run.settings.dark_frames
-    readable = [source for source in estimate.source_estimates if source.levels]
-    if config.mixture is None:
-        return [*_pattern_lines(config), *noise_lines(config, readable, dark_frames)]
-    total, sources, lines = sum(entry.weight for entry in config.mixture), len(estimate.run.sources), list[str]()
-    for number, entry in enumerate(interpretation.entry_configs(config)):
-        weight = config.mixture[number].weight
-        expected = f"weight {weight:g} of {total:g}: about {weight / total * sources:.1f} of {sources} sources"
-        drawn = "" if estimate.entries is None else f", {estimate.entries.count(number)} in this listing"
-        names = f"camera={entry.camera.name} noise={entry.noise.name} scene={entry.scene.name}"
-        lines += _labelled("mixture", [f"entry {number}, {names}; {expected}{drawn}"])
-        lines += _pattern_lines(entry)
-        lines += noise_lines(entry, [image for image in readable if image.levels[0].mixture == number], dark_frames)
-    return lines
 
 
 def format_duration(seconds: float) -> str:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.config.schema import ENTRY_GROUPS, Config
+from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.values import error_in_one_line, value_text
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
@@ -109,11 +109,8 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlace
 
 
 def shown_settings(config: Config) -> dict[str, str]:
-    """Return `SETTINGS_SHOWN` that are not null, as text; those that entries of a mixture differ in are left out."""
+    """Return `SETTINGS_SHOWN` that are not null, as text."""
     settings: dict[str, Any] = {key: functools.reduce(getattr, key.split("."), config) for key in SETTINGS_SHOWN}
-    if config.mixture is not None:
-        settings = {key: value for key, value in settings.items() if key.partition(".")[0] not in ENTRY_GROUPS}
-        settings["mixture"] = f"{len(config.mixture)} entries, in config.yaml"
     return {key: value_text(value) for key, value in settings.items() if value is not None}
 
 

@@ -29,7 +29,7 @@ NUMBER_COLUMNS = tuple(
 )
 TEXT_COLUMNS = (
     *("camera", "sensor_unit", "scene", "noise", "noise_law", "tone", "gamma", "highlight", "pattern", "accuracy"),
-    *("split", "mixture"),
+    "split",
 )
 SITE_COLUMNS = (
     *("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy_clipped_high"),

@@ -7,10 +7,8 @@ from dataclasses import replace
 from functools import partial
 
 from unprocess_gen.config.composition import OptionFolders
-from unprocess_gen.config.interpretation import entry_config
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.recomposition import Recomposition, override_text, overrides_of
-from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import is_dataset
@@ -90,8 +88,6 @@ def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
     manifest, source, given = folder / "manifest.csv", source_of(row), dict(start.settings)
     config, kind = read_dataset_yaml(folder / "config.yaml")
     require_photographs(config.source, "explore")
-    if config.mixture is not None:
-        config = replaced(entry_config(config, int(row["mixture"] or 0)), {"mixture": None})
     settings = overrides_of(config)
     settings.pop("source.limit", None)
     index = int(image_key(row))
