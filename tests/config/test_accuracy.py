@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,15 +21,14 @@ from unprocess_gen.config.accuracy import (
 from unprocess_gen.config.schema import AccuracyConfig
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import NEAR_NORMAL
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.sources.scenes import synthetic
 
 METHODS_BY_NAME = {method.spelled: method for method in METHODS}
-EXACT = AccuracyConfig("exact", False, 0.0, 0.0, 1e-6, 0.0)
-ALL = AccuracyConfig("anything", False, math.inf, 1.0, math.inf, 1.0, normal_shot=False)
+EXACT = AccuracyConfig("exact", False, 0.0, 0.0, 1e-6)
+ALL = AccuracyConfig("anything", False, math.inf, 1.0, math.inf)
 
 
 @pytest.fixture(scope="module")
@@ -54,22 +52,13 @@ def test_unlimited_budget_chooses_cheapest_method_of_every_stage() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("changes", "method"),
-    [({}, "shot:inversion"), ({"normal_shot": True}, NEAR_NORMAL), ({"law_distance": 0.0}, "shot:inversion")],
-)
-def test_normals_replace_counts_only_if_the_settings_ask_for_it(changes: dict[str, Any], method: str) -> None:
-    assert method in choose_methods(replace(ALL, **changes), counts_electrons=True)
-
-
 @given(
     dn=st.sampled_from([0.0, 0.5, 1.0, 2.0]),
     share=st.sampled_from([0.0, 1e-4, 1e-3, 1.0]),
     normal=st.sampled_from([1.5e-7, 1e-6, 1e-3, 1.0]),
-    distance=st.sampled_from([0.0, 5e-3]),
 )
-def test_chosen_methods_fit_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
-    some = AccuracyConfig("some", False, dn, share, normal, distance, normal_shot=False)
+def test_chosen_methods_fit_and_nothing_cheaper_does(dn: float, share: float, normal: float) -> None:
+    some = AccuracyConfig("some", False, dn, share, normal)
     chosen = [METHODS_BY_NAME[spelled] for spelled in choose_methods(some, counts_electrons=False)]
     cheaper = IMPLEMENTATIONS[: IMPLEMENTATIONS.index(chosen[0].implementation)]
 
@@ -82,7 +71,7 @@ def test_chosen_methods_fit_and_nothing_cheaper_does(dn: float, share: float, no
 def test_exact_tier_has_no_error_in_dn() -> None:
     chosen = set(choose_methods(EXACT, counts_electrons=True))
 
-    assert all(one.clean_dn == 0 and not one.approximates_law for one in METHODS if one.spelled in chosen)
+    assert all(one.clean_dn == 0 for one in METHODS if one.spelled in chosen)
 
 
 def test_noise_without_counts_has_no_shot_method() -> None:
@@ -112,7 +101,6 @@ def test_custom_budget_chooses_by_its_limits(settings: Settings) -> None:
             "accuracy.normal_error=1e-09: no method is that accurate; expected at least 1.5e-07",
         ),
         ("accuracy.clean_dn=-1", "accuracy.clean_dn=-1.0: expected a number of 0 or more"),
-        ("accuracy.law_distance=nan", "accuracy.law_distance=nan: expected a number of 0 or more"),
         ("accuracy.name='a b'", "accuracy.name='a b': expected up to 100 letters"),
     ],
 )
@@ -130,7 +118,7 @@ def test_plan_contains_the_methods_of_its_tier(settings: Settings, noise: str, s
     config = settings(noise, "accuracy=fast")
     plan = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
 
-    assert (plan.accuracy.name, plan.accuracy.law_distance) == ("fast", 5e-3)
+    assert plan.accuracy.name == "fast"
     assert plan.accuracy.methods == choose_methods(config.accuracy, noise == "noise=nikon_d850")
 
 

@@ -57,7 +57,7 @@ PATCH = Patch(number=0, y=0, x=0, height=2, width=3)
 
 PHYSICS = Physics(
     iso=800.0, exposure_s=0.02, temperature_c=25.0, dn_per_e=1.5, prnu_std=0.005, dark_e=0.02, dark_offset="removed",
-    hot_pixel_share=1e-5, hot_pixel_e=1.0, full_well_e=0.0, read_law="tukey", read_shape=-0.1, read_std_dn=3.0,
+    hot_pixel_share=1e-5, hot_pixel_e=1.0, full_well_e=0.0, read_law="tukey_lambda", read_shape=-0.1, read_std_dn=3.0,
     row_std_dn=0.5, column_std_dn=0.25, black_error_dn=(0.1, -0.2, 0.3, -0.4), dead_pixel_share=1e-6,
     sensor_unit="000000000000001f", body_key=0xF1, fixed_pattern_in_clean=True,
 )  # fmt: skip

@@ -98,8 +98,6 @@ def test_measured_errors_are_within_the_stated_limits(
     assert row.error_max is not None
     if method.stage == "normal":
         assert 0 < row.error_max <= method.normal_error
-    elif method.approximates_law:
-        return  # tests/config/test_accuracy.py compares the distributions
     else:
         changed_by_chance = 5 * math.sqrt(method.clean_changed_share / (3 * math.prod(LITTLE.sampled)))
         assert row.error_max <= method.clean_dn
@@ -374,7 +372,7 @@ def test_any_config_can_be_measured(overrides: tuple[str, ...], settings: Settin
 
 
 def test_budget_that_is_no_tier_has_its_own_name(settings: Settings) -> None:
-    opened = session.open_session(settings("accuracy.law_distance=1e-3"), SMALLEST)
+    opened = session.open_session(settings("accuracy.normal_error=1e-4"), SMALLEST)
 
     assert list(opened.tiers) == [*TIERS, "exact_changed"]
     assert opened.given_tier == "exact_changed"

@@ -33,8 +33,8 @@ def test_omitted_effect_in_electrons_changes_no_other_effect(effect: str, figure
 
 
 ALL = {
-    **COUNTED, "prnu_std": 0.02, "read_law": "tukey", "read_std_dn": 7.5, "row_std_dn": 3.3, "column_std_dn": 2.2,
-    "black_error_dn": (1.5, 0.25, -3.125, 2.0), "dead_pixel_share": 0.1, "full_well_e": 1e5,
+    **COUNTED, "prnu_std": 0.02, "read_law": "tukey_lambda", "read_std_dn": 7.5, "row_std_dn": 3.3,
+    "column_std_dn": 2.2, "black_error_dn": (1.5, 0.25, -3.125, 2.0), "dead_pixel_share": 0.1, "full_well_e": 1e5,
 }  # fmt: skip
 
 

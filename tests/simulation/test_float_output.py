@@ -198,8 +198,8 @@ def test_an_odd_side_cannot_be_packed(shape: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("counts", [False, True])
 def test_all_budgets_except_reference_select_the_same_methods(counts: bool) -> None:
-    exact = AccuracyConfig("e", False, 0, 0, 1e-6, 0)
-    fast = AccuracyConfig("f", False, 1, 1e-3, 1e-3, 5e-3, normal_shot=False)
+    exact = AccuracyConfig("e", False, 0, 0, 1e-6)
+    fast = AccuracyConfig("f", False, 1, 1e-3, 1e-3)
     assert choose_methods(exact, counts, normalised=True) == choose_methods(fast, counts, normalised=True)
     assert not any(one.startswith("quantise:") for one in choose_methods(exact, counts, normalised=True))
 

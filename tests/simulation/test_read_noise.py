@@ -85,12 +85,6 @@ def test_unit_tukey_table_has_variance_1(shape: float) -> None:
         assert abs(draw_variance(unit_tukey_table(shape)) - 1) < Decimal("1e-15")
 
 
-@pytest.mark.parametrize(("shape", "missing"), [(-0.3, 2.35e-4), (-0.4, 0.0151), (-0.45, 0.1225)])
-def test_tukey_table_of_0_1_lacks_variance_of_the_tails(shape: float, missing: float) -> None:
-    with localcontext(prec=40):
-        assert 1 - float(draw_variance(tukey_table(shape))) == pytest.approx(missing, rel=0.01)
-
-
 def test_draw_variance_is_that_of_every_word_of_an_octave() -> None:
     """Compare with the values of all words j below 2**18, in a table that is 0 above."""
     table = unit_tukey_table(-0.4).copy()
@@ -115,7 +109,6 @@ def test_quantiles_of_heavy_tails_keep_their_shape(shape: float) -> None:
     ("distribution", "shape"),
     [
         ("gaussian", 0.0),
-        *(("tukey", shape) for shape in SHAPES),
         *(("tukey_lambda", shape) for shape in (*SHAPES, -0.3)),
     ],
 )
@@ -128,7 +121,7 @@ def test_read_noise_has_given_standard_deviation_for_every_distribution(distribu
         second = float(draw_variance(table))
     fourth, reach = table_moment(table, 4), float(np.abs(table[0]).sum()) * std + 1
     variance = std**2 * second + 1 / 12
-    assert abs(second - 1) <= (1e-4 if distribution == "tukey" else 1e-9)
+    assert abs(second - 1) <= 1e-9
     assert bounds_off(deviation, 0, variance, reach) <= 1
     spread = std**4 * fourth + std**2 / 2 + 1 / 80 - variance**2
     assert bounds_off(deviation**2, variance, spread, reach**2) <= 1

@@ -13,7 +13,7 @@ How the error statements were obtained: ``docs/design/accuracy.md``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from unprocess_gen.config.schema import AccuracyConfig
@@ -35,8 +35,6 @@ class Method:
         Description for the accuracy report.
     clean_dn, clean_changed_share, normal_error : float
         Largest errors; units as in `AccuracyConfig`.
-    approximates_law : bool
-        Whether a normal distribution replaces the Poisson distribution within ``AccuracyConfig.law_distance``.
     """
 
     stage: str
@@ -46,7 +44,6 @@ class Method:
     clean_dn: float = 0.0
     clean_changed_share: float = 0.0
     normal_error: float = 0.0
-    approximates_law: bool = False
 
     @property
     def spelled(self) -> str:
@@ -65,7 +62,6 @@ class Method:
             and self.clean_dn <= budget.clean_dn
             and self.clean_changed_share <= budget.clean_changed_share
             and self.normal_error <= budget.normal_error
-            and (budget.draws_normals or not self.approximates_law)
         )
 
 
@@ -94,8 +90,6 @@ METHODS = (
     Method("normal", "polynomial_float32", "float32", "polynomial in √(-log p)", normal_error=POLYNOMIAL_NORMAL),
     Method("normal", "quadratic_float64", "float64", "1024 quadratics, or the same DN", normal_error=QUADRATIC_NORMAL),
     Method("normal", "numpy_float64", "numpy", "1024 quadratics, with NumPy", normal_error=QUADRATIC_NORMAL),
-    # simulated by NumPy, but rows of 0.1 and 0.2 name it with the methods of float64
-    Method("shot", "gaussian_where_near", "float64", "normals where near (0.1 and 0.2)", approximates_law=True),
     Method("shot", "inversion", "float64", "Poisson counts by inversion of the CDF, correct to 2^-32"),
     Method("shot", "numpy_inversion", "numpy", "Poisson counts by inversion of the CDF, with NumPy"),
     Method("effects", "fused_float64", "float64", "effects in order, row by row"),
@@ -145,8 +139,7 @@ def choose_methods(
     counts_electrons : bool
         Whether the noise has Poisson counts, which have no float32 implementation.
     normalised : bool
-        Whether frames are normalised floats. They are not rounded and are exact under every budget. Their stage
-        ``effects`` is recorded as NumPy, as 0.1 computed it.
+        Whether frames are normalised floats. They are not rounded and are exact under every budget.
     steep : bool
         Whether float32 is excluded: by `is_steep`, or because the unrounded clean frame is part of the dataset.
 
@@ -163,11 +156,8 @@ def choose_methods(
     stages = [stage for stage in STAGES if counts_electrons or stage not in COUNT_STAGES]
     if normalised:
         stages = [stage for stage in stages if stage not in INTEGER_STAGES]
-        budget = replace(budget, law_distance=0.0)
     for implementation in IMPLEMENTATIONS[1:] if steep or normalised else IMPLEMENTATIONS:
-        chosen = [
-            _first(stage, "numpy" if normalised and stage == "effects" else implementation, budget) for stage in stages
-        ]
+        chosen = [_first(stage, implementation, budget) for stage in stages]
         if None not in chosen:
             return tuple(method.spelled for method in chosen if method is not None)
     best = min(method.normal_error for method in methods_of_stage("normal"))  # the others have an exact method

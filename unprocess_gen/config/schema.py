@@ -629,11 +629,6 @@ class AccuracyConfig(Group):
         largest fraction of clean values that differ, at 14 bits
     normal_error
         largest error of a normal deviate against the true quantile
-    law_distance
-        largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead
-    normal_shot
-        normal distribution in place of Poisson counts within law_distance, as in 0.1 and 0.2; simulated with
-        NumPy, which is slow
     """
 
     name: str = key("exact", limits.NAME)
@@ -641,13 +636,6 @@ class AccuracyConfig(Group):
     clean_dn: float = key(0.0, Numbers(0), unit="DN")
     clean_changed_share: float = key(0.0, Numbers(0))
     normal_error: float = key(1e-06, Numbers(0), unit="standard deviations")
-    law_distance: float = key(0.0, Numbers(0))
-    normal_shot: bool = key(True, limits.BOOLEAN, since="0.3")
-
-    @property
-    def draws_normals(self) -> bool:
-        """True if normals replace counts."""
-        return self.normal_shot and self.law_distance > 0
 
 
 TOGETHER = "together"

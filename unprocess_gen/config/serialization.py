@@ -22,7 +22,6 @@ from unprocess_gen.config.interpretation import (
     shading_place,
     uses_assumed,
     uses_dark_frames,
-    uses_physics,
 )
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import (
@@ -101,8 +100,6 @@ def _canonical_settings(config: Config) -> dict[str, Any]:
         settings["noise"].pop("dark_frames_level", None)  # decides nothing
     if not is_physical(config.noise):
         settings["effects"].pop("scope", None)  # decides nothing
-    if not (config.accuracy.law_distance and uses_physics(config.noise)):
-        settings["accuracy"].pop("normal_shot", None)  # decides nothing
     if not has_float_clean(config):
         settings["output"].pop("clean_dtype", None)
     for group, keys in NUMBER_KEYS.items():

@@ -110,27 +110,6 @@ def tukey_std(shape: float) -> Decimal:
     return (2 / power**2 * (1 / (1 + 2 * power) - beta)).sqrt()
 
 
-def tukey_core_std(shape: float) -> Decimal:
-    """Return the standard deviation of the normal density that is as curved at 0 as Tukey's lambda density of std 1.
-
-    The density at scale 1 has the second derivative -(1 - λ)(2 - λ)·2**(3λ - 4) at 0; a normal one has -1/(√(2π) σ³).
-
-    Parameters
-    ----------
-    shape : float
-        The distribution's λ, above -½ and below 1.
-
-    Returns
-    -------
-    Decimal
-        The standard deviation, in the precision of the current decimal context; below 1 for shapes below 0.14, whose
-        densities are more peaked than the normal one.
-    """
-    power = Decimal(shape)
-    curvature = (1 - power) * (2 - power) * ((3 * power - 4) * Decimal(2).ln()).exp() * tukey_std(shape) ** 3
-    return (-((2 * PI).sqrt() * curvature).ln() / 3).exp()
-
-
 _BERNOULLI = ((1, 6), (-1, 30), (1, 42), (-1, 30), (5, 66), (-691, 2730), (7, 6), (-3617, 510), (43867, 798))
 _SHIFT = 60
 

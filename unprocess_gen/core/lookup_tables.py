@@ -186,7 +186,7 @@ def quantile_table(law: str, shape: float) -> Float:
     Parameters
     ----------
     law : str
-        ``gaussian``, ``tukey`` as version 0.1 computed it, or ``tukey_lambda`` (`unit_tukey_table`).
+        ``gaussian`` or ``tukey_lambda``.
     shape : float
         Shape of Tukey's lambda distribution.
 
@@ -195,9 +195,7 @@ def quantile_table(law: str, shape: float) -> Float:
     ndarray of float64, [1024, 3]
         Table for standard deviation 1, as `normal_table`; read-only.
     """
-    if law == "gaussian":
-        return normal_table()
-    return tukey_table(shape) if law == "tukey" else unit_tukey_table(shape)
+    return normal_table() if law == "gaussian" else unit_tukey_table(shape)
 
 
 @functools.lru_cache(maxsize=1)

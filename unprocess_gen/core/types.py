@@ -236,9 +236,6 @@ class Facts:
 REFERENCE_METHOD, FLOAT32_METHOD = "colour:numpy_float64", "colour:fused_float32"
 """Methods that select the NumPy reference and the float32 kernels; plans without them use the float64 kernels."""
 
-NEAR_NORMAL = "shot:gaussian_where_near"
-"""Method of recorded settings of 0.1 and 0.2 that selects the NumPy reference too: normals in place of counts."""
-
 UINT16, FLOAT32 = "uint16", "float32"
 """Dtypes of frames."""
 UINT8 = "uint8"
@@ -513,18 +510,15 @@ class AccuracyPlan:
         Name of the budget.
     methods : tuple of str
         Method of each stage.
-    law_distance : float
-        Largest accepted CDF difference of shot plus read noise.
     """
 
     name: str
     methods: tuple[str, ...]
-    law_distance: float = 0.0
 
     @property
     def uses_reference(self) -> bool:
         """True if the NumPy reference is selected."""
-        return REFERENCE_METHOD in self.methods or NEAR_NORMAL in self.methods
+        return REFERENCE_METHOD in self.methods
 
     @property
     def uses_float32(self) -> bool:

@@ -355,7 +355,6 @@ COLUMNS = (
             ("zero_variance", "sites at which the noise has no variance"),
         )
     ),
-    Column("law_distance", "largest accepted CDF distance of shot plus read noise", NOT_NEGATIVE, AccuracyPlan),
     Column("scene", "name of the scene", ANY_TEXT, ScenePlan, "name"),
     Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
     Column("saturated_as", "noisy sites whose clean site is saturated: noisy, pinned to it, or white where the "

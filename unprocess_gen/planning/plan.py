@@ -184,7 +184,6 @@ class Planner:
                     interpretation.is_normalised(config),
                     steep or interpretation.has_float_clean(config),
                 ),
-                config.accuracy.law_distance,
             )
             for steep in (False, True)
         )

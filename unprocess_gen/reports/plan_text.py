@@ -115,10 +115,9 @@ def _failure_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[
 
 def _accuracy_line(chosen: AccuracyConfig, tier_ns: dict[str, float]) -> str:
     """The chosen budget, and its time compared with the time of the tiers."""
-    law_distance = chosen.law_distance if chosen.normal_shot else 0
     line = (
         f"accuracy  {chosen.name}: clean within {chosen.clean_dn:g} DN ({100 * chosen.clean_changed_share:g} % "
-        f"changed), normals within {chosen.normal_error:g} σ, shot noise within {law_distance:g} (CDF)"
+        f"changed), normals within {chosen.normal_error:g} σ"
     )
     if not tier_ns:
         return line

@@ -205,7 +205,7 @@ def pair_ns(
     session: BenchmarkSession, name: str, accuracy: AccuracyConfig, image: BenchmarkImage, edit: str = "unchanged"
 ) -> float:
     """The time of a pair whose camera body was not simulated before."""
-    srgb = image.readable if accuracy.readable or accuracy.normal_shot else image.compiled
+    srgb = image.readable if accuracy.readable else image.compiled
     plan = session.plan(name, accuracy, image, srgb, edit)
     forget_bodies()
     return thread_ns(lambda: make_pair(srgb, plan), srgb[..., 0].size)

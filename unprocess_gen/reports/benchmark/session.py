@@ -40,9 +40,6 @@ RUN_SCENES = ("daylight", "night")
 FALLBACK_ISO = 1600
 """ISO of the physical profile if it is not calibrated at the ISO of the scene."""
 
-LAW_DISTANCE = 5e-3
-"""Budget under which a method that approximates Poisson counts is measured."""
-
 
 @dataclass(frozen=True, slots=True)
 class SampleSizes:
@@ -142,8 +139,6 @@ def budget_for(method: Method, tiers: dict[str, AccuracyConfig]) -> AccuracyConf
     exact = tiers[EXACT]
     if method.spelled in chosen_methods(exact):
         return exact
-    if method.approximates_law:
-        return replace(exact, law_distance=LAW_DISTANCE, normal_shot=True)
     if method.readable:
         return tiers[REFERENCE]
     together = [other for other in METHODS if other.implementation == method.implementation]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.exact_distributions import LOGISTIC, tukey_std
+from unprocess_gen.core.exact_distributions import LOGISTIC
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
 from unprocess_gen.simulation.reference.cfa import tile
@@ -156,20 +156,14 @@ def uniform(width_dn: float) -> EffectNoise:
     return EffectNoise(variance, lambda signal, tau: np.sinc(width_dn * tau / (2 * np.pi)))
 
 
-ALWAYS_COUNTED = (0.0, math.inf)
-
-
-def poisson_noise(
-    gain_dn: float, rate_e: Callable[[Float], Float], normal: tuple[float, float] = ALWAYS_COUNTED
-) -> EffectNoise:
-    """Poisson counts minus their mean, times a gain; normal deviates up to and from the rates ``normal``."""
+def poisson_noise(gain_dn: float, rate_e: Callable[[Float], Float]) -> EffectNoise:
+    """Poisson counts minus their mean, times a gain."""
 
     def factor(signal: Float, tau: Float) -> Complex:
         rate, phase = rate_e(signal), gain_dn * tau
         half_sine = np.sin(0.5 * phase)  # cos - 1 loses digits of small phases
         exponent = rate * (-2 * half_sine * half_sine + 1j * (np.sin(phase) - phase))
-        is_normal = (rate <= normal[0]) | (rate >= normal[1])
-        return np.asarray(np.exp(np.where(is_normal, -0.5 * rate * phase * phase, exponent)))
+        return np.asarray(np.exp(exponent))
 
     return EffectNoise(lambda signal: gain_dn * gain_dn * rate_e(signal), factor)
 
@@ -181,10 +175,9 @@ def known_offset(site: Site, offset_dn: float | Float) -> EffectNoise:
     return EffectNoise(offset_dn=offset_dn)
 
 
-def tukey_noise(std_dn: float, law: str, shape: float) -> EffectNoise:
+def tukey_noise(std_dn: float, shape: float) -> EffectNoise:
     """Read noise of Tukey's lambda distribution."""
-    values, quantiles, logarithms = tukey_distribution(law, shape)
-
+    values, quantiles, logarithms = tukey_distribution(shape)
     largest = -float(np.interp(math.log(RARE), logarithms, quantiles))
     return EffectNoise(
         constant(std_dn * std_dn),
@@ -201,12 +194,11 @@ _FREQUENCIES = np.linspace(0.0, 8.0, 801)
 
 
 @functools.lru_cache(maxsize=256)
-def tukey_distribution(law: str, shape: float) -> tuple[Float, Float, Float]:
+def tukey_distribution(shape: float) -> tuple[Float, Float, Float]:
     """Characteristic function of Tukey's lambda distribution at `_FREQUENCIES`, quantiles, and log probabilities.
 
-    They are for standard deviation 1, as read noise is drawn. The draws of ``"tukey_lambda"`` have this standard
-    deviation; for ``"tukey"`` (version 0.1) the distribution has, and its draws have less. The trapezoidal rule in the
-    logit of the probability p converges quickly: its error is below 3e-6 for shapes from -0.4.
+    They are for draws of standard deviation 1, as read noise is drawn. The trapezoidal rule in the logit of the
+    probability p converges quickly: its error is below 3e-6 for shapes from -0.4.
     """
     logit, step = np.linspace(-40.0, 0.0, 1001, retstep=True)
     p = 1 / (1 + np.exp(-logit))
@@ -214,5 +206,5 @@ def tukey_distribution(law: str, shape: float) -> tuple[Float, Float, Float]:
     weights[-1] /= 2
     tail = np.maximum(p, LEAST_TAIL)
     quantiles = np.log(tail / (1 - tail)) if abs(shape) < LOGISTIC else (tail**shape - (1 - tail) ** shape) / shape
-    std = float(tukey_std(shape)) if law == "tukey" else math.sqrt(float(quantiles**2 @ weights))
+    std = math.sqrt(float(quantiles**2 @ weights))
     return np.cos(np.outer(_FREQUENCIES, quantiles / std)) @ weights, quantiles / std, np.log(p)

@@ -17,9 +17,8 @@ class ReadNumbers(EffectNumbers):
 
     read_law: str = number(
         "gaussian",
-        "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45; tukey "
-        "is that of version 0.1, whose variance is low for shapes below -0.3",
-        words=("gaussian", "tukey", "tukey_lambda"),
+        "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45",
+        words=("gaussian", "tukey_lambda"),
         key_default="gaussian",
     )
     read_shape: float = number(
@@ -72,4 +71,4 @@ class ReadNoise(Effect):
         std = physics.read_std_dn
         if physics.read_law == "gaussian":
             return gaussian(constant(std * std))
-        return tukey_noise(std, physics.read_law, physics.read_shape)
+        return tukey_noise(std, physics.read_shape)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from unprocess_gen.core.types import NEAR_NORMAL, Float, Plan
+from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues, frame_words
-from unprocess_gen.simulation.effects.expectation import ALWAYS_COUNTED, EffectNoise, Site, poisson_noise
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, poisson_noise
 from unprocess_gen.simulation.effects.numbers import DN, EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import FrameFacts
-from unprocess_gen.simulation.reference.near_normal import counts_or_normals, near_limits
 from unprocess_gen.simulation.reference.poisson import poisson
 
 
@@ -21,17 +20,13 @@ class ShotNumbers(EffectNumbers):
 
 def counts(plan: Plan, electrons: Float, origin: Shape = (0, 0)) -> Float:
     """Draw the electrons of light, [H, W]: Poisson counts of their means."""
-    words = frame_words(plan, "shot", electrons.shape, origin)
-    if NEAR_NORMAL in plan.accuracy.methods:
-        return counts_or_normals(plan, words, electrons)
-    return poisson(words, electrons)
+    return poisson(frame_words(plan, "shot", electrons.shape, origin), electrons)
 
 
 def expected_counts(site: Site) -> EffectNoise:
-    """Shot noise; some recorded datasets have normal deviates at some rates."""
-    plan, gain = site.plan, site.gain_dn
-    is_near_normal = NEAR_NORMAL in plan.accuracy.methods and "gain_by_colour" not in plan.noise.effects
-    return poisson_noise(gain, lambda signal: signal / gain, near_limits(plan) if is_near_normal else ALWAYS_COUNTED)
+    """Poisson counts of the electrons of light."""
+    gain = site.gain_dn
+    return poisson_noise(gain, lambda signal: signal / gain)
 
 
 class Shot(Effect):
