@@ -14,7 +14,7 @@ MODULES = {
     "cli/test_messages.py": "writes to /dev/full, sends SIGHUP",
     "pipeline/test_faults.py": "stops and kills processes found in /proc, mounts small disks",
     "pipeline/test_refusals.py": "limits the address space",
-    "pipeline/test_resume.py": "kills processes found in /proc, takes locks of its own",
+    "pipeline/test_resume.py": "kills processes found in /proc",
     "project/test_everywhere.py": "replaces libraries of the Linux loader, reads /proc",
     "sources/test_hostile_files.py": "limits the address space",
     "sources/test_listing.py": "makes pipes, devices and links",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import random
 import shutil
@@ -41,7 +40,7 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.cli.messages import logging_to
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.locks import LockFile, host
+from unprocess_gen.core.locks import LockFile
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline.storage import Storage
@@ -206,36 +205,23 @@ def test_resumed_run_makes_only_missing_shards(begun: Path, make: Make) -> None:
     assert {name: after[name] for name in before} == before
 
 
-def leave(folder: Path) -> Path:
-    """Write half a shard as a process of this host that has ended."""
-    folder.mkdir(parents=True)
-    ended = {"host": host(), "pid": os.getpid(), "start": "0", "mark": "0"}
-    (folder / "owner").write_text(json.dumps(ended))
-    (folder / "shard-00002.tar.1.1").write_bytes(b"half")
-    return folder / "shard-00002.tar.1.1"
-
-
-def test_unfinished_shards_are_deleted_at_the_start(begun: Path, make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    left = [leave(begun / "ds/.work/tmp/host-1-a"), begun / "ds/.work/tmp/shard-00002.tar.1.1"]
-    left[1].write_bytes(b"half")  # as version 0.1 left it
+def test_unfinished_shards_of_a_killed_process_are_deleted_at_the_start(
+    begun: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = begun / "ds/.work/tmp/host-1-a/shard-00002.tar.1.1"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"half")
+    left.parent.with_suffix(".lock").touch()
     there: list[bool] = []
     run_tasks = runner.run_tasks
 
     def looking(*given: Any) -> Any:
-        there.extend(path.exists() for path in left)
+        there.append(left.exists())
         return run_tasks(*given)
 
     monkeypatch.setattr(runner, "run_tasks", looking)
     make(begun / "p", begun / "ds", TWO)
-    assert there == [False, False]
-
-
-def test_unfinished_files_are_deleted_at_the_end(begun: Path, make: Make) -> None:
-    of_another_host = begun / "ds/.work/tmp/elsewhere-1-a"
-    of_another_host.mkdir(parents=True)
-    os.utime(of_another_host, (0, 0))
-    (begun / "ds/.work/manifest.csv.part").write_text("half")
-    make(begun / "p", begun / "ds", TWO)
+    assert there == [False]
     assert_complete(begun / "ds")
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, LockedError, MachineError, UnprocessGenError
 from unprocess_gen.core.files import machine_error
-from unprocess_gen.core.locks import LockFile, has_ended, is_held
+from unprocess_gen.core.locks import LockFile
 from unprocess_gen.core.object_store import ObjectPath, Result, StoreAccessError
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import LocalPath, any_path
@@ -31,10 +31,7 @@ WORK = ".work"
 """Folder below ``out`` for what a run needs until the dataset is finished."""
 
 TMP = f"{WORK}/tmp"
-"""Folder of unfinished files: one folder for each writer."""
-
-OWNER = "owner"
-"""Lock file in the folder of a writer, by which others see whether the writer still runs."""
+"""Folder of unfinished files: for each writer a folder, and a lock file that shows whether it still runs."""
 
 LOCK = "lock"
 
@@ -93,7 +90,7 @@ class Storage:
 
     def close(self) -> None:
         """Delete the unfinished files of this process, and release the lock."""
-        self._delete_scratch()
+        self.delete_scratch()
         if self._lock is not None:
             self._lock.release()
             for folder in (self._lock.path.parent / "tmp", self._lock.path.parent):
@@ -140,44 +137,43 @@ class Storage:
         """Local folder for unfinished files of this process and its workers, named after host and process."""
         if self._owner is None:
             place, prefix = self.path.scratch_place(TMP)
+            place.mkdir(parents=True, exist_ok=True)
             host = re.sub(r"[^A-Za-z0-9.]", "", platform.node())[:40]
-            folder = place / f"{prefix}{host}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
-            folder.mkdir(mode=0o700, parents=True)
-            owner = LockFile(folder / OWNER)
-            owner.acquire(wait=False)
+            owner = LockFile(place / f"{prefix}{host}-{os.getpid()}-{uuid.uuid4().hex[:12]}.lock")
+            owner.acquire(wait=True)  # another process may look at the new file
+            owner.path.with_suffix("").mkdir(mode=0o700)
             self._owner = owner
-        return self._owner.path.parent
+        return self._owner.path.with_suffix("")
 
-    def _delete_scratch(self) -> None:
+    def delete_scratch(self) -> None:
+        """Delete the unfinished files of this process and its workers."""
         if self._owner is not None:
+            shutil.rmtree(self._owner.path.with_suffix(""), ignore_errors=True)
             self._owner.release()
-            shutil.rmtree(self._owner.path.parent, ignore_errors=True)
             self._owner = None
 
     def begin(self) -> None:
-        """Create the folder of shards; remove unfinished files of processes of this host that have ended."""
+        """Create the folder of shards; remove unfinished files of writers that have ended."""
         (self / "shards").mkdir(exist_ok=True)
-        for name, size in (self / TMP).entries().items():
-            if size >= 0:  # version 0.1 had no folders of writers
-                (self / f"{TMP}/{name}").delete()
-        for folder in self._scratch_folders():
-            if has_ended(folder / OWNER):
-                shutil.rmtree(folder, ignore_errors=True)
+        self._delete_ended()
 
     def remove_work(self, keep_records: bool) -> None:
         """Remove the unfinished files of writers that have ended and, unless they are kept, the records of the run."""
-        self._delete_scratch()
-        for folder in self._scratch_folders() if self._lock is not None else ():  # also those of other hosts
-            if not is_held(folder / OWNER):
-                shutil.rmtree(folder, ignore_errors=True)
+        self.delete_scratch()
+        self._delete_ended()
         for name in (self / WORK).entries() if not keep_records else ():
             if name not in (Path(TMP).name, LOCK):
                 (self / f"{WORK}/{name}").delete_all()
 
-    def _scratch_folders(self) -> list[Path]:
-        """List the folders of unfinished files of all writers that this process can see."""
+    def _delete_ended(self) -> None:
+        """Delete the unfinished files of writers that have ended; where there are no locks, a user deletes them."""
         place, prefix = self.path.scratch_place(TMP)
-        return [folder for folder in place.glob(f"{prefix}*") if folder.is_dir()]
+        for path in place.glob(f"{prefix}*.lock"):
+            owner = LockFile(path)
+            with contextlib.suppress(OSError):  # it still runs
+                if owner.acquire(wait=False):
+                    shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+            owner.release()
 
 
 def cannot_write(error: OSError, out: str) -> UnprocessGenError:
