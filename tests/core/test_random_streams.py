@@ -14,6 +14,7 @@ from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.random_streams import (
     STREAMS,
     body_key,
+    frame_word,
     parameter_uniforms,
     patch_words,
     philox4x32,
@@ -145,10 +146,10 @@ def test_the_first_of_identical_files_is_number_0() -> None:
 # Parameters -----------------------------------------------------------------------------------------------------------
 
 
-@given(keys, st.integers(0, 50))
-def test_parameter_n_is_the_first_52_bits_of_counter_n(key: int, number: int) -> None:
-    high, low, _, _ = philox_by_hand((0, number, 0, 0), key)
-    assert parameter_uniforms(key, number + 1)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
+@given(keys, st.integers(0, 50), st.integers(0, 4095), st.integers(0, 2**14 - 1))
+def test_parameter_n_is_the_first_52_bits_of_counter_n(key: int, number: int, level: int, epoch: int) -> None:
+    high, low, _, _ = philox_by_hand((0, number, purpose("parameters", level), frame_word(0, epoch)), key)
+    assert parameter_uniforms(key, number + 1, level, epoch)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
 
 
 @given(keys, st.floats(min_value=1e-3, max_value=1e7), st.integers(0, 20))
