@@ -32,7 +32,6 @@ from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.unprocess import apply_ccm, inverse_smoothstep, invert_gains_per_channel
 from unprocess_gen.sources.dark_shading import median_of, trimmed_mean
 from unprocess_gen.sources.loader import downscaled
-from unprocess_gen.sources.video import colours as video
 
 PAGE = Path(__file__).parent / "hard_cases.md"
 mpmath.mp.dps = 50
@@ -664,23 +663,6 @@ def float_averages() -> Figures:
     plain = np.floor(single / np.float32(4096) + np.float32(0.5)).astype(np.uint64)
     ours = downscaled(codes, 64)
     return float((plain != nearest).mean() * 100), float((ours != nearest).mean() * 100)
-
-
-@case("images", "red codes of BT.709 that are not the nearest, %", "factors times 2^8", "factors times 2^32")
-def video_rounding() -> Figures:
-    """Return the share of red codes that are not the nearest (BT.709, limited range), in percent: 2^8 factors, ours."""
-    luma, chroma = np.meshgrid(np.arange(256), np.arange(256))
-    red, _ = (Fraction(weight) for weight in video._LUMA[1])
-    light, slope = Fraction(255, 219), 2 * (1 - red) * Fraction(255, 224)
-    denominator = math.lcm(light.denominator, slope.denominator)
-    exact = (luma - 16) * int(light * denominator) + (chroma - 128) * int(slope * denominator)
-    nearest = np.clip((2 * exact + denominator) // (2 * denominator), 0, 255)
-
-    def by_factors(bits: int) -> Array:
-        one, two = round(light * 2**bits), round(slope * 2**bits)
-        return np.clip(((luma - 16) * one + (chroma - 128) * two + 2 ** (bits - 1)) >> bits, 0, 255)
-
-    return float((by_factors(8) != nearest).mean() * 100), float((by_factors(video.SHIFT) != nearest).mean() * 100)
 
 
 @case("images", "levels that 256 gray codes have at 14 bits", "exposure ratio 300", "exposure ratio 1")

@@ -37,7 +37,7 @@ from unprocess_gen.core.types import (
     SourcePlan,
 )
 from unprocess_gen.dataset import columns
-from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS, FIRST, NO_FRAMES, NO_VIDEO, Range
+from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS, FIRST, NO_FRAMES, Range
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
     JSON_BYTES,
@@ -200,7 +200,6 @@ BY_DEFAULT = {
 
 
 def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
-    video = dataclasses.replace(SOURCE, name="a.mp4", clip="a.mp4")
     unread = dataclasses.replace(SOURCE, size_bytes=None, reason="unreadable")
     bare = PLAN.replace(effects=(), skipped=())
     conditions = {column.empty_if for column in COLUMNS} - {""}
@@ -225,7 +224,6 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
         "float clean": (row_of(PHYSICAL.replace(clean_dtype="float32")), passed | absent - {same}),
         "without effects": (row_of(bare), passed | absent | {one for one in failed if one.startswith("no effect")}),
         "failed": (failed_row(SOURCE, SHA256, 0, 7, "corrupt", "why"), failed | absent),
-        "failed frame": (failed_row(video, SHA256, 0, 7, "corrupt", "why"), (failed | absent) - {NO_VIDEO}),
         "unread": (failed_row(unread, None, 0, 7, "unreadable", "why"), conditions - passed),
     }
     for name, (row, held) in holding.items():

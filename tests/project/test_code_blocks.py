@@ -137,7 +137,7 @@ class Page:
 
 @pytest.fixture
 def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the folder of a page: ten pictures in `photos`, two folders and a video in `clips`; one core is used."""
+    """Return the folder of a page: ten pictures in `photos`, two folders of frames in `clips`; one core is used."""
     (tmp_path / "photos").mkdir()
     for number in range(10):
         Image.fromarray(pixels(number, 528, 560)).save(tmp_path / "photos" / f"picture_{number}.jpg", quality=95)
@@ -145,10 +145,6 @@ def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "clips" / clip).mkdir(parents=True)
         for number in range(3):
             Image.fromarray(pixels(number, 96, 128)).save(tmp_path / "clips" / clip / f"{number:04}.png")
-    if importlib.util.find_spec("av") is not None:  # helpers.videos skips the test without PyAV
-        from helpers.videos import film, scene
-
-        film(tmp_path / "clips" / "harbour.mp4", "mpeg4", "yuv420p", scene(3))
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
     return tmp_path
 

@@ -34,7 +34,6 @@ ONLY_IN = {
         *("reports.encoding", "reports.explorer.views", "reports.sheets.panels", "camera_noise"),
     },
     "PIL": {"sources.image.decode"},
-    "av": {"sources.video.colours", "sources.video.decode"},
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng", "dataset.export", "sources.raw.decode", "sources.raw.metadata"},
     "rawpy": {"sources.raw.decode", "sources.raw.metadata"},

@@ -12,7 +12,7 @@ pytest_plugins = ["pytester"]
 
 def test_every_line_of_the_table_is_a_promise() -> None:
     rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
-    assert len(PROMISES) == len(rows) >= 40
+    assert len(PROMISES) == len(rows) >= 30
 
 
 def test_files_of_every_promise_exist_and_report_a_figure() -> None:
@@ -26,7 +26,7 @@ def test_files_of_every_promise_exist_and_report_a_figure() -> None:
 def test_list_shows_figures_failures_and_skipped_tests(pytester: pytest.Pytester) -> None:
     pytester.makeini(f"[pytest]\npythonpath = {ROOT / 'tests'}")
     pytester.makeconftest('pytest_plugins = ["helpers.promise_report"]')
-    for promise, lines in {"workers": "", "verify": "    assert False\n", "video": "    pytest.skip()\n"}.items():
+    for promise, lines in {"workers": "", "verify": "    assert False\n", "patches": "    pytest.skip()\n"}.items():
         path = Path(pytester.path, PROMISES[promise].files[0])
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f'import pytest\n\n\ndef test_it(figure):\n    figure("{promise}", "3 of 3")\n{lines}')
@@ -34,6 +34,6 @@ def test_list_shows_figures_failures_and_skipped_tests(pytester: pytest.Pytester
     lines = pytester.runpytest_inprocess("--promises", "-p", "no:cacheprovider").stdout
 
     lines.fnmatch_lines(
-        ["workers: 1 passed: *", "    3 of 3", "video: 1 skipped: *", "verify: 1 failed: *", "repair: not run: *"]
+        ["workers: 1 passed: *", "    3 of 3", "patches: 1 skipped: *", "verify: 1 failed: *", "repair: not run: *"]
     )
     assert lines.str().count("    3 of 3") == 1

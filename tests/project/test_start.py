@@ -18,7 +18,7 @@ assert main() == 0
 print(*sys.modules)
 """
 
-UNUSED = {"joblib", "asyncio", "matplotlib", "PIL", "av", "jinja2"}
+UNUSED = {"joblib", "asyncio", "matplotlib", "PIL", "jinja2"}
 """Modules that are slow or large to import, and that a run of one job from a folder of photographs does not use."""
 
 

@@ -99,12 +99,6 @@ def test_path_outside_the_root_is_never_opened(tmp_path: Path, path: str, monkey
         read_bytes(f"{tmp_path}/root", Source(0, path, path, 10))
 
 
-def test_folder_of_videos_only_is_refused_with_the_setting(tmp_path: Path) -> None:
-    fill(tmp_path, "film.MP4", "notes.txt")
-    with pytest.raises(ConfigError, match=r"set source\.clips=true to read videos as clips"):
-        list_folder(str(tmp_path), ["*.jpg"], True, None, video=["*.mp4"])
-
-
 def test_several_clips_or_one_photograph_give_no_warning(tmp_path: Path) -> None:
     fill(tmp_path, "a/1.jpg", "a/2.jpg", "b/1.jpg")
     assert clip_warnings(number_clips(str(tmp_path), listed(tmp_path).sources)) == ()
@@ -125,14 +119,6 @@ def test_frames_of_different_sizes_in_a_clip_give_one_warning() -> None:
     assert sizes.warnings(frame_sizes(row("a", 2, 2, patch=1), row("a", 5, 5, status="failed"))) == ()
     (warning,) = sizes.warnings(frame_sizes(row("a", 3, 4), row("a", 5, 5)))
     assert "clip a has frames of 4 x 3 and of 3 x 4 pixels" in warning
-
-
-def test_videos_among_photographs_name_the_setting_that_reads_them(tmp_path: Path) -> None:
-    fill(tmp_path, "a.jpg", "b.mp4", "c.mp4")
-    found = list_folder(str(tmp_path), ["*"], True, None, video=["*.mp4"])
-    (warning,) = found.warnings
-    assert warning.startswith("source.include matches videos (b.mp4, …)") and "set source.clips=true" in warning
-    assert list_folder(str(tmp_path), ["*.jpg"], True, None, video=["*.mp4"]).warnings == ()
 
 
 def test_sub_folders_are_ignored_without_recursive(tmp_path: Path) -> None:

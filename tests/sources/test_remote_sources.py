@@ -161,12 +161,6 @@ def test_no_match_names_the_globs(remote: ObjectPath) -> None:
         listed(remote, include="[*.none]")
 
 
-def test_videos_of_a_bucket_are_refused(bucket: ObjectPath) -> None:
-    (bucket / "clip.mp4").write_bytes(b"video")
-    with pytest.raises(ConfigError, match=r"clip\.mp4 is a video in an object store; .*copy the videos"):
-        listed(bucket, clips=True)
-
-
 def test_reads_run_ahead_in_order(s3: str, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
     sources = [Source(index, f"{index:02d}", f"{index:02d}", 2) for index in range(24)]
     for source in sources:

@@ -117,10 +117,7 @@ class SourceConfig(Group):
         colour profiles of photographs: ignore reads pixels as sRGB; with refuse, images with another profile
         fail (extra icc)
     clips
-        treat each folder, and each file that matches video, as a clip: its frames share camera, gains, noise
-        level and fixed patterns
-    video
-        glob patterns of video files, used if clips is true (extra video)
+        treat each folder as a clip: its frames share camera, gains, noise level and fixed patterns
     downscale
         side of the squares whose mean becomes one pixel of 16 bits; 2 removes JPEG artefacts, as Brooks et al.
         did
@@ -156,7 +153,6 @@ class SourceConfig(Group):
     max_failed: int = key(0, Integers(0, 10**9), decides_data=False)
     icc: str = key("ignore", Choice("ignore", "refuse"))
     clips: bool = key(False, limits.BOOLEAN)
-    video: tuple[str, ...] = key((), Limit("a list of patterns"))
     downscale: int = key(1, Integers(1, 64), unit="pixels")
     dequantize: str = key("off", limits.DEQUANTIZE)
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")

@@ -184,7 +184,7 @@ def _check_root(root: str) -> None:
 
 
 def _check_source(source: SourceConfig) -> None:
-    if not source.include and not (source.clips and source.video):
+    if not source.include:
         raise refusal("source.include", [], "expected at least one pattern such as '*.jpg'")
     patch_rule(source)
 

@@ -18,7 +18,7 @@ RESUME = "finished shards are kept; run the same command again to resume"
 """What to do after a run ended early, for messages. It is also true of one part of a run."""
 
 REASONS = {
-    "empty": "the file has no bytes, or the video no frame",
+    "empty": "the file has no bytes",
     "unreadable": "the file cannot be opened or read, or leads outside `source.root`",
     "not_a_file": "the name is not that of a regular file",
     "unsupported": "the format, the codec or the colours of the file are not supported",

@@ -37,8 +37,7 @@ class Source:
     index : int
         Place in the listing, from 0.
     name : str
-        Path below ``source.root`` as in the manifest: joined by ``/``, percent-encoded if necessary. All frames of a
-        video have the name of the video.
+        Path below ``source.root`` as in the manifest: joined by ``/``, percent-encoded if necessary.
     path : str
         Path below ``source.root`` as the operating system spells it (undecodable bytes as surrogate escapes), or the
         name of a synthetic scene.
@@ -51,11 +50,11 @@ class Source:
     sha256 : str or None
         SHA-256 of the file if the listing hashed it, which it does for files that share a size.
     clip : str
-        Name of the clip (its folder or video), or `NO_CLIP`.
+        Name of the clip (its folder), or `NO_CLIP`.
     frame : int
         Number of the frame in its clip, from 0.
     clip_sha256 : str or None
-        SHA-256 of the clip's first frame or of the video, or None without a clip.
+        SHA-256 of the clip's first frame, or None without a clip.
     clip_occurrence : int
         Number of clips before this one with the same ``clip_sha256``.
     frames : int
@@ -77,11 +76,6 @@ class Source:
     clip_occurrence: int = 0
     frames: int = 1
     etag: str | None = None
-
-    @property
-    def is_video(self) -> bool:
-        """True for a frame of a video file: only there the clip has the name of the source."""
-        return self.clip == self.name != NO_CLIP
 
     def stream_identity(self, sha256: str) -> tuple[str, int]:
         """Return the digest and occurrence number that key the random streams.

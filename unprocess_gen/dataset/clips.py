@@ -51,7 +51,7 @@ class Clip(_Frames):
 
 
 class RawClips:
-    """Read the clips of a dataset by number: a map-style dataset of videos.
+    """Read the clips of a dataset by number: a map-style dataset.
 
     ``clips[i]`` is a `Clip`. A clip with several noise levels, draws or patches is an item for each of them, in the
     order of the manifest. Frames that failed are missing; the column ``frame`` of the rows numbers the others. An

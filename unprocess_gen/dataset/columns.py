@@ -146,8 +146,6 @@ NO_DARK_FRAME = "there is no dark frame"
 
 NO_RAW = "the source is not raw, or it failed"
 
-NO_VIDEO = "the source failed, unless it is a frame of a video"
-
 
 HEXADECIMAL = Spelling("{:016x}".format, lambda text: int(text, 16))
 LIST = Spelling(";".join, lambda text: tuple(text.split(";")) if text else ())
@@ -374,8 +372,8 @@ COLUMNS = (
            spelling=FLAG),
     Column("level", "number of the noise level, from 0", integers(0, 99), NoisePlan),
     Column("draw", "number of the draw at this level, from 0", integers(0, 99), NoisePlan),
-    Column("frame", "number of the frame in its clip, from 0", COORDINATE, NoisePlan, empty_if=NO_VIDEO),
-    Column("clip", "name of the clip; none for single photographs", ANY_TEXT, Source, empty_if=NO_VIDEO),
+    Column("frame", "number of the frame in its clip, from 0", COORDINATE, NoisePlan),
+    Column("clip", "name of the clip; none for single photographs", ANY_TEXT, Source),
     Column("downscale", "side of the squares of source pixels that were averaged", integers(1, 64), SourcePlan,
            unit="pixels"),
     Column("dequantize", "dequantization of 8-bit codes: off, dither or dither_all",

@@ -74,7 +74,7 @@ def pair_row(
     key : str
         Key of the pair (`keys.pair_key`).
     source : Source
-        Photograph, video frame or scene.
+        Photograph or scene.
     sha256 : str
         SHA-256 of the source's bytes, 64 hexadecimal digits.
     orientation : int
@@ -121,7 +121,7 @@ def failed_row(
     Parameters
     ----------
     source : Source
-        Photograph, video frame or scene.
+        Photograph or scene.
     sha256 : str or None
         SHA-256 of the source's bytes; None if they could not be read.
     shard : int
@@ -138,11 +138,10 @@ def failed_row(
     Returns
     -------
     Row
-        Value by column. Only frames of a video have values for ``frame`` and ``clip``, which identify them.
+        Value by column.
     """
-    place: dict[str, Value] = {"frame": source.frame, "clip": source.clip} if source.is_video else {}
     failure = {"status": status, "reason": reason, "detail": detail_text(detail)}
-    return _row(source, sha256, shard, seed, {**failure, **place})
+    return _row(source, sha256, shard, seed, failure)
 
 
 def detail_text(text: str) -> str:

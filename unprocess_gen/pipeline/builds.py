@@ -108,7 +108,7 @@ class Build:
         if photographs is not None:
             names = ",".join(self.recipe.photographs)
             source = [f"source.root={photographs}", f"source.include=[{names}]", "source.recursive=false"]
-        return ["source.video=[]", *source, *self.recipe.overrides, *self.recipe.sweep, f"out={folder}"]
+        return [*source, *self.recipe.overrides, *self.recipe.sweep, f"out={folder}"]
 
     def new_columns(self, folder: Path) -> list[str]:
         """List the columns of the datasets that are newer than the build."""

@@ -40,12 +40,8 @@ from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, RunContext, ShardReport
 from unprocess_gen.pipeline.workspace import Workspace
 from unprocess_gen.sources.clips import ClipSizes
 from unprocess_gen.sources.raw.decode import decoder_versions
-from unprocess_gen.sources.video.decode import is_installed
 
-PACKAGES = (
-    *("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash"),
-    *(("av",) if is_installed() else ()),
-)
+PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
 """Packages whose versions ``dataset.json`` records."""
 
 

@@ -207,22 +207,15 @@ def _check_temporary_space(needed: int, out: ObjectPath) -> None:
 
 
 def _sampled_bytes(config: Config, sources: Sequence[Source], count: int) -> list[int]:
-    """Bytes of at most ``count`` evenly spaced sources in their shards, 0 for sources that will fail.
-
-    Frames of all videos are taken to be as large as frames of the first, because opening a video reads all of it.
-    """
+    """Bytes of at most ``count`` evenly spaced sources in their shards, 0 for sources that will fail."""
     sizes: list[int] = []
-    frame_size = None
     sample = evenly_spaced(sources, count)
     with reading_ahead(config.source.place, read_bytes, sample) as read:
         for source in sample:
-            size = frame_size if source.is_video else None
-            if size is None:
-                with suppress(SourceError, MachineError):
-                    size = _size_in_shard(config, source, read)
-            if source.is_video:
-                frame_size = size
-            sizes.append(size or 0)
+            size = 0
+            with suppress(SourceError, MachineError):
+                size = _size_in_shard(config, source, read)
+            sizes.append(size)
     return sizes
 
 
@@ -230,8 +223,8 @@ def _size_in_shard(config: Config, source: Source, read: ReadFile) -> int:
     side, bits = config.source.downscale, 8
     if config.source.place is None:
         height, width = synthetic.SCENE_SIZES.get(source.path, synthetic.DEFAULT_SIZE)
-    elif source.is_video or config.source.kind == "raw":
-        height, width = load_source(config.source, replace(source, frame=0))[1].srgb.shape[:2]
+    elif config.source.kind == "raw":
+        height, width = load_source(config.source, source)[1].srgb.shape[:2]
         side = 1
     else:
         header = probe(read(config.source.place, source))

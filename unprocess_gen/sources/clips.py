@@ -12,14 +12,14 @@ from unprocess_gen.sources.reading import content_sha256, name_sha256
 
 
 def number_clips(root: Root | None, sources: Sequence[Source]) -> tuple[Source, ...]:
-    """Make each folder a clip whose files are frames 0, 1, … in listing order; videos are clips already.
+    """Make each folder a clip whose files are frames 0, 1, … in listing order.
 
     The digest of a clip's first file identifies the clip, so that adding or removing other clips changes nothing. If
     that file cannot be read, or is a built-in scene (no ``root``), the digest of its name is used.
     """
     clips: dict[str, list[Source]] = {}
     for source in sources:
-        clips.setdefault(source.name if source.is_video else source.name.rpartition("/")[0] or ".", []).append(source)
+        clips.setdefault(source.name.rpartition("/")[0] or ".", []).append(source)
     seen: Counter[str] = Counter()
     placed: dict[int, Source] = {}
     for clip, frames in clips.items():
@@ -35,7 +35,7 @@ def number_clips(root: Root | None, sources: Sequence[Source]) -> tuple[Source, 
 def clip_warnings(sources: Sequence[Source]) -> tuple[str, ...]:
     """Return a warning if one folder of several photographs is the only clip."""
     clips = {source.clip for source in sources}
-    if len(sources) < 2 or len(clips) != 1 or sources[0].is_video:
+    if len(sources) < 2 or len(clips) != 1:
         return ()
     return (
         f"source.clips=true: all {len(sources)} photographs are in one folder and become frames of one clip; "

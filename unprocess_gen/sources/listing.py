@@ -75,9 +75,7 @@ class Listing:
         return sum(self.unmatched.values())
 
 
-def list_folder(
-    root: Root, include: Sequence[str], recursive: bool, limit: int | None, video: Sequence[str] = ()
-) -> Listing:
+def list_folder(root: Root, include: Sequence[str], recursive: bool, limit: int | None) -> Listing:
     """List the files below ``root`` that the globs match, ordered by the bytes of their relative paths.
 
     Parameters
@@ -90,8 +88,6 @@ def list_folder(
         Whether to list sub-folders too, also through links.
     limit : int or None
         Keep the first ``limit`` files; None keeps all.
-    video : sequence of str, optional
-        Globs of videos that this listing leaves out. They decide the advice of messages only.
 
     Returns
     -------
@@ -106,16 +102,15 @@ def list_folder(
     single = _single_file(root)
     if single is not None:
         return Listing((_source(0, single),))
-    matches, is_video = matcher(include), matcher(video)
+    matches = matcher(include)
     matched: list[Entry] = []
-    suffixes, skipped_links, has_video = Counter[str](), 0, False
+    suffixes, skipped_links = Counter[str](), 0
     try:
         for entry in root_path(root).walk_entries(recursive):
             if matches(entry.path):
                 matched.append(entry)
             elif entry.kind is EntryKind.FILE:
                 suffixes[PurePosixPath(encode_name(entry.path)).suffix.lower()] += 1
-                has_video = has_video or is_video(entry.path)
             elif entry.kind is EntryKind.UNREADABLE and recursive:  # may be a folder of photographs
                 raise _unreadable_folder(root, entry.path, entry.problem)
             skipped_links += recursive and entry.kind is EntryKind.LOOP
@@ -129,12 +124,11 @@ def list_folder(
         advice += "choose a folder of photographs or other globs"
         raise ConfigError(
             f"{place_setting(root)}: no file matches source.include={list(include)} "
-            f"({'with' if recursive else 'without'} sub-folders); "
-            + ("set source.clips=true to read videos as clips" if has_video else advice)
+            f"({'with' if recursive else 'without'} sub-folders); {advice}"
         )
     in_order = sorted(matched, key=lambda entry: os.fsencode(entry.path))
     sources = tuple(_source(index, entry) for index, entry in enumerate(itertools.islice(in_order, limit)))
-    return Listing(sources, skipped_links, unmatched, _video_warnings(sources, is_video))
+    return Listing(sources, skipped_links, unmatched)
 
 
 def list_file(root: Root, file: str, limit: int | None) -> Listing:
@@ -275,15 +269,3 @@ _REASONS = {EntryKind.BROKEN_LINK: "unreadable", EntryKind.UNREADABLE: "unreadab
 def _source(index: int, entry: Entry) -> Source:
     reason = _REASONS.get(entry.kind, "not_a_file")
     return Source(index, encode_name(entry.path), entry.path, entry.size, reason, etag=entry.etag)
-
-
-def _video_warnings(sources: Sequence[Source], is_video: Callable[[str], bool]) -> tuple[str, ...]:
-    """Return a warning if the globs of photographs match videos; each of them will fail as unsupported."""
-    videos = [source.name for source in sources if is_video(source.path)]
-    if not videos:
-        return ()
-    names = videos[0] + (", …" if len(videos) > 1 else "")
-    return (
-        f"source.include matches videos ({names}), which cannot be read as photographs; set source.clips=true to read "
-        "them as clips",
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
@@ -18,9 +17,6 @@ from unprocess_gen.sources.names import encode_name
 
 MAX_FILE_BYTES = 2**30
 """Larger photographs are refused unread. 2^26 pixels of 16-bit RGBA, the largest accepted image, take half of it."""
-
-Stamp = tuple[int, int, int, int]
-"""Device, inode, size in bytes and modification time in nanoseconds of a file."""
 
 _RESTORE = "restore it, or choose another out when nothing writes to source.root"
 
@@ -50,14 +46,14 @@ def source_file(root: Root, path: str) -> LocalPath | ObjectPath:
 
 
 @contextmanager
-def opened(root: Root, source: Source, has_limit: bool = True) -> Iterator[BinaryIO]:
+def opened(root: Root, source: Source) -> Iterator[BinaryIO]:
     """Open a source, unless it is not, or no longer, the regular file that was listed.
 
     Raises
     ------
     SourceError
         With ``source.reason`` if the listing gave one; ``not_a_file``, ``unreadable``, or ``too_large``: more than
-        `MAX_FILE_BYTES` if ``has_limit``.
+        `MAX_FILE_BYTES`.
     MachineError
         If size or ETag is not the listed one: the file changed during the run.
     """
@@ -65,7 +61,7 @@ def opened(root: Root, source: Source, has_limit: bool = True) -> Iterator[Binar
         raise SourceError(source.reason, f"{source.name} was not a readable file when the folder was listed")
     try:
         with source_file(root, source.path).open_listed(source.size_bytes or 0, source.etag) as (file, size_bytes):
-            if has_limit and size_bytes > MAX_FILE_BYTES:
+            if size_bytes > MAX_FILE_BYTES:
                 raise SourceError("too_large", f"{source.name} has {size_bytes} bytes, more than {MAX_FILE_BYTES}")
             _check_size(source, size_bytes, "since it was listed")
             yield file
@@ -108,16 +104,3 @@ def content_sha256(root: Root, source: Source) -> str:
 def name_sha256(source: Source) -> str:
     """SHA-256 of a source's name."""
     return hashlib.sha256(source.name.encode()).hexdigest()
-
-
-def stamp(root: Root, source: Source) -> Stamp:
-    """Device, inode, size and modification time of a local file, to detect a replaced file; raise as `opened`."""
-    with opened(root, source, has_limit=False) as file:
-        status = os.fstat(file.fileno())
-        return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def keep_open(root: Root, source: Source) -> BinaryIO:
-    """Open a local file that the caller closes; raise as `opened`."""
-    with opened(root, source, has_limit=False) as file:
-        return os.fdopen(os.dup(file.fileno()), "rb", buffering=0)

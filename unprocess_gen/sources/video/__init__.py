@@ -1,1 +1,0 @@
-"""Read the frames of video files."""
