@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import tracemalloc
 from dataclasses import replace
@@ -67,30 +66,18 @@ def test_simulated_camera_is_measured(calibrated: Any, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_profile_is_used_as_it_was_written(calibrated: Any, run_main: RunMain, tmp_path: Path) -> None:
-    """Noise of data made with it and with the darks that are kept passes the check; so do the captures."""
-    folder, page, kept, listed = (tmp_path / name for name in ("captures", "page.html", "kept", "list.csv"))
-    with_levels(draw(folder, Numbers(), 0))
-    profile = calibrated(folder, "--keep-darks", str(kept), "--report", str(page))
-    assert "Next to known sensors" in page.read_text(encoding="utf-8")
-    scene = ["scene.iso=800", "sensor=generic_14bit", "source.limit=1"]
-    settings = ["--config-dir", profile.parents[1], "noise=mine", *scene]
-    for number, more in enumerate(([], [f"noise.dark_frames={kept / 'iso800'}"])):
-        out = tmp_path / f"ds{number}"
-        assert run_main(*settings, *more, f"out={out}", "n_jobs=1").code == 0
-        assert run_main("verify", out, "--noise").code == 0
-    assert run_main("plan", *settings[:3], "scene.iso=1600").code == 2  # one ISO is not extrapolated
+    """Noise of data made with it passes the check, and its captures agree with it."""
+    folder, out = tmp_path / "captures", tmp_path / "ds"
+    profile = calibrated(with_levels(draw(folder, Numbers(), 0)))
+    settings = ["--config-dir", profile.parents[1], "noise=mine", "sensor=generic_14bit", "source.limit=1"]
+    assert run_main(*settings, "scene.iso=800", f"out={out}", "n_jobs=1").code == 0
+    assert run_main("verify", out, "--noise").code == 0
+    assert run_main("plan", *settings, "scene.iso=1600").code == 2  # one ISO is not extrapolated
     done = run_main("verify", out, "--against", folder)
     assert (done.code, "0 wrong" in done.out) == (0, True), done.err
     other = with_levels(draw(tmp_path / "other", Numbers(2.2, 5.5, 0.0, 2.5, prnu_std=0.02), 0))
-    done = run_main("verify", out, "--against", other, "--to", listed)
-    rows = {(row["number"], row["site"]): row for row in csv.DictReader(listed.read_text().splitlines())}
-    assert (done.code, rows["read_std_dn", ""]["verdict"], rows["column_std_dn", ""]["verdict"]) == (
-        4,
-        "differs",
-        "agrees",
-    )
-    assert float(rows["read_std_dn", ""]["difference_percent"]) == pytest.approx(10, abs=2)
-    assert rows["row_std_dn", ""]["verdict"] == "missing in the frames"
+    done = run_main("verify", out, "--against", other)
+    assert done.code == 4
     for text in ("dn_per_e of the frames is 2.", "lacks it: effect prnu", "black_error_dn of the frames is 2."):
         assert text in done.err
 
@@ -147,14 +134,6 @@ def two_isos(folder: Path) -> Path:
     return captures
 
 
-def test_two_numbers_of_several_isos(calibrated: Any, tmp_path: Path) -> None:
-    """``--two-parameter`` with several ISOs writes branches of gain and noise without light."""
-    profile = calibrated(two_isos(tmp_path), "--two-parameter")
-    (branch,) = yaml.safe_load(profile.read_text(encoding="utf-8"))["branches"]
-    assert (branch["iso"], branch["read_law"]) == ([800, 1600], "gaussian")
-    assert branch.keys() == {"iso", "dn_per_e", "read_law", "read_std_dn"}
-
-
 @pytest.mark.slow
 def test_page_shows_estimates_with_intervals_and_figures(calibrated: Any, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
@@ -189,9 +168,8 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(EMVA is None, reason="the real frames of EMVA 1288 are not on this machine")
 def test_real_frames_give_published_numbers(calibrated: Any) -> None:
-    """K: 0.2808 by the documentation of the frames, 0.283 to 0.291 by range of the fit; row noise 0.505 DN."""
+    """K: 0.283 to 0.291 by the range of the fit; row noise 0.505 DN."""
     found = estimates(calibrated(EMVA))
     gain = found["dn_per_e", 100, None]
     assert gain["low"] <= 0.283 <= 0.291 <= gain["high"]
-    assert found["dn_per_e_emva1288", 100, None]["value"] == pytest.approx(0.2808, rel=0.01)
     assert found["row_std_dn", 100, None]["value"] == pytest.approx(0.505, rel=0.05)

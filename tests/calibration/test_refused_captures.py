@@ -113,8 +113,8 @@ def test_fault_is_refused(fault: str, run_main: RunMain, tmp_path: Path) -> None
     refused(run_main, write(tmp_path / "captures", shots(), change), reason)
 
 
-def refused(run_main: RunMain, folder: Path, reason: str, *flags: str) -> None:
-    done = run_main("calibrate", folder, "--to", folder.parent / "mine.yaml", *flags)
+def refused(run_main: RunMain, folder: Path, reason: str) -> None:
+    done = run_main("calibrate", folder, "--to", folder.parent / "mine.yaml")
     assert (done.code, len(done.err.splitlines())) == (2, 1), done.err
     assert reason in done.err
     assert not list(folder.parent.glob("mine.*"))
@@ -149,17 +149,6 @@ def test_sound_frames_are_accepted(run_main: RunMain, tmp_path: Path) -> None:
     assert profile["name"] == "mine"
     assert (profile["dark_e_per_s"], profile["full_well_e"]) == (None, None)
     assert "dark_e_per_s is null: the captures do not show it" in done.err
-    done = run_main("calibrate", folder, "--to", tmp_path / "mine.yaml", "--two-parameter")
-    assert done.code == 0, done.err
-    profile = yaml.safe_load((tmp_path / "mine.yaml").read_text(encoding="utf-8"))
-    assert profile["a"] == pytest.approx(GAIN, rel=0.08)
-    assert profile["b"] == pytest.approx(READ**2, rel=0.05)
-
-
-def test_quick_frames_give_wider_interval(run_main: RunMain, tmp_path: Path) -> None:
-    folder = write(tmp_path / "captures", shots(darks=2, levels=LEVELS[2:3]), suffix=".png")
-    refused(run_main, folder, "--quick")
-    assert run_main("calibrate", folder, "--to", tmp_path / "mine.yaml", "--quick").code == 0
 
 
 LINES = {

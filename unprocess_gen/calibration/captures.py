@@ -238,7 +238,10 @@ def _from_names(folder: Path, default: str | None = None) -> Iterator[Capture]:
 
 
 def _from_emva(folder: Path) -> Iterator[Capture]:
-    """Yield the frames that an EMVA 1288 description lists: b has exposure (ns) and photons, d has the exposure."""
+    """Yield the frames that an EMVA 1288 description lists; each line b (flats) or d (darks) has the exposure in ns.
+
+    The frames below a line are a measurement of their own, even if another line has its exposure and photons.
+    """
     path, bits = folder / EMVA, None
     kind, seconds, level = "", 0.0, ""
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
@@ -250,7 +253,7 @@ def _from_emva(folder: Path) -> Iterator[Capture]:
                 bits = int(words[1])
             elif words[0] in ("b", "d"):
                 kind, seconds = {"b": "flat", "d": "dark"}[words[0]], float(words[1]) * 1e-9
-                level = f"{float(words[2]):g}" if kind == "flat" else ""
+                level = f"of line {number}"
             elif words[0] == "i" and kind:
                 file = folder / words[1].replace("\\", "/")
                 if not file.is_file():

@@ -19,13 +19,11 @@ from unprocess_gen.core.types import Float
 from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 RANGES = (0.1, 0.3)
-"""Largest signals of the fits, as fractions of white above black."""
-EMVA_RANGE = 0.7
-"""Largest signal of EMVA 1288's fit, as a fraction of that at the largest variance."""
+"""Largest signals of the fits, as fractions of white above black; the second range has `LEAST_LEVELS` or more."""
 SIGNIFICANT = 3.0
 """Standard errors from which a difference is systematic."""
-UNSEEN_CURVATURE = 0.015
-"""Relative systematic error of a gain from too few levels to show it. Real sensors: EMVA 1288 reference set 001."""
+LEAST_LEVELS = 4
+"""Fewest levels of flats of a fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,26 +162,24 @@ def _joint_fit(curves: Sequence[Transfer], limit_dn: float, with_q: bool) -> Joi
 
 def fit_gain(curves: Sequence[Transfer], span_dn: float) -> tuple[list[Estimate], bool]:
     """Fit the gain of the sensor, then of each plane; True if the gains of the planes differ."""
-    few = sum(len(curve.upto(RANGES[-1] * span_dn).signal) for curve in curves) < 3 * len(curves)
-    ranges = [*RANGES, *[max(float(curve.signal.max()) for curve in curves) / span_dn] * few]
+    first, least = (share * span_dn for share in RANGES)
+    largest = max(least, *(float(np.sort(curve.signal)[LEAST_LEVELS - 1]) for curve in curves))
     fits = {
-        (share, with_q): joint
-        for share, with_q in itertools.product(ranges, (False, True))
-        if (joint := _joint_fit(curves, share * span_dn, with_q)) is not None
+        (limit_dn, with_q): joint
+        for limit_dn, with_q in itertools.product((first, largest), (False, True))
+        if (joint := _joint_fit(curves, limit_dn, with_q)) is not None
     }
-    chosen = base = fits[ranges[-1], False]
+    chosen = base = fits[largest, False]
     low, high = base.gain - NORMAL_95 * base.error, base.gain + NORMAL_95 * base.error
     is_systematic = base.chi2 > 1 + SIGNIFICANT * math.sqrt(2 / max(base.degrees, 1))
     for other in fits.values():
         own = math.sqrt(max(other.error**2 - base.error**2, 0.0))  # the fits share the points of the smaller range
         is_systematic |= other.error > base.error and abs(other.gain - base.gain) > SIGNIFICANT * own
     if is_systematic:
-        chosen = fits.get((ranges[-1], True), base)
+        chosen = fits[largest, True]
         low, high = min(fit.interval.low for fit in fits.values()), max(fit.interval.high for fit in fits.values())
-    if len(fits) == 1:
-        low, high = low - UNSEEN_CURVATURE * chosen.gain, high + UNSEEN_CURVATURE * chosen.gain
     sensor, planes = Estimate(chosen.gain, low, high), [estimate(fit.gain, fit.error) for fit in chosen.planes]
-    if is_systematic or len(fits) == 1:
+    if is_systematic:
         planes = [plane.times(sensor.scaled(1 / chosen.gain)) for plane in planes]
     return [sensor, *planes], _have_colours(chosen)
 
@@ -191,10 +187,3 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> tuple[list[Estimate]
 def _have_colours(chosen: JointFit) -> bool:
     """True if the gains of planes differ by more than their errors, and by more than 0.3 %."""
     return any(abs(fit.gain - chosen.gain) > max(4 * fit.error, 0.003 * chosen.gain) for fit in chosen.planes)
-
-
-def emva_gain(curve: Transfer) -> float:
-    """Return the gain by the rule of EMVA 1288: the slope up to 70 % of the signal at the largest variance."""
-    saturation = float(curve.signal[np.argmax(curve.variance)])
-    chosen = curve.upto(max(EMVA_RANGE * saturation, float(curve.signal.min())))
-    return float(chosen.signal @ chosen.variance / (chosen.signal @ chosen.signal))

@@ -20,7 +20,7 @@ from unprocess_gen.calibration.frame_sums import (
     high_passed,
     robust_std,
 )
-from unprocess_gen.calibration.gain import Estimate, Transfer, combined, emva_gain, estimate, fit_gain, root_estimate
+from unprocess_gen.calibration.gain import LEAST_LEVELS, Estimate, Transfer, combined, estimate, fit_gain, root_estimate
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fit_shape, histograms, joined_histogram
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
@@ -29,7 +29,7 @@ from unprocess_gen.statistics.mosaics import planes_of
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""
 
-LEAST_FRAMES, LEAST_LEVELS = 2, 4
+LEAST_FRAMES = 2
 DARKEST_LEVEL = 0.1
 """Largest signal of the darkest level, as a fraction of white."""
 FULL_SHARE = 1e-4
@@ -108,31 +108,25 @@ class IsoResult:
         return self.numbers[name][0]
 
 
-def measure_iso(
-    captures: CaptureSet, iso: float, quick: bool, watch: Watch, known: Estimate | None = None
-) -> IsoResult:
+def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate | None = None) -> IsoResult:
     """Measure the captures of one ISO; ConfigError if they are too few, or do not pass a check.
 
-    With a ``known`` gain, only darks are measured.
+    If the ``gain`` is given, darks alone are measured.
     """
     sensor, notes = captures.sensor, list[str]()
     darks = _darks(captures, iso, notes, watch)
     dark = max(darks, key=lambda dark: dark.measured.count)
-    flats = _flats(captures, iso, darks, watch, notes) if known is None else []
-    if known is None:
-        _check_levels(iso, flats, sensor, quick)
+    flats = [] if gain else _flats(captures, iso, darks, watch, notes)
+    if not gain:
+        _check_levels(iso, flats, sensor)
     shapes, histogram = _shapes(dark, watch)
     spread = _variances(dark.measured, shapes[0])[0] + np.maximum(dark.measured.dsnu, 0.0)  # both are dither
     checks.check_dark_noise(dark.frames, sensor, math.sqrt(float(spread.mean())))
     curves = _curves(usable(flats), shapes[0]) if flats else []
-    gains, has_colours = ([known], False) if known else fit_gain(curves, sensor.span_dn)
-    numbers = {"dn_per_e": gains}
-    if curves:
-        value = float(np.mean([emva_gain(curve) for curve in curves]))
-        numbers["dn_per_e_emva1288"] = [estimate(value, gains[0].error)]
+    gains, has_colours = ([gain], False) if gain else fit_gain(curves, sensor.span_dn)
     return IsoResult(
         iso=iso,
-        numbers=numbers | _dark_numbers(dark.measured, sensor, shapes),
+        numbers={"dn_per_e": gains} | _dark_numbers(dark.measured, sensor, shapes),
         has_colours=has_colours,
         curves=curves,
         darks=darks,
@@ -218,19 +212,17 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
     return sorted(flats, key=lambda flat: flat.signal_dn)
 
 
-def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor, quick: bool) -> None:
+def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> None:
     """Refuse too few levels."""
     signals = [flat.signal_dn for flat in usable(flats)]
-    least = 1 if quick else LEAST_LEVELS
-    if len(signals) < least:
-        advice = "" if quick else "; --quick takes one level, and gives wider intervals"
+    if len(signals) < LEAST_LEVELS:
         raise ConfigError(
             f"calibrate: ISO {iso:g} has {len(signals)} levels of {LEAST_FRAMES} flats that are not saturated; "
-            f"expected {least} or more{advice}"
+            f"expected {LEAST_LEVELS} or more"
         )
     if min(signals) <= 0:
         raise ConfigError(f"calibrate: ISO {iso:g} has flats that are not brighter than the darks; correct kind")
-    if not quick and min(signals) > DARKEST_LEVEL * sensor.span_dn:
+    if min(signals) > DARKEST_LEVEL * sensor.span_dn:
         raise ConfigError(
             f"calibrate: ISO {iso:g}: the darkest level has {min(signals) / sensor.span_dn:.0%} of white; expected one "
             f"below {DARKEST_LEVEL:.0%}, which shows whether the gain depends on the light"

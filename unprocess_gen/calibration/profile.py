@@ -34,7 +34,6 @@ MARK = "by gen-dataset calibrate"
 
 UNITS = {
     "dn_per_e": "DN/e",
-    "dn_per_e_emva1288": "DN/e",
     "b_dn2": "DN²",
     "dark_e_per_s": "e/s",
     "hot_pixel_e_per_s": "e/s",
@@ -57,23 +56,14 @@ class NamedNumber(NamedTuple):
         return UNITS.get(self.name, {"dn": "DN", "e": "e"}.get(self.name.rpartition("_")[2], ""))
 
 
-class KnownGain(NamedTuple):
-    """Gains by ISO of a calibration without flats, with their source and what is known of their error."""
-
-    source: str
-    uncertainty: str
-    by_iso: Mapping[float, Estimate]
-
-
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Everything measured on a folder of captures; ``known`` is the gain if they are darks alone."""
+    """Everything measured on a folder of captures."""
 
     captures: CaptureSet
     isos: list[IsoResult]
     body: Body
     notes: list[str]
-    known: KnownGain | None = None
 
     @property
     def sensor(self) -> Sensor:
@@ -88,11 +78,10 @@ def site_names(sensor: Sensor) -> list[str]:
 
 def estimates(calibration: Calibration) -> list[NamedNumber]:
     """Return the list of all estimates: those of the body, then those of each ISO."""
-    sites, known = site_names(calibration.sensor), calibration.known
+    sites = site_names(calibration.sensor)
     listed = list(_named(calibration.body.numbers, None, sites))
     for result in calibration.isos:
-        gain = {"dn_per_e": [known.by_iso[result.iso]]} if known and result.iso in known.by_iso else {}
-        listed += _named(result.numbers | gain, result.iso, sites)
+        listed += _named(result.numbers, result.iso, sites)
     return listed
 
 
@@ -165,20 +154,14 @@ def provenance(numbers: Sequence[str], isos: Sequence[float], source: str, uncer
     return {"numbers": [*numbers], "iso": [isos[0], isos[-1]], "source": source, "uncertainty": uncertainty}
 
 
-def measured_yaml(calibration: Calibration, name: str, two_parameter: bool) -> str:
+def measured_yaml(calibration: Calibration, name: str) -> str:
     """Return the noise profile of measured frames."""
     profile, isos = profile_head(name, calibration.sensor), [result.iso for result in calibration.isos]
-    if two_parameter and len(isos) == 1:
-        (result,) = calibration.isos
-        numbers = {"a": result["dn_per_e"], "b": dark_variance(result)}
-        profile |= {key: rounded(number.value) for key, number in numbers.items()} | {"negative_variance": "refuse"}
-    else:
-        branches = [[calibration.isos[place] for place in places] for places in iso_branches(calibration.isos)]
-        profile["branches"] = [_branch(results, calibration.sensor, two_parameter) for results in branches]
-        if not two_parameter:
-            profile |= _common_keys(calibration)
-        written = {*profile, *(key for branch in profile["branches"] for key in branch)}
-        profile["provenance"] = _provenance(calibration, written)
+    branches = [[calibration.isos[place] for place in places] for places in iso_branches(calibration.isos)]
+    profile["branches"] = [_branch(results, calibration.sensor) for results in branches]
+    profile |= _common_keys(calibration)
+    written = {*profile, *(key for branch in profile["branches"] for key in branch)}
+    profile["provenance"] = [_provenance(calibration, written)]
     frames = f"{len(calibration.captures.captures)} raw frames, ISO {', '.join(f'{iso:g}' for iso in isos)}"
     return profile_yaml(f"Measured {MARK} on {frames}", calibration.captures.sha256, calibration.notes, profile)
 
@@ -198,14 +181,10 @@ def dark_variance(result: IsoResult) -> Estimate:
     return estimate(sum(std.value**2 for std in stds), error, 0.0)
 
 
-def _branch(results: Sequence[IsoResult], sensor: Sensor, two_parameter: bool) -> dict[str, Any]:
-    """Return a branch; the keys of two numbers are gain, and noise without light."""
+def _branch(results: Sequence[IsoResult], sensor: Sensor) -> dict[str, Any]:
+    """Return a branch of neighbouring ISOs: gain, and noise without light."""
     isos, gains = [result.iso for result in results], [result["dn_per_e"] for result in results]
     branch = {"iso": [isos[0], isos[-1]], "dn_per_e": gain_law(isos, gains), "read_law": "gaussian"}
-    if two_parameter:
-        variances = [dark_variance(result) for result in results]
-        reads = [estimate(math.sqrt(b.value), b.error / 2 / math.sqrt(b.value)) for b in variances]
-        return branch | {"read_std_dn": std_law(isos, reads)}
     shapes = [result.shapes[0] for result in results]
     if any(shape.is_tukey for shape in shapes):
         values = [shape.shape if shape.is_tukey else NORMAL_SHAPE for shape in shapes]
@@ -255,18 +234,15 @@ ABSOLUTE = ("black_error_dn", "read_shape", "row_correlation")
 """Numbers whose errors are not stated relative to them, because they may be near 0."""
 
 
-def _provenance(calibration: Calibration, written: Iterable[str]) -> list[dict[str, Any]]:
-    """Return the sources of the numbers of a profile: the form of the calibration, and the largest error of each."""
-    isos, known, widths = [result.iso for result in calibration.isos], calibration.known, dict[str, tuple[float, str]]()
+def _provenance(calibration: Calibration, written: Iterable[str]) -> dict[str, Any]:
+    """Return the source of the numbers of a profile, and the largest error of each."""
+    isos, widths = [result.iso for result in calibration.isos], dict[str, tuple[float, str]]()
     for entry in estimates(calibration):
         if entry.site is None and entry.number is not None and entry.number.value and entry.name in written:
             half = (entry.number.high - entry.number.low) / 2
             width, unit = (half, entry.unit) if entry.name in ABSOLUTE else (100 * half / abs(entry.number.value), "%")
             widths[entry.name] = max(widths.get(entry.name, (0.0, unit)), (width, unit))
-    form = "calibrate --from darks, own darks" if known else "calibrate, own flats and darks"
-    if known:
-        del widths["dn_per_e"]
-    source = f"{form}, {len(calibration.captures.captures)} frames, SHA-256 {calibration.captures.sha256[:16]}"
+    digest = calibration.captures.sha256[:16]
+    source = f"calibrate, own flats and darks, {len(calibration.captures.captures)} frames, SHA-256 {digest}"
     errors = ", ".join(f"{name} ±{width:.2g} {unit}".strip() for name, (width, unit) in widths.items())
-    measured = provenance([*widths], isos, source, f"{errors} (95 %, systematic errors included)")
-    return [provenance(["dn_per_e"], isos, known.source, known.uncertainty), measured] if known else [measured]
+    return provenance([*widths], isos, source, f"{errors} (95 %, systematic errors included)")

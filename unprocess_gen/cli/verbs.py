@@ -248,22 +248,9 @@ _VERBS = (
             _file("--report", "draw curves, histograms and maps in PAGE (HTML)", "PAGE"),
             choice(
                 ("--from",),
-                "make the profile from NoiseProfile tags of DNG files, or from darks alone",
+                "make the profile from NoiseProfile tags of DNG files",
                 "noise_profile",
-                "darks",
             ),
-            Argument(
-                ("--gain",),
-                "with --from darks: take the gain from PROFILE, a YAML file or an option of noise",
-                "PROFILE",
-                completes="files",
-            ),
-            Argument(
-                ("--dn-per-e",), "with --from darks: state the gain, in DN per electron: 0.1@100,0.4@400", "GAINS"
-            ),
-            Argument(("--quick",), "accept one level of two flats, and two darks; intervals are wider"),
-            Argument(("--two-parameter",), "write gain and variance without light only: a and b"),
-            _folder("--keep-darks", "copy the darks to FOLDER/isoN, for noise.dark_frames"),
         ),
         PlaceArgument("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
     ),

@@ -21,7 +21,6 @@ from unprocess_gen.calibration.measure import Watch
 from unprocess_gen.calibration.profile import (
     ABSOLUTE,
     Calibration,
-    KnownGain,
     NamedNumber,
     dark_variance,
     estimates,
@@ -126,7 +125,7 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
     profile = Profile(config, captures.sensor, captures.isos)
     dark_only = [iso for iso in captures.isos if iso not in with_flats]
     known = {iso: Estimate(*[profile.numbers(iso, None)["dn_per_e"][0] or 1.0] * 3) for iso in dark_only}
-    calibration = measure_all(captures, True, watch, KnownGain("the profile of the dataset", "", known))
+    calibration = measure_all(captures, watch, known)
     return Comparisons(list(_compared(calibration, profile, known)), calibration.notes)
 
 
