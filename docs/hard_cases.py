@@ -30,7 +30,7 @@ from unprocess_gen.simulation.reference import colour, isp
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.unprocess import apply_ccm, inverse_smoothstep, invert_gains_per_channel
-from unprocess_gen.sources.dark_shading import median_of, trimmed_mean
+from unprocess_gen.sources.dark_frames import trimmed_moments
 from unprocess_gen.sources.loader import downscaled
 
 PAGE = Path(__file__).parent / "hard_cases.md"
@@ -623,8 +623,8 @@ def fractional_black() -> Figures:
     """Return the error of the black level of frames with a fractional mean: median, then mean."""
     frame = np.rint(14.76 + 3.09 * by_inverse_cdf(words(2**20), normal_table())).clip(0).astype(np.int64)
     frame[:: 2**14] = 4000  # hot pixels
-    counts = np.bincount(frame)
-    return median_of(counts) - 14.76, trimmed_mean(counts) - 14.76
+    mean_dn, _ = trimmed_moments(np.bincount(frame))
+    return float(np.median(frame)) - 14.76, mean_dn - 14.76
 
 
 # --------------------------------------------------------------------------------------------------------------- others

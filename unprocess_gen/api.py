@@ -297,7 +297,6 @@ def replay(
     root: PathLike | None = None,
     to: PathLike | None = None,
     dark_frames: PathLike | None = None,
-    dark_shading: PathLike | None = None,
 ) -> list[_replay.ReplayResult]:
     """Regenerate pairs from their manifest rows and sources, and compare them bit for bit.
 
@@ -313,8 +312,6 @@ def replay(
         Folder to write the arrays to, as ``KEY.clean.npy`` and ``KEY.noisy.npy``.
     dark_frames : path-like, optional
         Folder of the dark frames; by default the one that ``dataset.json`` records.
-    dark_shading : path-like, optional
-        Dark-shading map, or folder of maps; by default the one that ``dataset.json`` records.
 
     Returns
     -------
@@ -344,10 +341,8 @@ def replay(
         keys = str(keys) if isinstance(keys, int) else ",".join(map(str, keys))
     rows = select_rows(manifest, None, keys)
     source_root = _replay.source_root(manifest, None if root is None else os.fspath(root))
-    dark = _replay.dark_places(
-        manifest, *(None if place is None else os.fspath(place) for place in (dark_frames, dark_shading))
-    )
-    return list(_replay.replay(rows, source_root, None if to is None else Path(to), dark))
+    frames_root = _replay.dark_frames_root(manifest, None if dark_frames is None else os.fspath(dark_frames))
+    return list(_replay.replay(rows, source_root, None if to is None else Path(to), frames_root))
 
 
 def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:

@@ -74,7 +74,7 @@ CONTRACT = [
 PHYSICAL = PLAN.replace(effects=("prnu", "shot", "read", "quantise"), skipped=("row: hidden",), physics=PHYSICS)
 
 
-DARK = PHYSICAL.replace(dark=DarkFramePlan("ab" * 32, (2, 4), 512.0, 0.5, "cd" * 32))
+DARK = PHYSICAL.replace(dark=DarkFramePlan("ab" * 32, (2, 4), 512.0, 0.5))
 
 
 RAW = PHYSICAL.replace(
@@ -478,7 +478,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     dark = physical.replace(
         effects=tuple("dark_frame" if effect == "read" else effect for effect in EFFECTS),
         skipped=tuple(sampled.get(one.partition(": ")[0], one) for one in skipped),
-        dark=DarkFramePlan("f" * 64, (2**32 - 2,) * 2, LONGEST, LONGEST, "f" * 64),
+        dark=DarkFramePlan("f" * 64, (2**32 - 2,) * 2, LONGEST, LONGEST),
     )
     for one in (plan, physical, dark):
         source, patch = Source(10**9, "", "", 2**30), Patch(2**38, 2**40, 2**40, 2, 2)

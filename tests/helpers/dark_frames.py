@@ -20,10 +20,6 @@ class DarkPixelsInMemory:
         """Return the frame with this name."""
         return self.frames[sha256]
 
-    def shading(self, sha256: str) -> np.ndarray:
-        """Return the mean of all frames, whatever the digest."""
-        return np.mean(list(self.frames.values()), axis=0).astype(np.float32)
-
 
 def banded(seed: int, shape: tuple[int, int] = (70, 90), black: int = 512, std: float = 3.0) -> Raw:
     """Return a dark frame with read noise, rows and columns, rounded."""

@@ -597,7 +597,7 @@ def test_config_yaml_records_every_table_of_a_profile(settings: Settings, noise:
     config = on_its_own_sensor(settings, noise, 3200)
     text = dataset_yaml(config)
     recorded, _ = parse_dataset_yaml(text)
-    assert recorded.noise == replace(config.noise, provenance=[], dark_frames_level="median")  # without dark frames
+    assert recorded.noise == replace(config.noise, provenance=[])
     assert dataset_yaml(recorded) == text
     assert "*" not in text.replace("*.", "")  # no YAML aliases, as conf/noise has
     assert physics(recorded) == physics(config)

@@ -158,12 +158,10 @@ def with_dark_frame(one: Case, dice: Dice) -> Case:
             (2 * int(dice.random() * shape[0] / 2), 2 * int(dice.random() * shape[1] / 2)),
             dice.pick((0.0, 7.0, 512.0, 100.5)),
             dice.pick((1.0, 1.0, 0.25, 3855 / 15871, 4.0)),
-            dice.pick(("", "", "e" * 64)),
         ),
     )
     plan = plan if "dark_frame" in plan.noise.effects else plan.replace(effects=("dark_frame", *plan.noise.effects))
-    frames = {"d" * 64: drawn.astype(np.uint16), "f" * 64: np.full(shape, 600, dtype=np.uint16)}
-    return replace(one, plan=plan, dark_pixels=DarkPixelsInMemory(frames))
+    return replace(one, plan=plan, dark_pixels=DarkPixelsInMemory({"d" * 64: drawn.astype(np.uint16)}))
 
 
 def with_later_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:

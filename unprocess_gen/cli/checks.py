@@ -106,8 +106,8 @@ def _regenerated(folder: AnyPath, call: Call) -> list[ReplayResult]:
     """Regenerate rows that are spread evenly over the dataset, and compare them."""
     manifest = folder / "manifest.csv"
     rows = evenly_spaced_rows(manifest, call.values["regenerate"])
-    dark = dark_frames_of(manifest, call)
-    return list(replay_rows(rows, source_root(manifest, call.values.get("source")), dark=dark))
+    root = source_root(manifest, call.values.get("source"))
+    return list(replay_rows(rows, root, dark_frames=dark_frames_of(manifest, call)))
 
 
 def _complaint(result: ReplayResult) -> str:
@@ -117,19 +117,21 @@ def _complaint(result: ReplayResult) -> str:
 def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
     from unprocess_gen.reports import photon_transfer
+    from unprocess_gen.sources.dark_frames import dark_folder
 
-    to, access = call.values.get("to"), None
+    to, dark_frames = call.values.get("to"), dark_frames_of(folder / "manifest.csv", call)
     try:
-        access = dark_frames_of(folder / "manifest.csv", call).open()
+        access = None if dark_frames is None else dark_folder(dark_frames)
     except ConfigError:  # without the recorded files, the pairs are counted as not checked
-        if {"dark_frames", "dark_shading"} & call.values.keys():
+        if "dark_frames" in call.values:
             raise
+        access = None
     summary = photon_transfer.examine_dataset(folder, access)
     checks = summary.checks
     if not checks.count:
         print_result(
             f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
-            "noise.dark_frames=FOLDER names their folder, noise.dark_shading=PATH their map"
+            "noise.dark_frames=FOLDER names their folder"
         )
         return []
     if summary.worst is not None:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.output_paths import DATASET_ENTRIES
 from unprocess_gen.core.paths import AnyPath, any_path
-
-if TYPE_CHECKING:
-    from unprocess_gen.sources.dark_frames import DarkPlaces
 
 
 def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
@@ -49,8 +44,8 @@ def given_root(call: Call) -> str | None:
     return root
 
 
-def dark_frames_of(manifest: AnyPath, call: Call) -> DarkPlaces:
-    """Places of the dark frames of a dataset and of their map, by the call or by ``dataset.json``."""
-    from unprocess_gen.pipeline.replay import dark_places
+def dark_frames_of(manifest: AnyPath, call: Call) -> str | None:
+    """Folder of the dark frames of a dataset, by the call or by ``dataset.json``; None without one."""
+    from unprocess_gen.pipeline.replay import dark_frames_root
 
-    return dark_places(manifest, call.values.get("dark_frames"), call.values.get("dark_shading"))
+    return dark_frames_root(manifest, call.values.get("dark_frames"))

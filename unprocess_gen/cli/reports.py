@@ -108,6 +108,7 @@ def report(call: Call) -> int:
     """Write the HTML page of a dataset or a sweep, or the card of a dataset."""
     from unprocess_gen.pipeline.verify import is_sweep
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
+    from unprocess_gen.sources.dark_frames import dark_folder
 
     folder, to = dataset_folder(call, sweeps=True), Path(call.values["to"]) if "to" in call.values else None
     if isinstance(folder, Path) and is_sweep(folder):
@@ -117,8 +118,8 @@ def report(call: Call) -> int:
         return _card(folder, to, call)
     root = given_root(call)
     dark = dark_frames_of(folder / "manifest.csv", call)
-    if {"dark_frames", "dark_shading"} & call.values.keys():
-        dark.open()  # refuses places that the user names and that do not exist
+    if "dark_frames" in call.values and dark is not None:
+        dark_folder(dark)  # refuses a folder that the user names and that does not exist
     print_result(write_dataset_report(folder, to, None if root is None else any_path(root), dark))
     return 0
 
@@ -133,7 +134,7 @@ def _report_sweep(folder: Path, to: Path | None, call: Call) -> int:
     return 0
 
 
-FOR_PAGE, FOR_CARD = ("source", "dark_frames", "dark_shading"), ("licence", "published")
+FOR_PAGE, FOR_CARD = ("source", "dark_frames"), ("licence", "published")
 """Arguments that only the page of a dataset, or only its card, uses."""
 
 

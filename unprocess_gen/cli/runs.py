@@ -55,9 +55,8 @@ def again(call: Call) -> int:
     changes |= {"n_jobs": call.values["n_jobs"]} if "n_jobs" in call.values else {}
     changes |= {"output.frames": call.values["frames"] == "true"} if "frames" in call.values else {}
     changes |= {"source.max_failed": call.values["max_failed"]} if "max_failed" in call.values else {}
-    given = {name for name in ("dark_frames", "dark_shading") if name in call.values}
-    dark = dark_frames_of(folder / "manifest.csv", call)
-    config = recorded_config(folder, given_root(call), dark, given, changes)
+    changes |= {"noise.dark_frames": dark_frames_of(folder / "manifest.csv", call)}
+    config = recorded_config(folder, given_root(call), changes)
     check_sources(folder, config)
     code, _, lines = generate_dataset(config)
     print_results(lines)

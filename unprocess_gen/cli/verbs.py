@@ -64,12 +64,6 @@ INPUTS = (
         "FOLDER",
         completes="folders",
     ),
-    Argument(
-        ("--dark-shading", "noise.dark_shading"),
-        "dark-shading map, or folder of maps, if it is not the recorded one",
-        "PATH",
-        completes="files",
-    ),
 )
 """Where the files are that pairs are regenerated from."""
 

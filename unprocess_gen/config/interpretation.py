@@ -26,13 +26,8 @@ from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.dark_current import HEAT
 
-SHADING_WORDS = ("keep", "remove")
-"""Values of ``noise.dark_shading`` that are no path of a map."""
-
-ONLY_WITH_DARK_FRAMES = {"dark_shading": "keep", "dark_shading_sha256": None, "dark_frames_black_dn": None}
-"""Keys of the noise that need dark frames, with their values without dark frames."""
-
-NO_DARK_FRAMES = {"dark_frames": None, "dark_frames_sha256": None, **ONLY_WITH_DARK_FRAMES}
+NO_DARK_FRAMES = {f"noise.dark_frames{ending}": None for ending in ("", "_sha256", "_black_dn")}
+"""Settings of a run without dark frames."""
 
 # ---------------------------------------------------------------------------------------------------- distributions
 
@@ -161,20 +156,9 @@ def uses_dark_frames(noise: NoiseConfig) -> bool:
     return noise.dark_frames is not None or noise.dark_frames_sha256 is not None
 
 
-def shading_place(noise: NoiseConfig) -> str | None:
-    """Return the place of the dark-shading map."""
-    return None if noise.dark_shading in SHADING_WORDS else noise.dark_shading
-
-
-def run_iso(config: Config) -> float:
-    """Return the ISO of a run with dark frames, which has only one."""
-    iso = config.scene.iso if config.noise.iso is None else config.noise.iso
-    return parse_drawn("iso", iso, limits.ISO).numbers[0]
-
-
 def without_dark_frames(config: Config) -> Config:
     """Return a copy of a configuration with the noise of the profile in place of dark frames."""
-    return replaced(config, {f"noise.{key}": value for key, value in NO_DARK_FRAMES.items()})
+    return replaced(config, NO_DARK_FRAMES)
 
 
 def uses_assumed(config: Config) -> bool:

@@ -446,15 +446,6 @@ class NoiseConfig(EffectGroup):
         SHA-256 of the set of dark frames, which a run records; frames of another set are refused
     dark_frames_black_dn
         black level of the dark frames
-    dark_frames_level
-        how a black level that neither dark_frames_black_dn nor the files state is measured: mean of the pixels
-        without the lowest and the highest 0.01 %, or their median, an integer
-    dark_shading
-        mean of dark frames at each site (dark shading): keep adds it to the noisy frames, remove subtracts the
-        mean of the frames of dark_frames, a path subtracts a map of your own; config.yaml has its digest, not
-        the path
-    dark_shading_sha256
-        SHA-256 of the dark-shading map, which a run records; another map is refused
     branches
         numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters
     assumed
@@ -501,17 +492,9 @@ class NoiseConfig(EffectGroup):
         Numbers(0, 65535),
         CHOSEN,
         unit="DN of the profile",
-        null="the black level in the raw files, else dark_frames_level, minus a map above black if there is one",
+        null="the black level in the raw files, else the mean of the pixels without 0.01 % at each end",
         since="0.2",
     )
-    dark_frames_level: str = key("median", Choice("mean", "median"), CHOSEN, since="0.3")
-    dark_shading: str = key(
-        "keep",
-        limits.text("keep, remove, a map (NPY, PNG, TIFF or raw), or a folder of maps with names such as iso1600.npy"),
-        CHOSEN,
-        since="0.2",
-    )
-    dark_shading_sha256: Optional[str] = key(None, limits.DIGEST, CHOSEN, null="any map, or none", since="0.2")
     branches: tuple[BranchConfig, ...] = key((), Limit("a list of mappings with the keys of a branch"), PHYSICAL)
     assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), PHYSICAL)
     unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), PHYSICAL, since="0.3")

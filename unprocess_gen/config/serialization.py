@@ -19,9 +19,7 @@ from unprocess_gen.config.interpretation import (
     has_float_clean,
     is_physical,
     saturated_as,
-    shading_place,
     uses_assumed,
-    uses_dark_frames,
 )
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import (
@@ -90,14 +88,10 @@ def _canonical_settings(config: Config) -> dict[str, Any]:
     settings["source"] = {"kind": source_kind(config)} | settings["source"]
     settings["sensor"]["saturated"] = saturated_as(config)
     settings["source"]["patch"] = canonical_patch(config.source)
-    if shading_place(config.noise) is not None:
-        settings["noise"].pop("dark_shading", None)  # dark_shading_sha256 identifies the map
     if config.gains.light != "scene":
         settings["scene"].pop("light", None)  # decides nothing
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
-    if not uses_dark_frames(config.noise):
-        settings["noise"].pop("dark_frames_level", None)  # decides nothing
     if not is_physical(config.noise):
         settings["effects"].pop("scope", None)  # decides nothing
     if not has_float_clean(config):

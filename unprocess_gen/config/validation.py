@@ -16,7 +16,6 @@ from pathlib import Path
 from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.distributions import parse_drawn
 from unprocess_gen.config.interpretation import (
-    ONLY_WITH_DARK_FRAMES,
     UNCLIPPED,
     effect_switch,
     gain_distributions,
@@ -27,7 +26,6 @@ from unprocess_gen.config.interpretation import (
     missing_number,
     noise_levels,
     patch_rule,
-    shading_place,
     uses_dark_frames,
     uses_physics,
 )
@@ -232,13 +230,10 @@ def _check_levels(config: Config) -> None:
 def _check_dark_frames(config: Config) -> None:
     noise = config.noise
     if not uses_dark_frames(noise):
-        for key, default in ONLY_WITH_DARK_FRAMES.items():
-            if (value := getattr(noise, key)) != default:
-                raise refusal(f"noise.{key}", value, "there are no dark frames; give noise.dark_frames=FOLDER")
+        if (black_dn := noise.dark_frames_black_dn) is not None:
+            problem = "there are no dark frames; give noise.dark_frames=FOLDER"
+            raise refusal("noise.dark_frames_black_dn", black_dn, problem)
         return
-    if noise.dark_shading == "remove" and noise.dark_shading_sha256 is not None:
-        problem = "noise.dark_shading_sha256 names a map; expected its place, or no digest"
-        raise refusal("noise.dark_shading", "remove", problem)
     frames = noise.dark_frames or noise.dark_frames_sha256
     if not is_physical(noise):
         problem = f"noise={noise.name} gives no DN per electron, from which shot noise follows"
@@ -251,8 +246,7 @@ def _check_dark_frames(config: Config) -> None:
             raise refusal("noise.dark_frames", frames, f"{problem}; {advice}")
     if config.clean.includes_fixed_pattern:
         problem = "dark frames do not separate the fixed pattern from the noise; expected false"
-        advice = "noise.dark_shading=remove subtracts their mean"
-        raise refusal("clean.includes_fixed_pattern", "true", f"{problem}; {advice}")
+        raise refusal("clean.includes_fixed_pattern", "true", problem)
     for effect in REPLACED:
         if _named_switch(config, effect) == "on":
             raise refusal(f"effects.{effect}", "on", "the dark frames contain it; expected auto or off")
@@ -261,17 +255,12 @@ def _check_dark_frames(config: Config) -> None:
 
 
 def _check_dark_folder(noise: NoiseConfig) -> None:
-    """Raise ConfigError if dark frames or the map of a recorded config are not given, or do not exist."""
-    frames, shading = noise.dark_frames, shading_place(noise)
+    """Raise ConfigError if the dark frames of a recorded config are not given, or do not exist."""
+    frames = noise.dark_frames
     if frames is None and noise.dark_frames_sha256 is not None:
         raise ConfigError("noise.dark_frames is missing; expected the folder of the recorded dark frames")
-    if shading is None and noise.dark_shading_sha256 is not None:
-        raise ConfigError("noise.dark_shading is missing; expected the place of the recorded dark-shading map")
     if frames is not None and not _local("dark_frames", frames, "dark frames").is_dir():
         raise ConfigError(f"noise.dark_frames={frames}: no such folder; expected a folder of dark frames")
-    if shading is not None and not _local("dark_shading", shading, "maps").exists():
-        expected = "expected keep, remove, or a dark-shading map"
-        raise ConfigError(f"noise.dark_shading={shading}: no such file or folder; {expected}")
 
 
 def _local(key: str, place: str, content: str) -> Path:

@@ -147,9 +147,6 @@ class DarkPixels(Protocol):
     def frame(self, sha256: str) -> Raw:
         """Return the mosaic of the dark frame whose file has this SHA-256, [H, W] with even sides."""
 
-    def shading(self, sha256: str) -> NDArray[np.float32]:
-        """Return the dark-shading map with this SHA-256, [H, W] with the sides of the dark frames."""
-
 
 @dataclass(frozen=True, slots=True)
 class DarkFrame:
@@ -158,28 +155,6 @@ class DarkFrame:
     sha256: str
     height: int
     width: int
-
-
-@dataclass(frozen=True, slots=True)
-class DarkShading:
-    """Dark-shading map that is subtracted from dark frames.
-
-    Attributes
-    ----------
-    sha256 : str
-        SHA-256 of its file, or of the set of dark frames whose mean it is.
-    black_dn : float
-        Value that is subtracted too, DN of the frames: their black level for a map above black, else 0.
-    file : str
-        Name of its file; empty for the mean of the frames.
-    residual_dn : float
-        Median of the frames after the subtraction, DN of the frames.
-    """
-
-    sha256: str
-    black_dn: float = 0.0
-    file: str = ""
-    residual_dn: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,8 +173,6 @@ class DarkFrames:
         DN of the sensor per DN of the frames.
     variance_dn2 : float
         Variance of their noise with dither, DN² of the sensor.
-    shading : DarkShading or None
-        Map that is subtracted at each site; None to subtract the black level alone.
     """
 
     frames: tuple[DarkFrame, ...]
@@ -207,7 +180,6 @@ class DarkFrames:
     black_dn: float
     scale: float
     variance_dn2: float
-    shading: DarkShading | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,17 +383,13 @@ class DarkFramePlan:
     shift : (int, int)
         Even row and column of the dark frame at row 0, column 0 of the full frame.
     black_dn, scale : float
-        Value that is subtracted from the dark frame, DN of the dark frame, and DN of the sensor per DN of it.
-    shading : str
-        SHA-256 of the dark-shading map that is subtracted too: of its file, or of the set of dark frames whose mean it
-        is. Empty without a map.
+        Black level of the dark frame, DN of the dark frame, and DN of the sensor per DN of it.
     """
 
     sha256: str = ""
     shift: tuple[int, int] = (0, 0)
     black_dn: float = 0.0
     scale: float = 1.0
-    shading: str = ""
 
 
 @dataclass(frozen=True, slots=True)

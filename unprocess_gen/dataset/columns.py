@@ -407,15 +407,11 @@ COLUMNS = (
                DarkFramePlan, "shift", unit="pixels", since="0.2", empty_if="there is no dark frame, or both are 0")
         for axis, side in (("y", "row"), ("x", "column"))
     ),
-    Column("dark_black_dn", "value that is subtracted from all sites of the dark frame: its black level, or 0 if the "
-           "map of dark_shading contains that",
-           Range(0, 65535), DarkFramePlan, "black_dn", unit="DN of the dark frame", since="0.2",
+    Column("dark_black_dn", "black level of the dark frame", Range(0, 65535), DarkFramePlan, "black_dn",
+           unit="DN of the dark frame", since="0.2",
            empty_if="there is no dark frame, or it is 0"),
     Column("dark_scale", "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan,
            "scale", since="0.2", empty_if="there is no dark frame, or it is 1"),
-    Column("dark_shading", "SHA-256 of the dark-shading map that is subtracted from the dark frame: of its file, or of "
-           "the set of dark frames whose mean it is",
-           HEX_256, DarkFramePlan, "shading", since="0.2", empty_if="no map is subtracted"),
     Column("dark_variance_dn2", "noise variance of a site at black, by all simulated effects except hot pixels, dead "
            "pixels and rounding; ug.noise_std uses it",
            FINITE, unit="DN²", since="0.3", in_json=False, empty_if="the source failed"),

@@ -30,7 +30,6 @@ class DarkFrameFacts(msgspec.Struct, frozen=True):
     sizes: list[str] = []
     black_dn: float = 0.0
     std_dn: Amount = 0.0
-    shading: str = ""
 
 
 class ShardFacts(msgspec.Struct, frozen=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from typing import Any
 
 from unprocess_gen.config.schema import Config, replaced
@@ -13,25 +13,20 @@ from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.roots import Root, root_path
 from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_changes, source_root
 from unprocess_gen.pipeline.verify import have_same_rows
-from unprocess_gen.sources.dark_frames import DarkPlaces, with_dark_places
 
 
-def recorded_config(
-    folder: AnyPath, root: str | None, dark: DarkPlaces, given: Set[str], changes: Mapping[str, Any]
-) -> Config:
-    """Return the settings of a dataset with ``changes``, which contain another ``out``.
-
-    ``given`` names the places that the user gives: ``dark_frames``, ``dark_shading``. A dataset without them has none.
-    """
+def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any]) -> Config:
+    """Return the settings of a dataset with ``changes``, which contain another ``out`` and the dark frames."""
     config, kind = read_dataset_yaml(folder / "config.yaml")
     out = any_path(changes["out"])
     if out.resolve() == any_path(folder).resolve() and (out / "dataset.json").exists():
         raise ConfigError(f"again: out={out}: is the dataset itself; expected another folder")
-    places = (("dark_frames", dark.frames, "dark frames"), ("dark_shading", dark.shading, "dark-shading map"))
-    for name, place, what in places:
-        if name in given and getattr(config.noise, f"{name}_sha256") is None:
-            raise ConfigError(f"again: noise.{name}={place}: {folder} was generated without {what}; leave it out")
-    config = with_dark_places(replaced(config, {**changes, **source_changes(_root(folder, kind, root), folder)}), dark)
+    frames = changes["noise.dark_frames"]
+    if frames is not None and config.noise.dark_frames_sha256 is None:
+        raise ConfigError(
+            f"again: noise.dark_frames={frames}: {folder} was generated without dark frames; leave it out"
+        )
+    config = replaced(config, {**changes, **source_changes(_root(folder, kind, root), folder)})
     validate_config(config)
     return config
 

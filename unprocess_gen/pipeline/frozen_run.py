@@ -22,7 +22,6 @@ from typing import Annotated
 
 import msgspec
 
-from unprocess_gen.config.interpretation import shading_place
 from unprocess_gen.config.schema import TOGETHER, Config, at_place, replaced
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.config.validation import check_values
@@ -41,7 +40,6 @@ from unprocess_gen.pipeline.storage import WORK, Storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardTask
 from unprocess_gen.pipeline.worker import make_and_commit, make_image
 from unprocess_gen.pipeline.workspace import Workspace
-from unprocess_gen.sources.dark_frames import DarkPlaces, with_dark_places
 
 PACKAGE = "unprocess_gen"
 PLAN = f"{WORK}/plan.json"
@@ -67,8 +65,8 @@ class FrozenPlan(msgspec.Struct, frozen=True):
     ----------
     config_sha256, listing_sha256 : str
         Digests of ``config.yaml`` and of the index of the recorded listing.
-    root, dark_frames, dark_shading : str or None
-        Absolute places of the sources, the dark frames and their map; None without them.
+    root, dark_frames : str or None
+        Absolute places of the sources and the dark frames; None without them.
     roots : tuple of str
         Absolute places of the sources, if there are several.
     starts : tuple of int
@@ -95,7 +93,6 @@ class FrozenPlan(msgspec.Struct, frozen=True):
     canary_source: Count | None
     canary_sha256: str
     dark_frames: str | None = None
-    dark_shading: str | None = None
     parts: Positive | None = None
     roots: tuple[str, ...] = ()
     starts: tuple[Count, ...] = ()
@@ -168,7 +165,6 @@ def _new_plan(workspace: Workspace, run: Run, on_compiling: OnCompiling | None, 
         canary_source=index,
         canary_sha256=sha256,
         dark_frames=absolute_text(config.noise.dark_frames),
-        dark_shading=absolute_text(shading_place(config.noise)),
         parts=parts,
     )
 
@@ -271,8 +267,8 @@ class FrozenRun:
             raise DamageError(f"{self.storage.out}/config.yaml: cannot be read ({error_in_one_line(error)})") from error
         changes = {"out": self.storage.out, "n_jobs": plan.n_jobs, "self_test": plan.self_test}
         changes |= {f"source.{key}": value for key, value in at_place(root or plan.roots or plan.root).items()}
-        changes |= {"source.max_failed": plan.max_failed}
-        return with_dark_places(replaced(config, changes), DarkPlaces(plan.dark_frames, plan.dark_shading))
+        changes |= {"source.max_failed": plan.max_failed, "noise.dark_frames": plan.dark_frames}
+        return replaced(config, changes)
 
     @cached_property
     def settings(self) -> PairSettings:

@@ -24,7 +24,6 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
-from unprocess_gen.config.interpretation import shading_place
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
@@ -300,13 +299,11 @@ def machine() -> dict[str, Any]:
 
 
 def _dark_facts(settings: PairSettings) -> dict[str, Any]:
-    """Place, number, sizes, noise and map of the dark frames; the places alone if they cannot be read here."""
-    noise, dark_frames, folder = settings.config.noise, settings.dark_frames, settings.dark_folder
+    """Place, number, sizes and noise of the dark frames; the place alone if they cannot be read here."""
+    noise, dark_frames = settings.config.noise, settings.dark_frames
     if noise.dark_frames is None:
         return {}
     facts: dict[str, Any] = {"root": absolute_text(noise.dark_frames)}
-    if (shading := shading_place(noise)) is not None:
-        facts["shading"] = absolute_text(shading if folder is None else folder.shading_place)
     if dark_frames is not None:
         sizes = {f"{frame.width}x{frame.height}" for frame in dark_frames.frames}
         facts |= {"count": len(dark_frames.frames), "sizes": sorted(sizes)}

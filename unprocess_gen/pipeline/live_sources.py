@@ -28,9 +28,8 @@ from unprocess_gen.dataset.manifest import (
     rows_with_offsets,
 )
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
-from unprocess_gen.pipeline.replay import PairRegenerator, dark_places, source_of, source_root
+from unprocess_gen.pipeline.replay import PairRegenerator, dark_frames_root, source_of, source_root
 from unprocess_gen.pipeline.run import resolve
-from unprocess_gen.sources.dark_frames import with_dark_places
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.pixel_cache import PixelCache
 
@@ -99,9 +98,9 @@ class RecordedPairs:
         self.path, self.name, self._cache = folder, folder_name(folder), cache
         self._manifest = folder / "manifest.csv"
         config, _ = read_dataset_yaml(folder / "config.yaml")
-        dark = dark_places(self._manifest)
-        self.settings = PairSettings.read(with_dark_places(config, dark))
-        self._sources = PairRegenerator(source_root(self._manifest, root), dark)
+        dark_frames = dark_frames_root(self._manifest)
+        self.settings = PairSettings.read(replaced(config, {"noise.dark_frames": dark_frames}))
+        self._sources = PairRegenerator(source_root(self._manifest, root), dark_frames)
         self._columns = read_columns(self._manifest)
         self.splits: set[str] = set()
         self._offsets = np.fromiter(self._places(split), dtype=np.int64)

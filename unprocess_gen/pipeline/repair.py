@@ -62,7 +62,6 @@ from unprocess_gen.pipeline.verify import expected_samples, shard_rows
 from unprocess_gen.pipeline.worker import make_image
 from unprocess_gen.pipeline.workspace import add_parquet, dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.planning.plan import drawn_light
-from unprocess_gen.sources.dark_frames import NO_PLACES, DarkPlaces, with_dark_places
 
 RecordedFacts = dict[str, Any]
 
@@ -96,27 +95,27 @@ class RepairStep:
         return f"{self.file}: {self.what}"
 
 
-def repair(folder: Path, root: Root | None, dark: DarkPlaces = NO_PLACES) -> Iterator[RepairStep]:
+def repair(folder: Path, root: Root | None, dark_frames: str | None = None) -> Iterator[RepairStep]:
     """Restore every damaged file of a dataset; yield a step for each damaged or foreign file.
 
-    ``root`` is the folder of the sources, None for built-in scenes or if no source is needed; ``dark`` has the places
-    of dark frames that rows name. Raises LockedError if a run holds the folder, DamageError if config or manifest
-    cannot be restored, ConfigError if sources are needed and ``root`` is None, SourceChangedError if the manifest must
+    ``root`` is the folder of the sources, None for built-in scenes or if no source is needed; ``dark_frames`` is that
+    of dark frames. Raises LockedError if a run holds the folder, DamageError if config or manifest cannot be restored,
+    ConfigError if sources are needed and ``root`` is None, SourceChangedError if the manifest must
     be regenerated and a source was changed or deleted, MachineError if a file cannot be read or written.
     """
     with closing(Storage(folder)) as storage, machine_errors(folder):
         storage.hold()
-        yield from _Repair(folder, root, dark, storage).steps()
+        yield from _Repair(folder, root, dark_frames, storage).steps()
 
 
 class _Repair:
     """Hold a dataset under repair: its folder, the intact content of ``dataset.json`` (or {}), and its config."""
 
-    def __init__(self, folder: Path, root: Root | None, dark: DarkPlaces, storage: Storage) -> None:
-        self._folder, self._root, self._dark = folder, root, dark
+    def __init__(self, folder: Path, root: Root | None, dark_frames: str | None, storage: Storage) -> None:
+        self._folder, self._root, self._dark_frames = folder, root, dark_frames
         self._storage, self._temporary = storage, storage.scratch
         self._config_file, self._manifest_file = folder / "config.yaml", folder / "manifest.csv"
-        self._regenerator = PairRegenerator(root, dark)
+        self._regenerator = PairRegenerator(root, dark_frames)
         try:
             self._facts = read_dataset(folder / "dataset.json")
         except DamageError:
@@ -192,7 +191,7 @@ class _Repair:
     def _read_config(self) -> Config:
         config, kind = read_dataset_yaml(self._config_file)
         config = replaced(config, source_changes((self._root or "") if kind != "synthetic" else None, self._folder))
-        return with_dark_places(config, self._dark)
+        return replaced(config, {"noise.dark_frames": self._dark_frames})
 
     # ---------------------------------------------------------------------------------------------------- manifest
 

@@ -38,7 +38,7 @@ from unprocess_gen.dataset.shards import arrays_of, target_names
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
-from unprocess_gen.sources.dark_frames import NO_PLACES, DarkFolder, DarkPlaces
+from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
 from unprocess_gen.sources.listing import place_text
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
@@ -111,13 +111,9 @@ def source_changes(root: Root | None, folder: AnyPath) -> dict[str, Any]:
     return {f"source.{key}": value for key, value in places.items()}
 
 
-def dark_places(manifest: AnyPath, frames: str | None = None, shading: str | None = None) -> DarkPlaces:
-    """Find the dark frames of a dataset and their dark-shading map."""
-    recorded = _recorded_places(manifest).dark_frames or DarkFrameFacts()
-    return DarkPlaces(
-        frames if frames is not None else recorded.root,
-        shading if shading is not None else recorded.shading or None,
-    )
+def dark_frames_root(manifest: AnyPath, given: str | None = None) -> str | None:
+    """Return the folder of the dark frames of a dataset: the given one, else the recorded one; None without one."""
+    return given or (_recorded_places(manifest).dark_frames or DarkFrameFacts()).root
 
 
 def check_source_sizes(manifest: AnyPath, root: Root) -> None:
@@ -168,7 +164,7 @@ def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
 
 
 def replay(
-    rows: Iterable[Row], root: Root | None, to: Path | None = None, dark: DarkPlaces = NO_PLACES
+    rows: Iterable[Row], root: Root | None, to: Path | None = None, dark_frames: str | None = None
 ) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
@@ -177,7 +173,7 @@ def replay(
     """
     if to is not None:
         check_output_folder(to, f"--to {to}")
-    regenerator = PairRegenerator(root, dark)
+    regenerator = PairRegenerator(root, dark_frames)
     for row in rows:
         if row["status"] != "ok":
             continue
@@ -206,12 +202,12 @@ def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayRe
 class PairRegenerator:
     """Regenerate pairs from rows and the folder of their sources, ``root``; built-in scenes need none.
 
-    ``dark`` has the places of the dark frames and of the map that rows name. The last photograph stays decoded, because
-    rows of one image are consecutive.
+    ``dark_frames`` is the folder of the dark frames that rows name. The last photograph stays decoded, because rows of
+    one image are consecutive.
     """
 
-    def __init__(self, root: Root | None, dark: DarkPlaces = NO_PLACES) -> None:
-        self._root, self._dark = root, dark
+    def __init__(self, root: Root | None, dark_frames: str | None = None) -> None:
+        self._root, self._dark_frames = root, dark_frames
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
     def regenerate(self, row: Row) -> Targets:
@@ -259,13 +255,13 @@ class PairRegenerator:
         sha256 = plan.noise.dark.sha256
         if not sha256:
             return None
-        if self._dark.frames is None:
+        if self._dark_frames is None:
             raise SourceChangedError(
                 f"noise.dark_frames is missing: the row names the dark frame {sha256}; expected the folder of "
                 "the dark frames; give noise.dark_frames=…"
             )
         try:
-            return self._dark.open()
+            return dark_folder(self._dark_frames)
         except ConfigError as error:
             raise SourceChangedError(str(error)) from error
 

@@ -110,9 +110,7 @@ def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: i
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
-    shading, scale = dark_frames.shading, dark_frames.scale
-    black_dn, map_sha256 = (dark_frames.black_dn, "") if shading is None else (shading.black_dn, shading.sha256)
-    return plan.replace(dark=types.DarkFramePlan(frame.sha256, shift, black_dn, scale, map_sha256))
+    return plan.replace(dark=types.DarkFramePlan(frame.sha256, shift, dark_frames.black_dn, dark_frames.scale))
 
 
 def _even_place(word: int, available: int, needed: int) -> int:

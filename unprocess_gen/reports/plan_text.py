@@ -257,18 +257,11 @@ def _number_text(noise: NoiseConfig, key: str) -> str:
 
 
 def _dark_frames_sentence(config: Config, dark_frames: DarkFrames) -> str:
-    """Number and sizes of dark frames, what is subtracted from them, and what is left."""
+    """Number, sizes, black level and noise of dark frames."""
     sizes = sorted({f"{frame.width} x {frame.height}" for frame in dark_frames.frames})
-    shading, subtracted = dark_frames.shading, f"black level {dark_frames.black_dn:g} DN"
-    if shading is not None and not shading.file:
-        subtracted = "their mean is subtracted"
-    elif shading is not None:
-        content = f"its DN are above the {subtracted}" if shading.black_dn else "its DN include the black level"
-        left = f"which leaves a median of {shading.residual_dn:.3g} DN"
-        subtracted = f"the map {shading.file} ({content}) is subtracted, {left}"
     return (
         f"{counted(len(dark_frames.frames), 'dark frame')} in {config.noise.dark_frames}: {', '.join(sizes)} pixels, "
-        f"{subtracted}, standard deviation {math.sqrt(dark_frames.variance_dn2):.4g} DN"
+        f"black level {dark_frames.black_dn:g} DN, standard deviation {math.sqrt(dark_frames.variance_dn2):.4g} DN"
     ) + ("" if dark_frames.scale == 1 else f" on this sensor (times {dark_frames.scale:.6g})")
 
 

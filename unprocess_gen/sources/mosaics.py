@@ -28,7 +28,7 @@ class Mosaic:
 
 
 def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
-    """Read a mosaic.
+    """Read a mosaic of 16-bit integers, or with ``numbers`` of integers or floats.
 
     Raises ConfigError or MachineError.
     """
@@ -50,7 +50,7 @@ def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
     return Mosaic(np.ascontiguousarray(pixels))
 
 
-def map_mosaic(path: Path, key: str, numbers: bool = False) -> NDArray[Any]:
+def map_mosaic(path: Path, key: str) -> NDArray[Any]:
     """Map the mosaic of an NPY file into memory.
 
     The result is array, [H, W]. Raises ConfigError or MachineError.
@@ -60,7 +60,7 @@ def map_mosaic(path: Path, key: str, numbers: bool = False) -> NDArray[Any]:
             pixels: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, EOFError) as error:  # an edited row can name any file of the folder
         raise ConfigError(f"{key}: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
-    _check_numbers(path, key, pixels, numbers)
+    _check_numbers(path, key, pixels)
     return pixels
 
 
@@ -72,13 +72,13 @@ def even_sides(pixels: NDArray[Any]) -> NDArray[Any]:
     return pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
 
 
-def _check_numbers(path: Path, key: str, pixels: NDArray[Any], numbers: bool) -> None:
+def _check_numbers(path: Path, key: str, pixels: NDArray[Any], numbers: bool = False) -> None:
     """Raise ConfigError unless an array is a mosaic of 16-bit integers, or with ``numbers`` of integers or floats."""
     allowed = pixels.dtype.kind in "iuf" if numbers else pixels.dtype == np.uint16
     if not allowed or pixels.ndim != 2:
+        expected = "integers or floats" if numbers else "uint16"
         raise ConfigError(
-            f"{key}: {path} is {pixels.dtype} {list(pixels.shape)}; expected a mosaic [H, W] of "
-            + ("integers or floats" if numbers else "uint16")
+            f"{key}: {path} is {pixels.dtype} {list(pixels.shape)}; expected a mosaic [H, W] of {expected}"
         )
 
 

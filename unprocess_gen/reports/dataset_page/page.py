@@ -42,7 +42,7 @@ from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.noise_check.checks import Checker
 from unprocess_gen.reports.report_files import check_page_file, require_libraries, writable_folder, write_files
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
-from unprocess_gen.sources.dark_frames import NO_PLACES, DarkPlaces
+from unprocess_gen.sources.dark_frames import dark_folder
 from unprocess_gen.sources.names import encode_name
 
 PAIRS_FITTED = 8
@@ -60,23 +60,23 @@ SETTINGS_SHOWN = (
 
 
 def write_dataset_report(
-    folder: AnyPath, to: Path | None = None, source: AnyPath | None = None, dark: DarkPlaces = NO_PLACES
+    folder: AnyPath, to: Path | None = None, source: AnyPath | None = None, dark_frames: str | None = None
 ) -> Path:
     """Write the page of a finished dataset to ``to``, ``report.html`` in a local dataset by default.
 
-    ``source`` is the folder of the photographs, for the contact sheet, by default the recorded one; ``dark`` the place
-    of the dark frames. ConfigError if a library is missing or ``to`` may not be written; DamageError if the dataset is
-    not finished or was changed; MachineError if writing fails.
+    ``source`` is the folder of the photographs, for the contact sheet, by default the recorded one; ``dark_frames``
+    that of the dark frames. ConfigError if a library is missing or ``to`` may not be written; DamageError if the
+    dataset is not finished or was changed; MachineError if writing fails.
     """
     require_libraries("report")
     file = to or writable_folder(folder, "file") / REPORT
     if to is not None and not (isinstance(folder, Path) and to.resolve() == (folder / REPORT).resolve()):
         check_page_file(to, f"--to {to}")
-    write_files(file.parent, {file.name: dataset_page(folder, source, dark).encode()})
+    write_files(file.parent, {file.name: dataset_page(folder, source, dark_frames).encode()})
     return file
 
 
-def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlaces = NO_PLACES) -> str:
+def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: str | None = None) -> str:
     """Render the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
     from jinja2 import TemplateError  # optional library, extra "figures"
 
@@ -102,7 +102,7 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlace
             shards=[(shard_name(number), entry) for number, entry in enumerate(facts["shards"][:SHARDS_LISTED])],
             name=name,
             quoted=shlex.quote(name),
-            **({} if first is None else _pair_values(folder, source, dark, first)),
+            **({} if first is None else _pair_values(folder, source, dark_frames, first)),
         )
     except (TypeError, ValueError, ZeroDivisionError, TemplateError) as error:  # what a row of facts should have
         raise DamageError(f"{folder / 'dataset.json'}: cannot be shown ({error_in_one_line(error)})") from error
@@ -131,7 +131,7 @@ def checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
         raise DamageError(str(error)) from error
 
 
-def _pair_values(folder: AnyPath, source: AnyPath | None, dark: DarkPlaces, first: Row) -> dict[str, Any]:
+def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | None, first: Row) -> dict[str, Any]:
     """Values of the sections about pairs.
 
     The noise of a few evenly spaced pairs is checked and fitted, unless their dark frames are not available.
@@ -139,9 +139,9 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark: DarkPlaces, firs
     pairs, figure, missing, noise = RawPairs(folder), b"", "", None
     numbers = evenly_spaced(range(len(pairs)), PAIRS_FITTED)
     try:
-        access = dark.open() if first["dark_frame"] else None
-        if first["dark_frame"] and access is None:
+        if first["dark_frame"] and dark_frames is None:
             raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
+        access = dark_folder(dark_frames) if dark_frames and first["dark_frame"] else None
         examined = with_bar((pairs[number] for number in numbers), "pair checked", len(numbers))
         noise = photon_transfer.examine_pairs(examined, Checker(np.ones((len(numbers), 2), int)), access)
         if noise.first:

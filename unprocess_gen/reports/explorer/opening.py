@@ -18,7 +18,7 @@ from unprocess_gen.core.roots import root_path
 from unprocess_gen.core.types import NO_CLIP, Row, Source
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.selection import select_rows
-from unprocess_gen.pipeline.replay import dark_places, source_changes, source_of, source_root
+from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_of, source_root
 from unprocess_gen.reports.explorer.exploration import Exploration
 from unprocess_gen.sources.loader import list_photographs
 
@@ -111,11 +111,8 @@ def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
             for key, value in changes.items()
             if value
         }
-    places = dark_places(manifest)
-    if places.frames is not None:
-        settings["noise.dark_frames"] = override_text(places.frames)
-    if places.shading is not None and config.noise.dark_shading_sha256 is not None:
-        settings["noise.dark_shading"] = override_text(places.shading)
+    if (dark_frames := dark_frames_root(manifest)) is not None:
+        settings["noise.dark_frames"] = override_text(dark_frames)
     return replace(
         start,
         settings=settings | given,

@@ -31,7 +31,7 @@ def dark_frame_offsets(
     origin: Shape = (0, 0),
     out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """Return the dark frame's contribution, (frame - black level - dark-shading map) · scale.
+    """Return the dark frame's contribution, (frame - black level) · scale.
 
     Frames smaller than the image are repeated: rows and columns count modulo the size of the frame, which is even.
 
@@ -63,13 +63,10 @@ def dark_frame_offsets(
         raise ValueError(f"dark_pixels=None: the plan needs the dark frame {dark.sha256}; expected access to it")
     out = np.empty((shape[0], shape[1]), dtype=np.float32) if out is None else out
     frame, black, scale = dark_pixels.frame(dark.sha256), np.float32(dark.black_dn), np.float32(dark.scale)
-    shading = dark_pixels.shading(dark.shading) if dark.shading else None
     for y, from_y, rows in _runs(origin[0] + dark.shift[0], shape[0], frame.shape[0]):
         for x, from_x, columns in _runs(origin[1] + dark.shift[1], shape[1], frame.shape[1]):
             part, source = out[y : y + rows, x : x + columns], np.s_[from_y : from_y + rows, from_x : from_x + columns]
-            np.subtract(frame[source], black if shading is None else shading[source], out=part, dtype=np.float32)
-            if shading is not None and black != 0:
-                part -= black
+            np.subtract(frame[source], black, out=part, dtype=np.float32)
             if scale != 1:
                 part *= scale
     return out
