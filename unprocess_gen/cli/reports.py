@@ -24,7 +24,6 @@ from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import Config
-    from unprocess_gen.core.paths import AnyPath
     from unprocess_gen.core.roots import Root
     from unprocess_gen.reports.estimate import RunEstimate
 
@@ -105,7 +104,7 @@ def _report_folder(config: Config, verb: str) -> Path:
 
 
 def report(call: Call) -> int:
-    """Write the HTML page of a dataset or a sweep, or the card of a dataset."""
+    """Write the HTML page of a dataset or a sweep."""
     from unprocess_gen.pipeline.verify import is_sweep
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
     from unprocess_gen.sources.dark_frames import dark_folder
@@ -113,9 +112,6 @@ def report(call: Call) -> int:
     folder, to = dataset_folder(call, sweeps=True), Path(call.values["to"]) if "to" in call.values else None
     if isinstance(folder, Path) and is_sweep(folder):
         return _report_sweep(folder, to, call)
-    _check_card_arguments(call)
-    if "card" in call.values:
-        return _card(folder, to, call)
     root = given_root(call)
     dark = dark_frames_of(folder / "manifest.csv", call)
     if "dark_frames" in call.values and dark is not None:
@@ -127,33 +123,10 @@ def report(call: Call) -> int:
 def _report_sweep(folder: Path, to: Path | None, call: Call) -> int:
     from unprocess_gen.reports.sweep_page import write_sweep_page
 
-    if others := sorted(call.values.keys() & {"card", *FOR_PAGE, *FOR_CARD}):
+    if others := sorted(call.values.keys() & {"source", "dark_frames"}):
         raise ConfigError(f"report: {folder}: is a sweep; --{others[0]} is for one of its datasets; leave it out")
     jobs = read_table(folder / "sweep.csv")
     print_result(write_sweep_page(folder, jobs, swept_keys(jobs), to))
-    return 0
-
-
-FOR_PAGE, FOR_CARD = ("source", "dark_frames"), ("licence", "published")
-"""Arguments that only the page of a dataset, or only its card, uses."""
-
-
-def _check_card_arguments(call: Call) -> None:
-    unused, other = (FOR_PAGE, "without") if "card" in call.values else (FOR_CARD, "with")
-    for name in unused:
-        if name in call.values:
-            flag = f"--{name.replace('_', '-')}"
-            raise ConfigError(f"report: {flag} {call.values[name]}: is used {other} --card only; leave one of both out")
-
-
-def _card(folder: AnyPath, to: Path | None, call: Call) -> int:
-    """Write the card of a dataset, and name what is left to its author."""
-    from unprocess_gen.pipeline.workspace import CARD_FILES
-    from unprocess_gen.reports.card import write_card
-
-    out = write_card(folder, to, *(call.values.get(name, "") for name in FOR_CARD))
-    missing = ", ".join(f"--{name}" for name in FOR_CARD if name not in call.values)
-    print_result(f"{out}: {' and '.join(CARD_FILES)} written" + (f"; left to its author: {missing}" if missing else ""))
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import date
 
 from unprocess_gen.cli.arguments import SOURCE, Argument, PlaceArgument, Verb, choice
 
@@ -25,10 +24,6 @@ def _local_path(text: str) -> str:
     if "://" in text:  # it would become a folder named after the scheme
         raise ValueError
     return text
-
-
-def _date(text: str) -> str:
-    return date.fromisoformat(text).isoformat()
 
 
 def _file(flag: str, text: str, metavar: str = "FILE", *, required: bool = False) -> Argument:
@@ -138,13 +133,10 @@ _VERBS = (
     ),
     Verb(
         "report",
-        "write an HTML page about a dataset or a sweep, or the card of a dataset",
+        "write an HTML page about a dataset or a sweep",
         "reports.report",
         (
-            _file("--to", "write FILE instead of DIR/report.html; with --card, a folder"),
-            Argument(("--card",), "write README.md and croissant.json (Croissant 1.1) instead of the page"),
-            Argument(("--licence", "--license"), "with --card: licence of the dataset, an SPDX name or URL", "LICENCE"),
-            Argument(("--published",), "with --card: date of publication", "DATE", _date, "a date, such as 2026-01-31"),
+            _file("--to", "write FILE instead of DIR/report.html"),
             *INPUTS,
         ),
         PlaceArgument("DIR", "the folder of a dataset or of a sweep"),

@@ -26,11 +26,11 @@ from unprocess_gen.core.suggestions import did_you_mean
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.manifest import read_columns, read_rows
 from unprocess_gen.pipeline.verify import Damage, differing_columns, verify
-from unprocess_gen.pipeline.workspace import CARD_FILES, REPORT
+from unprocess_gen.pipeline.workspace import REPORT
 
 MANIFEST = "manifest.csv"
 
-BESIDE = ("dataset.json", ".work", REPORT, *CARD_FILES, "sweep.csv", "sweep.csv.lock")
+BESIDE = ("dataset.json", ".work", REPORT, "sweep.csv", "sweep.csv.lock")
 """Files in the folder of a build whose bytes are not compared."""
 
 PHOTOGRAPHS_FROM = "scikit-image 0.24.0, 0.25.2 and 0.26.0"

@@ -10,7 +10,6 @@
     out/manifest.parquet         the manifest as typed columns, if output.parquet is true
     out/dataset.json             written last; then .work is deleted, unless a shard is provisional
     out/report.html              the page of the verb ``report``; not part of the dataset
-    out/README.md                with croissant.json, the card of ``report --card``; not part of the dataset
 
 Workers sync and rename their shards, then the shards' records. A shard without a record is regenerated, to the same
 bytes, whenever a run is killed. Correct data do not depend on the lock: two runs that hold it at once make the same
@@ -49,8 +48,7 @@ from unprocess_gen.pipeline.tasks import Tally
 from unprocess_gen.sources.reading import content_sha256
 
 REPORT = "report.html"
-CARD_FILES = ("README.md", "croissant.json")
-"""The page and the card of a dataset, files in its folder that are not part of the dataset."""
+"""The page of a dataset, a file in its folder that is not part of the dataset."""
 
 DIFFERENCES_SHOWN = 3
 """Differences named in an error; the others are counted."""

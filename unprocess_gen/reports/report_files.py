@@ -1,6 +1,6 @@
 """Check that a report can be written to the requested place, and write its files.
 
-A report is not part of a dataset. This module imports no kernel, so that the dataset report starts without Numba.
+A report is not part of a dataset.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_file, check_output_folder
 from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.pipeline.workspace import REPORT
 
 LIBRARIES = {"matplotlib": "drawing needs", "jinja2": "HTML pages need"}
 """Optional libraries of the extra ``figures``, and the purpose that an error message names."""
@@ -67,17 +68,21 @@ def check_page_file(file: Path, option: str) -> None:
     check_output_file(file, option, "an HTML page", b"<!doctype html", b"<html")
 
 
-def writable_folder(folder: AnyPath, kind: str) -> Path:
-    """Return the folder of a dataset in which a report, a ``file`` or files of a ``folder``, is written without --to.
+def page_file(folder: AnyPath, to: Path | None = None) -> Path:
+    """Return the file for the page of a dataset or sweep: ``report.html`` in its folder, unless ``to`` names another.
 
-    ConfigError if it is remote or read-only.
+    ConfigError if a library is missing, or if the page cannot be written there.
     """
-    advice = f"give --to {kind.upper()}"
+    require_libraries("report")
+    if to is not None:
+        if not (isinstance(folder, Path) and to.resolve() == (folder / REPORT).resolve()):
+            check_page_file(to, f"--to {to}")
+        return to
     if not isinstance(folder, Path):
-        raise ConfigError(f"report: {folder} is in an object store; expected a local {kind}; {advice}")
+        raise ConfigError(f"report: {folder} is in an object store; expected a local file; give --to FILE")
     if not os.access(folder, os.W_OK):
-        raise ConfigError(f"report: {folder} is read-only; expected a {kind} that can be written; {advice}")
-    return folder
+        raise ConfigError(f"report: {folder} is read-only; expected a file that can be written; give --to FILE")
+    return folder / REPORT
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:

@@ -27,7 +27,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
-from unprocess_gen.pipeline.workspace import REPORT, read_dataset
+from unprocess_gen.pipeline.workspace import read_dataset
 from unprocess_gen.reports import photon_transfer
 from unprocess_gen.reports.dataset_page.statistics import (
     MEANINGS,
@@ -40,7 +40,7 @@ from unprocess_gen.reports.encoding import figure_png, picture_jpeg
 from unprocess_gen.reports.formatting import byte_size, short_number
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.noise_check.checks import Checker
-from unprocess_gen.reports.report_files import check_page_file, require_libraries, writable_folder, write_files
+from unprocess_gen.reports.report_files import page_file, write_files
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 from unprocess_gen.sources.dark_frames import dark_folder
 from unprocess_gen.sources.names import encode_name
@@ -68,10 +68,7 @@ def write_dataset_report(
     that of the dark frames. ConfigError if a library is missing or ``to`` may not be written; DamageError if the
     dataset is not finished or was changed; MachineError if writing fails.
     """
-    require_libraries("report")
-    file = to or writable_folder(folder, "file") / REPORT
-    if to is not None and not (isinstance(folder, Path) and to.resolve() == (folder / REPORT).resolve()):
-        check_page_file(to, f"--to {to}")
+    file = page_file(folder, to)
     write_files(file.parent, {file.name: dataset_page(folder, source, dark_frames).encode()})
     return file
 
