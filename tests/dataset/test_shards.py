@@ -29,10 +29,8 @@ from unprocess_gen.dataset.shards import (
     ArrayFormat,
     Member,
     ShardWriter,
-    image_bytes,
     map_array,
     read_index,
-    shard_bytes,
     shard_name,
 )
 
@@ -99,18 +97,6 @@ def test_arrays_of_any_layout_give_the_same_bytes(tmp_path: Path) -> None:
     written(tmp_path / "a.tar", one)
     written(tmp_path / "b.tar", other)
     assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
-
-
-SIZES = [(1, 1), (1, 2), (2, 1), (3, 5), (16, 16), (17, 31), (1, 191), (1, 193), (255, 1), (1000, 1)]
-
-
-def test_size_of_a_shard_is_predicted_exactly(tmp_path: Path) -> None:
-    for json_bytes in (512, 700):
-        path = tmp_path / f"{json_bytes}.tar"
-        writer = written(path, *(pair(height, width) for height, width in SIZES), json_bytes=json_bytes)
-        predicted = shard_bytes([image_bytes(uint16(height, width), json_bytes) for height, width in SIZES])
-        assert predicted == writer.bytes == path.stat().st_size
-    assert shard_bytes([]) == 0
 
 
 def test_shards_are_numbered_with_five_digits_or_more() -> None:

@@ -23,7 +23,6 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.cli.messages import logging_to
-from unprocess_gen.config.schema import OutputConfig
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.types import Source
@@ -31,7 +30,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import worker
 from unprocess_gen.pipeline.executors import local
-from unprocess_gen.pipeline.run import shard_starts, shard_tasks
+from unprocess_gen.pipeline.run import shard_tasks
 from unprocess_gen.pipeline.tasks import COUNTS
 
 SHARDS_OF_5 = "output.pairs_per_shard=5"
@@ -406,8 +405,7 @@ def sources(count: int) -> list[Source]:
     ("count", "per_shard", "lengths"), [(5, 2, [2, 2, 1]), (4, 2, [2, 2]), (1, 8, [1]), (3, 1, [1] * 3)]
 )
 def test_shard_tasks_split_the_listing_in_order(count: int, per_shard: int, lengths: list[int]) -> None:
-    starts = shard_starts(sources(count), OutputConfig(pairs_per_shard=per_shard))
-    tasks = shard_tasks(sources(count), starts)
+    tasks = shard_tasks(sources(count), per_shard)
     assert [len(task.sources) for task in tasks] == lengths
     assert [source for task in tasks for source in task.sources] == sources(count)
     assert [task.shard for task in tasks] == list(range(len(tasks)))

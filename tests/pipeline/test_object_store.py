@@ -342,17 +342,6 @@ def test_wrong_out_is_refused_before_anything_is_written(
     assert sorted(bucket.walk_entries()) == before
 
 
-def test_too_little_temporary_space_is_refused(
-    twelve: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from unprocess_gen.pipeline import sizes
-
-    monkeypatch.setattr(sizes, "free_bytes", lambda path: 100)
-    with pytest.raises(MachineError, match=r"out=s3://.*: not enough temporary disk space .* set TMPDIR"):
-        generate(config_of(twelve, bucket / "ds"))
-    assert list(bucket.walk_entries()) == []
-
-
 def test_signal_ends_a_run_without_leftovers(
     twelve: Path, bucket: ObjectPath, proxy: Proxy, scratch: Path, tmp_path: Path
 ) -> None:

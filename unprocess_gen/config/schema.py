@@ -10,7 +10,6 @@ override replaces a list completely. A mapping would be merged with the default'
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -617,13 +616,6 @@ class AccuracyConfig(Group):
     normal_error: float = key(1e-06, Numbers(0), unit="standard deviations")
 
 
-TOGETHER = "together"
-"""Value of ``output.clips`` that keeps the frames of a clip in one shard."""
-
-AUTO = "auto"
-"""Value of ``output.pairs_per_shard`` that lets a run choose the number."""
-
-
 @documented
 @dataclass(frozen=True)
 class OutputConfig(Group):
@@ -640,16 +632,12 @@ class OutputConfig(Group):
         layout of the arrays: mosaic is [H, W], packed is [4, H/2, W/2] with planes R, G of red rows, G of blue
         rows, B
     pairs_per_shard
-        sources per shard, the unit of work and of a retry; auto chooses the number for shards of about 256 MB,
-        and config.yaml records it
+        sources per shard, the unit of work and of a retry
     parquet
         write manifest.parquet too: the manifest as typed columns, compressed with zstd; needs pyarrow
     targets
         more arrays for a training: linear_rgb is the scene before the mosaic, srgb the photograph, variance that
         of the noise at each site, noise_std its standard deviation as estimated from the noisy frame
-    clips
-        with source.clips: divided puts the same number of sources into each shard, together keeps each clip in one
-        shard, which then has pairs_per_shard sources or more
     frames
         store frames; false writes a manifest only, as the verb manifest does: ug.LivePairs makes the pairs of it
     """
@@ -657,18 +645,10 @@ class OutputConfig(Group):
     dtype: str = key("uint16", Choice("uint16", "float32"))
     clean_dtype: Optional[str] = key(None, Choice("uint16", "float32"), null="the type of dtype", since="0.2")
     layout: str = key("mosaic", Choice("mosaic", "packed"))
-    pairs_per_shard: Any = key(8, NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"))
+    pairs_per_shard: int = key(8, Integers(1, 10**6))
     parquet: bool = key(False, limits.BOOLEAN, since="0.2")
     targets: tuple[str, ...] = key((), limits.TARGET_NAMES, since="0.3")
-    clips: str = key("divided", Choice("divided", TOGETHER), since="0.3")
     frames: bool = key(True, limits.BOOLEAN, since="0.3")
-
-    def __post_init__(self) -> None:
-        """Convert the text of an integer, such as the value of an environment variable."""
-        super().__post_init__()
-        if isinstance(self.pairs_per_shard, str):
-            with contextlib.suppress(ValueError):
-                object.__setattr__(self, "pairs_per_shard", int(self.pairs_per_shard))
 
 
 @documented

@@ -34,7 +34,6 @@ from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.raw_validation import check_raw_source
 from unprocess_gen.config.schema import (
     PHYSICAL,
-    TOGETHER,
     CameraConfig,
     Config,
     EffectsConfig,
@@ -310,8 +309,6 @@ def _check_output(config: Config) -> None:
     Integers are rounded and clipped; float32 is not.
     """
     quantise, output = _named_switch(config, "quantise"), config.output
-    if output.clips == TOGETHER and not config.source.clips:
-        raise refusal("output.clips", TOGETHER, "there are no clips; expected divided; or set source.clips=true")
     if output.targets and config.source.max_pixels > MAX_TARGET_PIXELS:
         problem = f"12 bytes a pixel could exceed 8 GiB; expected source.max_pixels up to {MAX_TARGET_PIXELS}"
         raise refusal("output.targets", output.targets, problem)

@@ -60,7 +60,7 @@ class RawClips:
     Parameters
     ----------
     path : str or Path, or a list of them
-        As for `RawPairs`. With ``output.clips=together`` each clip is read from one shard.
+        As for `RawPairs`.
     split : str, optional
         Only clips of this split, by default all.
 
@@ -76,7 +76,7 @@ class RawClips:
     Examples
     --------
     >>> import unprocess_gen as ug
-    >>> settings = ["source.clips=true", "source.limit=16", "output.clips=together", "out=clips", "n_jobs=1"]
+    >>> settings = ["source.clips=true", "source.limit=16", "out=clips", "n_jobs=1"]
     >>> _ = ug.generate(ug.load_config(settings))
     >>> clips = ug.RawClips("clips")
     >>> len(clips), clips[0].noisy.shape[0], clips[1].rows[7]["frame"]

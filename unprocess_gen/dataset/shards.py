@@ -115,23 +115,6 @@ def _padding(size: int) -> int:
     return -size % RECORD_BYTES
 
 
-def image_bytes(
-    array: ArrayFormat,
-    json_bytes: int,
-    pairs: int = 1,
-    clean: ArrayFormat | None = None,
-    targets: Sequence[ArrayFormat] = (),
-) -> int:
-    """Return the bytes of one sample in a shard."""
-    sizes = [len(form.header) + form.size for form in (clean or array, *[array] * pairs, *targets)]
-    return sum(RECORD_BYTES + member + _padding(member) for member in (*sizes, json_bytes))
-
-
-def shard_bytes(pairs: list[int]) -> int:
-    """Return the size of a shard."""
-    return sum(pairs) + len(END) if pairs else 0
-
-
 _sync_data = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 
 MAX_PENDING_BYTES = 2**26

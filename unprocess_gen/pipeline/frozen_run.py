@@ -22,7 +22,7 @@ from typing import Annotated
 
 import msgspec
 
-from unprocess_gen.config.schema import TOGETHER, Config, at_place, replaced
+from unprocess_gen.config.schema import Config, at_place, replaced
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line
@@ -69,8 +69,6 @@ class FrozenPlan(msgspec.Struct, frozen=True):
         Absolute places of the sources and the dark frames; None without them.
     roots : tuple of str
         Absolute places of the sources, if there are several.
-    starts : tuple of int
-        Index of the first source of each shard, if shards have complete clips; else empty.
     not_matched, skipped_links : int
         What the listing left out.
     canary_source : int or None
@@ -95,7 +93,6 @@ class FrozenPlan(msgspec.Struct, frozen=True):
     dark_frames: str | None = None
     parts: Positive | None = None
     roots: tuple[str, ...] = ()
-    starts: tuple[Count, ...] = ()
 
     def __post_init__(self) -> None:
         if self.parts is not None and self.parts > self.shards:
@@ -104,13 +101,10 @@ class FrozenPlan(msgspec.Struct, frozen=True):
     @property
     def shards(self) -> int:
         """Number of shards."""
-        return len(self.starts) or -(-self.sources // self.pairs_per_shard)
+        return -(-self.sources // self.pairs_per_shard)
 
     def sources_of(self, shard: int) -> tuple[int, int]:
         """Index of the first source of a shard, and of the one after its last."""
-        if self.starts:
-            first, end = (*self.starts, self.sources)[shard : shard + 2]
-            return first, end
         first = shard * self.pairs_per_shard
         return first, min(first + self.pairs_per_shard, self.sources)
 
@@ -156,7 +150,6 @@ def _new_plan(workspace: Workspace, run: Run, on_compiling: OnCompiling | None, 
         pairs_per_shard=config.output.pairs_per_shard,
         root=None if isinstance(place, tuple) else place,
         roots=place if isinstance(place, tuple) else (),
-        starts=tuple(run.starts()) if config.output.clips == TOGETHER else (),
         max_failed=config.source.max_failed,
         n_jobs=config.n_jobs,
         self_test=config.self_test,

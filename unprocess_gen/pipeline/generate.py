@@ -179,7 +179,7 @@ def begin(workspace: Workspace, run: Run) -> list[ShardTask]:
     done = workspace.records.committed(range(len(tasks)))
     todo = [task for task in tasks if task.shard not in done]
     if run.config.check_disk:
-        check_free_space(run.config, todo, effective_jobs(run.config.n_jobs, len(todo)))
+        check_free_space(run.config, [source for task in todo for source in task.sources])
     workspace.begin(run.sources, len(tasks))
     return todo
 

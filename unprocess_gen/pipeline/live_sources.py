@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -160,7 +159,7 @@ class PlannedPairs:
             )
         self.name, self._cache = "", cache
         run = resolve(config)
-        self.settings, self._starts = run.settings, run.starts()
+        self.settings = run.settings
         self._sources = [source for source in run.sources if source.reason is None]
         self._patches = 1 if rule is None else rule.count
         self._plans = len(noise_levels(config.noise)) * config.noise.draws
@@ -183,7 +182,7 @@ class PlannedPairs:
         patch, plan = patches[rest // self._plans], plans[rest % self._plans]
         sample = patch_key(source.index, patch, several=config.source.patch is not None)
         key = pair_key(sample, plan, several=self._plans > 1)
-        shard = bisect.bisect_right(self._starts, source.index) - 1
+        shard = source.index // self.settings.config.output.pairs_per_shard
         return LiveImage(source, sha256, orientation, shard, key, plan, patch)
 
     def pixels(self, image: LiveImage) -> Srgb:

@@ -1,7 +1,6 @@
 """Estimate the pairs, shards, bytes, time and effects of a run, without writing anything.
 
-The pairs of up to `SAMPLE` evenly spaced sources are made, or of all sources on request. Bytes follow from the headers
-of all sources, because the size of a pair depends only on its width, height and name; they are exact if all were read.
+The pairs of up to `SAMPLE` evenly spaced sources are made, or of all sources on request.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,16 +21,13 @@ from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.roots import is_remote
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.targets import FRAME_TARGETS
 from unprocess_gen.core.types import Frame, Plan, Source, Srgb
-from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
-from unprocess_gen.pipeline.sizes import HEADERS_READ as SIZE_SAMPLE
-from unprocess_gen.pipeline.sizes import estimate_shards, source_bytes
+from unprocess_gen.pipeline.sizes import source_bytes
 from unprocess_gen.pipeline.targets import noise_law, targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
@@ -48,9 +44,6 @@ LOGGER = logging.getLogger("unprocess_gen")
 
 SAMPLE = 8
 """Number of sources of which pairs are made, unless all are asked for."""
-
-BYTES_WITH_HEADERS = 2**31
-"""Bytes of the files whose headers are read, at most; of more, evenly spaced ones are read."""
 
 SLOW_TIER = "reference"
 """The tier that is not timed for comparison."""
@@ -108,7 +101,6 @@ class RunEstimate:
     n_jobs: int
     source_estimates: tuple[SourceEstimate, ...]
     shards: int
-    headers: int
     bytes: int
     free_bytes: int
     start_seconds: float
@@ -148,23 +140,14 @@ def estimate_run(
     start_seconds += _compile_kernels(without_dark_frames(config), quick.values())
     sample = sources if read_all else evenly_spaced(sources, SAMPLE)
     estimates = tuple(estimate_source(run.settings, source) for source in with_bar(sample, "photograph"))
-    sampled_bytes = sum(source.bytes for source in estimates)
-    if len(sample) == len(sources):
-        headers, growth = 0, 1.0
-        shards = (estimates[task.sources[0].index : task.sources[-1].index + 1] for task in tasks)
-        size = sum(shard_bytes([source.bytes for source in shard if source.bytes]) for shard in shards)
-    else:
-        headers = _headers_read(config, sources)
-        size = estimate_shards(config, tasks, headers).total
-        growth = size / sampled_bytes if sampled_bytes else len(sources) / len(sample)
-    size = size if config.output.frames else 0
+    growth = len(sources) / len(sample)
+    size = round(sum(source.bytes for source in estimates) * growth)
     folder = any_path(config.out).scratch_place("")[0]
     return RunEstimate(
         run,
         n_jobs,
         estimates,
         len(tasks),
-        headers,
         size,
         free_bytes=free_bytes(folder),
         start_seconds=start_seconds,
@@ -172,14 +155,6 @@ def estimate_run(
         disk_seconds=len(tasks) * COMMIT_SECONDS + size * _seconds_per_byte(folder),
         tier_ns=_tier_ns(without_dark_frames(config), estimates, quick),
     )
-
-
-def _headers_read(config: Config, sources: Sequence[Source]) -> int:
-    """Number of sources whose headers are read: all, as long as their files have `BYTES_WITH_HEADERS`."""
-    if config.source.place is not None and is_remote(config.source.place):
-        return SIZE_SAMPLE
-    mean_bytes = sum(source.size_bytes or 0 for source in sources) // len(sources)
-    return min(len(sources), max(SIZE_SAMPLE, BYTES_WITH_HEADERS // max(mean_bytes, 1)))
 
 
 def _seconds_per_byte(out: Path) -> float:
@@ -220,7 +195,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     return SourceEstimate(
         source,
         time.perf_counter() - started if config.output.frames else planned_s,
-        source_bytes(config, source.name, height, width, 8 * photograph.srgb.itemsize),
+        source_bytes(config, height, width),
         levels,
         predictions=predictions,
         patches=len(image.patches),

@@ -10,10 +10,9 @@ import numpy as np
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.bodies import body_sentence
-from unprocess_gen.config.schema import BRANCH_FIELDS, TOGETHER, AccuracyConfig, Config, NoiseConfig, SourceConfig
+from unprocess_gen.config.schema import BRANCH_FIELDS, AccuracyConfig, Config, NoiseConfig, SourceConfig
 from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Patch, Plan
-from unprocess_gen.pipeline.sizes import shards_warning
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
 from unprocess_gen.planning.sensor_levels import sensor_warning
@@ -30,19 +29,17 @@ def format_estimate(estimate: RunEstimate) -> str:
     """Format an estimate for a terminal: lines without a final newline."""
     run, read, config = estimate.run, estimate.source_estimates, estimate.run.config
     about = "" if estimate.exact else "about "
-    notes = unmatched_sentence(run.listing.unmatched), *run.listing.warnings, shards_warning(config, run.sources)
-    basis = "" if estimate.exact else f", from {estimate.headers} headers (--all reads every source: exact)"
+    notes = unmatched_sentence(run.listing.unmatched), *run.listing.warnings
     place = place_text(config.source.place or "the built-in scenes")
     readable = [source for source in read if source.levels]
     lines = [
         f"sources   {len(run.sources)} in {config.source.list or place}; {len(read)} of them read",
         *(f"          {note}" for note in notes if note),
-        f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}"
-        + (" or more, with complete clips" if config.output.clips == TOGETHER else ""),
+        f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}",
         *_labelled("splits", [_split_sentence(config, len(run.sources))]),
         *_patch_lines(config, read),
         *_labelled("targets", [", ".join(config.output.targets)]),
-        f"bytes     {about}{estimate.bytes:,} in shards, {byte_size(estimate.bytes)}{basis}",
+        f"bytes     about {estimate.bytes:,} in shards, {byte_size(estimate.bytes)}",
         f"disk      {byte_size(estimate.free_bytes)} free"
         + ("" if estimate.free_bytes > estimate.bytes else ": NOT ENOUGH"),
         f"time      about {format_duration(estimate.seconds)} with {counted(estimate.n_jobs, 'worker')}: start-up "
