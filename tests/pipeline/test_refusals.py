@@ -35,7 +35,6 @@ from unprocess_gen.pipeline import progress as progress_module
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
-from unprocess_gen.pipeline.repair import repair
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.verify import have_same_rows, verify, verify_sweep
@@ -184,24 +183,6 @@ def as_version_01(folder: Path) -> dict[str, bytes]:
     known = dataset_facts((folder / "config.yaml").read_text(), digest, facts["shards"], {})
     (folder / "dataset.json").write_text(dataset_text(facts | known))
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.mark.parametrize("lost", ["manifest.csv", "dataset.json", "shards/shard-00001.tar", "config.yaml"])
-def test_repair_restores_the_bytes_of_a_01_dataset(lost: str, copy: Path) -> None:
-    before = as_version_01(copy / "ds")
-    assert verify(copy / "ds") == []
-    (copy / "ds" / lost).unlink()
-    assert [step.exit_code for step in repair(copy / "ds", str(copy / "p"))] == [0]
-    for name, content in before.items():
-        assert name == lost == "dataset.json" or (copy / "ds" / name).read_bytes() == content
-
-
-def test_lost_01_manifest_is_regenerated_from_the_sources(copy: Path) -> None:
-    before = as_version_01(copy / "ds")
-    for name in ("manifest.csv", "shards/shard-00000.tar"):
-        (copy / "ds" / name).unlink()
-    assert {step.exit_code for step in repair(copy / "ds", str(copy / "p"))} == {0}
-    assert {name: (copy / "ds" / name).read_bytes() for name in before} == before
 
 
 def test_finished_01_dataset_is_complete(copy: Path, make: Make) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from PIL import Image
 from unprocess_gen.core.types import Plan, Srgb
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.shards import json_inside
-from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.planning.source_noise import noise_ratio, source_noise_dn, tile_noise
 from unprocess_gen.reports.plan_text import source_noise_sentence
@@ -143,26 +141,6 @@ def test_scenes_have_no_estimate(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1")
     assert [row["source_noise_dn"] for row in read_rows(tmp_path / "ds/manifest.csv")] == [None]
     assert "source_noise_dn" not in json.loads((tmp_path / "ds/dataset.json").read_text())["shards"][0]
-
-
-def test_lost_manifest_is_restored_without_sources(made: Path, tmp_path: Path, run_main: RunMain) -> None:
-    copy = Path(shutil.copytree(made, tmp_path / "ds"))
-    before = (copy / "manifest.csv").read_bytes()
-    (copy / "manifest.csv").unlink()
-
-    done = run_main("verify", copy, "--repair", f"source.root={tmp_path}")
-
-    assert done.code == 0, done.err
-    assert done.out.splitlines()[0] == "manifest.csv: restored from the rows in the shards"
-    assert (copy / "manifest.csv").read_bytes() == before
-
-
-def test_edited_estimate_in_dataset_json_is_damage(made: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(made, tmp_path / "ds"))
-    facts = json.loads((copy / "dataset.json").read_text())
-    facts["shards"][0]["source_noise_dn"][0] = "much"
-    (copy / "dataset.json").write_text(json.dumps(facts))
-    assert verify(copy)
 
 
 def test_plan_states_noisy_sources(folder: Path, run_main: RunMain) -> None:

@@ -347,7 +347,7 @@ def test_replayed_patches_are_written_under_their_keys(cut_up: Path, run_main: R
         np.testing.assert_array_equal(np.load(tmp_path / "to" / f"{name}.clean.npy"), found[name].clean)
 
 
-def test_damaged_patch_is_named_and_repaired_alone(cut_up: Path, run_main: RunMain, tmp_path: Path) -> None:
+def test_damaged_patch_is_named_and_repaired(cut_up: Path, run_main: RunMain, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(cut_up, tmp_path / "ds"))
     path = copy / "shards" / "shard-00000.tar"
     content = bytearray(path.read_bytes())
@@ -355,7 +355,7 @@ def test_damaged_patch_is_named_and_repaired_alone(cut_up: Path, run_main: RunMa
     path.write_bytes(content)
 
     assert [(one.key, one.member) for one in verify(copy)] == [("00000001-p0003", "noisy.l01d01.npy")]
-    assert "shards/shard-00000.tar: 1 of 40 pairs regenerated" in run_main("verify", copy, "--repair").out
+    assert "shards/shard-00000.tar: regenerated" in run_main("verify", copy, "--repair").out
     assert path.read_bytes() == (cut_up / "shards" / "shard-00000.tar").read_bytes()
 
 

@@ -94,10 +94,10 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
     manifest, codes = folder / "manifest.csv", []
     root, dark = source_root(manifest, call.values.get("source")), dark_frames_of(manifest, call)
     for step in repair(local_path(folder, refusal), root, dark):
-        if step.repaired:
-            print_result(step)
+        if step.exit_code:
+            report(step.text, logging.ERROR)
         else:
-            report(str(step), logging.ERROR)
+            print_result(step.text)
         codes.append(step.exit_code)
     return codes
 

@@ -40,8 +40,6 @@ class ShardFacts(msgspec.Struct, frozen=True):
     failed: Count
     bytes: Count
     sha256: Digest | None
-    source_noise_dn: list[Amount | None] | None = None
-    light_clipped_high: list[Count | None] | None = None
 
 
 class RunFacts(msgspec.Struct, frozen=True):

@@ -532,28 +532,6 @@ def rows_with_offsets(path: AnyPath) -> Iterator[tuple[int, Row]]:
             offset += len(line)
 
 
-def readable_rows(path: AnyPath) -> Iterator[Row]:
-    """Read those lines of a damaged manifest that are still rows.
-
-    Parameters
-    ----------
-    path : Path or ObjectPath
-        A ``manifest.csv``; it need not exist.
-
-    Yields
-    ------
-    Row
-        Intact rows. The first line is ignored: each line is read with the header of the version that fits it.
-    """
-    with contextlib.suppress(OSError), path.open("rb") as stream:
-        stream.readline(MAX_LINE_BYTES + 1)
-        while line := stream.readline(MAX_LINE_BYTES + 1):
-            for names in HEADERS:
-                with contextlib.suppress(csv.Error, ValueError):
-                    yield _typed(names, line)
-                    break
-
-
 def read_columns(path: AnyPath) -> tuple[str, ...]:
     """Columns of a manifest, those unknown to this version included; DamageError if the file is no manifest."""
     with _opened(path) as manifest:

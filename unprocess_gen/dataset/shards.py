@@ -316,22 +316,6 @@ def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tup
             yield "", "", "the end of the archive is missing" if len(rest) < len(END) else "something follows the end"
 
 
-def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dict[str, Frame]]:
-    """Read the frames of a damaged shard that are intact and at their place."""
-    with path.open("rb") if path.is_file() else io.BytesIO() as stream:
-        position = 0
-        for sample in samples:
-            frames = {}
-            for member, digest, array in sample.frames:
-                size, head = array.size, len(array.header)
-                content = _read_at(stream, Member(position + RECORD_BYTES + head, size))
-                position += RECORD_BYTES + head + size + _padding(head + size)
-                if len(content) == size and xxhash.xxh3_128_hexdigest(content) == digest:
-                    frames[member] = np.frombuffer(content, array.description).reshape(array.shape)
-            position += RECORD_BYTES + len(sample.json) + _padding(len(sample.json))
-            yield frames
-
-
 def json_inside(path: Path) -> list[bytes]:
     """Return the JSON members of an intact shard.
 

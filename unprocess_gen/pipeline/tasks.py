@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import NO_CLIP, Counts, Row, Source, Value
+from unprocess_gen.core.types import NO_CLIP, Counts, Row, Source
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.manifest import has_frames
 from unprocess_gen.dataset.shards import shard_name
@@ -198,17 +198,7 @@ class ShardResult:
             "failed": sum(row["status"] == "failed" for row in self.rows),
             "bytes": self.bytes,
             "sha256": self.sha256,
-            **self._only_in_manifest(),
         }
-
-    def _only_in_manifest(self) -> dict[str, list[Value]]:
-        """Return the measured columns that KEY.json lacks, from which a lost manifest is restored."""
-        pairs = [row for row in self.rows if row["status"] == "ok"]
-        values = {
-            "source_noise_dn": [rows[0]["source_noise_dn"] for rows in group_by_image(pairs)],
-            "light_clipped_high": [row["light_clipped_high"] for row in pairs],
-        }
-        return {name: column for name, column in values.items() if any(value is not None for value in column)}
 
     def report(self) -> ShardReport:
         """Describe the shard for the coordinator."""
