@@ -1,8 +1,8 @@
 """Measure the cost of accuracy and update its pages: python .readme/draw_accuracy.py [overrides].
 
-Run `gen-dataset accuracy` with the overrides (source.root=photos). Save its figure as accuracy.png in this folder, and
-its conclusion and tables between the marks in docs/accuracy.md (errors) and docs/performance.md (times). It takes some
-minutes; stop other programs meanwhile.
+Run `gen-dataset accuracy` with the overrides (source.root=photos), and with a physical profile by day and by night.
+Save the figure of the first as accuracy.png in this folder, its errors in docs/accuracy.md, and the times of all in
+docs/performance.md, between the marks. It takes some minutes; stop other programs meanwhile.
 """
 
 from __future__ import annotations
@@ -13,35 +13,52 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from unprocess_gen.reports.benchmark.complete_runs import RunMeasurement
-from unprocess_gen.reports.benchmark.measure import Measurement
-from unprocess_gen.reports.benchmark.report import METHOD_COLUMNS, RECOMMENDATIONS, RUN_COLUMNS, table
-from unprocess_gen.reports.html_pages import PageTable
+from unprocess_gen.reports.accuracy.measure import STAGES, Measurement
+from unprocess_gen.reports.accuracy.report import accuracy_table
 
 HERE = Path(__file__).parent
 ERRORS, TIMES = (HERE.parent / "docs" / name for name in ("accuracy.md", "performance.md"))
-CONCLUSION = re.compile(r"^In a complete run of .*?(?=\n\n)", re.MULTILINE | re.DOTALL)
-TEXTS = ("stage", "method", "tier", "error_unit", "setting", "noise")
+CONCLUSION = re.compile(r"^In a complete run of .*?\.$", re.MULTILINE | re.DOTALL)
+RUNS: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "`sony_a7s2`, daylight": ("noise=sony_a7s2", "scene=daylight"),
+    "`sony_a7s2`, night": ("noise=sony_a7s2", "scene=night"),
+}
+"""Overrides of each run by the name of its noise."""
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a CSV file of the report, with numbers as numbers and empty values as None."""
-    with path.open(newline="", encoding="utf-8") as lines:
-        return [
-            {name: text if name in TEXTS else float(text) if text else None for name, text in line.items()}
-            for line in csv.DictReader(lines)
-        ]
+def measure(overrides: Sequence[str], out: Path) -> tuple[str, list[Measurement]]:
+    """Run the command; return its conclusion and the rows of its table."""
+    command = [sys.executable, "-m", "unprocess_gen", "accuracy", *overrides, f"out={out}"]
+    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    conclusion = CONCLUSION.search(printed)
+    assert conclusion is not None
+    with (out / "accuracy.csv").open(newline="", encoding="utf-8") as lines:
+        rows = [list(line.values()) for line in csv.DictReader(lines)]
+    numbers = [[None if text == "" else float(text) for text in row[2:]] for row in rows]
+    return conclusion[0], [Measurement(*row[:2], *of_row) for row, of_row in zip(rows, numbers, strict=True)]
 
 
-def markdown(table: PageTable, left_out: tuple[str, ...] = ()) -> str:
-    """Return a table in Markdown without some of its columns."""
-    kept = [index for index, heading in enumerate(table.headings) if heading not in left_out]
-    rule = "|".join("--:" if index in table.numeric else "---" for index in kept)
-    lines = [f"| {' | '.join(line[index] for index in kept)} |" for line in (table.headings, *table.lines)]
-    return "\n".join([lines[0], f"|{rule}|", *lines[1:]])
+def errors_table(rows: Sequence[Measurement]) -> str:
+    """Return the errors of the tier fast as a table in Markdown."""
+    table = accuracy_table([row for row in rows if row.tier == "fast" and row.stage in ("clean", "noise")])
+    lines = ["| frame | " + " | ".join(table.headings[4:]) + " |", "|---|" + "--:|" * 5]
+    frames = zip(("clean", "noisy"), table.lines, strict=True)
+    return "\n".join([*lines, *(f"| {frame} | {' | '.join(line[4:])} |" for frame, line in frames)])
+
+
+def times_table(runs: dict[str, list[Measurement]]) -> str:
+    """Return the times of all tiers as a table in Markdown, with the stages side by side."""
+    lines = [f"| noise | tier | of exact | {' | '.join(STAGES)} |", "|---|---|" + "--:|" * (1 + len(STAGES))]
+    for name, rows in runs.items():
+        cells = list(accuracy_table(rows).lines)
+        for first in range(0, len(cells), len(STAGES)):
+            stages = cells[first : first + len(STAGES)]
+            lines.append(f"| {name} | {stages[0][0]} | {stages[-1][3]} | {' | '.join(line[2] for line in stages)} |")
+    return "\n".join(lines)
 
 
 def replace_part(path: Path, name: str, content: str) -> None:
@@ -55,23 +72,14 @@ def replace_part(path: Path, name: str, content: str) -> None:
 def main() -> None:
     """Measure, then replace conclusion, tables and figure."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "unprocess_gen", "accuracy", *sys.argv[1:], f"out={folder}/report"]
-        printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-        report = Path(folder) / "report"
-        shutil.copy(report / "accuracy.png", HERE / "accuracy.png")
-        methods = [Measurement(**row) for row in read_rows(report / "accuracy.csv")]
-        runs = [RunMeasurement(**row) for row in read_rows(report / "accuracy_runs.csv")]
-    conclusion = CONCLUSION.search(printed)
-    assert conclusion is not None
-    times = ("of exact", "ns per pixel", "decode", "simulate", "write")
-    errors = ("noise", "changed", "max DN", "RMS DN", "max σ", "RMS σ")
-    replace_part(TIMES, "conclusion", conclusion[0])
-    replace_part(TIMES, "runs", markdown(table(RUN_COLUMNS, runs), errors))
-    replace_part(ERRORS, "recommendations", markdown(RECOMMENDATIONS))
-    with_errors = [run for run in runs if run.noisy_changed_share]
-    replace_part(ERRORS, "runs", markdown(table(RUN_COLUMNS, with_errors), times))
-    inexact = [method for method in methods if method.error_max]
-    replace_part(ERRORS, "methods", markdown(table(METHOD_COLUMNS, inexact), ("ns per pixel", "of reference")))
+        measured = {
+            name: measure((*sys.argv[1:], *overrides), Path(folder) / str(number))
+            for number, (name, overrides) in enumerate(RUNS.items())
+        }
+        shutil.copy(Path(folder) / "0" / "accuracy.png", HERE / "accuracy.png")
+    replace_part(TIMES, "conclusion", measured["default"][0])
+    replace_part(TIMES, "times", times_table({name: rows for name, (_, rows) in measured.items()}))
+    replace_part(ERRORS, "errors", errors_table(measured["default"][1]))
 
 
 if __name__ == "__main__":

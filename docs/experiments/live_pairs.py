@@ -24,7 +24,7 @@ import numpy as np
 from live_pairs_numpy import NumpyPairs, brooks_colours
 
 import unprocess_gen as ug
-from unprocess_gen.reports.benchmark.timing import measure_in_turns, median_ratio
+from unprocess_gen.reports.timing import measure_in_turns, median_ratio
 from unprocess_gen.simulation.reference.colour import CAMERAS, RGB2XYZ
 from unprocess_gen.sources.scenes import synthetic
 

@@ -34,7 +34,7 @@ from unprocess_gen.core.types import Patch, Plan, Source, Srgb
 from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
-from unprocess_gen.reports.benchmark.timing import measure_in_turns, thread_ns
+from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.pair import make_pair, make_pairs
 from unprocess_gen.sources.image.decode import decode

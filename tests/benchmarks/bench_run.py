@@ -21,7 +21,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from unprocess_gen.reports.benchmark.timing import measure_in_turns
+from unprocess_gen.reports.timing import measure_in_turns
 
 Times = dict[str, float]
 

@@ -34,7 +34,7 @@ def test_experiment_is_valid_with_all_compatible_options(recipe: str, settings: 
     config = settings(f"+{RECIPE}={recipe}", *groups)
     validate_config(config)
     assert (config.camera.name, config.isp.gamma, config.gains.red) == ("sony_a7r", "srgb", 2.15)
-    assert (config.noise.name, config.sensor.bits, config.accuracy.name) == ("none", 10, "fast")
+    assert (config.noise.name, config.sensor.bits, config.accuracy) == ("none", 10, "fast")
 
 
 @pytest.fixture(scope="module")

@@ -99,7 +99,6 @@ noise: imx385_iso1600 imx385_iso3200 imx385_iso6400 imx385_iso12800 imx385_iso25
 noise: imx385_rvdd heteroscedastic none imx385 sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x
 scene: daylight indoor long_exposure low_light night video_night
 effects: default
-accuracy: reference exact fast
 output: webdataset
 executor: local dask
 experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training

@@ -17,11 +17,10 @@ from helpers.records import FACTS, PAIR, PATCH, PHYSICS, PLAN, SHA256, SOURCE
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.accuracy import STAGES, methods_of_stage
 from unprocess_gen.config.schema import ASSUMABLE, PHYSICAL_NUMBERS, replaced
 from unprocess_gen.core.errors import REASONS, DamageError
 from unprocess_gen.core.types import (
-    AccuracyPlan,
+    TIERS,
     CameraPlan,
     Counts,
     DarkFramePlan,
@@ -67,7 +66,7 @@ CONTRACT = [
     *(f"rgb2cam_{row}{column}" for row in range(3) for column in range(3)),
     *("red_gain", "blue_gain", "inverse_rgb_gain", "tone", "gamma", "highlight", "highlight_threshold"),
     *("pattern", "bits", "black_level_dn", "white_level_dn", "noise", "a_dn", "b_dn2", "effects", "skipped"),
-    *("accuracy", "methods", "clean_xxh3", "noisy_xxh3", "clean_clipped_low", "clean_clipped_high"),
+    *("accuracy", "clean_xxh3", "noisy_xxh3", "clean_clipped_low", "clean_clipped_high"),
     *("noisy_clipped_low", "noisy_clipped_high", "saturated"),
 ]
 
@@ -165,7 +164,7 @@ plans = st.builds(
         draw=st.integers(0, 99),
         frame=st.integers(0, 10**9),
     ),
-    accuracy=st.builds(AccuracyPlan, name=word, methods=st.lists(word, max_size=3).map(tuple)),
+    accuracy=st.sampled_from(TIERS),
     split=st.sampled_from(["", "train", "fold-3"]),
 )
 names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40).filter(
@@ -461,7 +460,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
         saturated="pinned", a_dn=LONGEST, b_dn2=LONGEST,
         dtype="float32", layout="mosaic",
-        methods=tuple(max((one.spelled for one in methods_of_stage(stage)), key=len) for stage in STAGES),
+        accuracy="reference",
         effects=("heteroscedastic", "quantise"),
         skipped=(f"heteroscedastic: noise={LONGEST_NAME} has no variance (a_dn={LONGEST!r}, b_dn2={LONGEST!r})",),
     )  # fmt: skip

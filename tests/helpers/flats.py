@@ -103,7 +103,8 @@ def plan_with(*on: str, frame: int = 0xF4A3E, **changes: Any) -> Plan:
         camera=CameraPlan("identity", (0.0,) * 4, IDENTITY, 1.0, 1.0, 1.0, "none", highlight_threshold=0.9),
         isp=IspPlan("none", gamma=1.0),
         sensor=SensorPlan("RGGB", bits=16, black_level_dn=BLACK, white_level_dn=WHITE),
-        a_dn=physics.dn_per_e, b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"), physics=physics, methods=(),
+        a_dn=physics.dn_per_e, b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"), physics=physics,
+        accuracy="exact",
     )  # fmt: skip
 
 

@@ -14,12 +14,10 @@ from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 
 import unprocess_gen as ug
-from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.reports.estimate import COMMIT_SECONDS, SAMPLE, estimate_run
 from unprocess_gen.reports.plan_text import format_estimate
-from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 
 
@@ -47,11 +45,6 @@ def test_time_of_pairs_is_divided_by_the_workers_that_have_a_shard(
     estimate = estimate_run(config, 2, read_all=True)
     assert estimate.n_jobs == workers
     assert estimate.pair_seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates) / workers)
-
-
-def test_reference_is_not_timed_for_comparison(settings: Settings) -> None:
-    tiers = {name: read_option("accuracy", name) for name in ("reference", "fast")}
-    assert estimate_run(settings("source.limit=1"), 1, True, tiers).tier_ns.keys() == {"exact", "fast"}
 
 
 def test_time_includes_start_up_and_disk(settings: Settings, tmp_path: Path) -> None:
@@ -208,22 +201,6 @@ def test_compiling_kernels_is_announced_unless_they_are_compiled(
     caplog.set_level("INFO", "unprocess_gen")
     estimate_run(settings("source.limit=1"), 1, True)
     assert caplog.messages == ([] if compiled else [COMPILING])
-
-
-def test_second_plan_announces_no_compiling(
-    settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Kernels of the tiers are recorded, too: those of the tier fast differ from those of the run."""
-    known: set[str] = set()
-    monkeypatch.setattr("unprocess_gen.simulation.self_test.has_run", known.__contains__)
-    monkeypatch.setattr("unprocess_gen.simulation.self_test.note_run", known.add)
-    self_test.failures.cache_clear()
-    caplog.set_level("INFO", "unprocess_gen")
-    config = settings("source.limit=1")
-    tiers = {"fast": read_option("accuracy", "fast")}
-    for _ in range(2):
-        estimate_run(config, 1, True, tiers)
-    assert caplog.messages == [COMPILING]
 
 
 def test_plan_states_source_and_uncertainty_of_numbers_at_its_isos(run_main: RunMain) -> None:

@@ -19,10 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.accuracy import choose_methods
-from unprocess_gen.config.schema import AccuracyConfig, replaced
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.types import REFERENCE_METHOD, Frame, Plan
+from unprocess_gen.core.types import REFERENCE, Frame, Plan
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.planning.effect_selection import facts_for
@@ -89,7 +88,7 @@ def test_normalised_values_are_rounded_quotients_near_midpoints(black_dn: float,
 @pytest.mark.parametrize("name", PLANS)
 def test_kernels_equal_the_reference_byte_for_byte(name: str, clip: str, figure: Figure) -> None:
     plan, picture = normalised(PLANS[name], clip), selftest.golden_image()
-    compiled, expected = (make_pair(picture, one, ORIGIN) for one in (plan, plan.replace(methods=(REFERENCE_METHOD,))))
+    compiled, expected = (make_pair(picture, one, ORIGIN) for one in (plan, plan.replace(accuracy=REFERENCE)))
     assert compiled.clean.tobytes() == expected.clean.tobytes()
     assert compiled.noisy.tobytes() == expected.noisy.tobytes()
     assert compiled.counts == expected.counts
@@ -194,14 +193,6 @@ def test_an_odd_side_cannot_be_packed(shape: tuple[int, int]) -> None:
 
 
 # Plans ----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("counts", [False, True])
-def test_all_budgets_except_reference_select_the_same_methods(counts: bool) -> None:
-    exact = AccuracyConfig("e", False, 0, 0, 1e-6)
-    fast = AccuracyConfig("f", False, 1, 1e-3, 1e-3)
-    assert choose_methods(exact, counts, normalised=True) == choose_methods(fast, counts, normalised=True)
-    assert not any(one.startswith("quantise:") for one in choose_methods(exact, counts, normalised=True))
 
 
 @pytest.mark.parametrize("noise", ["brooks2019", "none", "oppo_reno10x"])
@@ -323,9 +314,3 @@ def test_the_noise_of_the_arrays_fits_the_rows(overrides: tuple[str, ...], make:
     lying = fit_pair(clean, noisy, row | {gain: row[gain] * 1.1})
     assert lying is not None
     assert lying.deviation > 6
-
-
-def test_accuracy_requires_integer_frames(run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("accuracy", "output.dtype=float32")
-    assert (done.code, list(tmp_path.iterdir())) == (2, [])
-    assert "errors are in integer DN; expected uint16; set output.dtype=uint16" in done.err

@@ -11,11 +11,12 @@ from helpers.promise_report import Figure
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from unprocess_gen.config.accuracy import FLOAT32_CHANGED_SHARE, FLOAT32_CLEAN_DN, POLYNOMIAL_NORMAL, is_steep
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.core.types import FLOAT32_METHOD, Pair, Plan
+from unprocess_gen.core.types import FAST, Pair, Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
+from unprocess_gen.simulation.kernels.clean import FLOAT32_CHANGED_SHARE, FLOAT32_CLEAN_DN, is_steep
+from unprocess_gen.simulation.kernels.normal import COARSE_ERROR
 from unprocess_gen.simulation.kernels.render import pass_key
 from unprocess_gen.simulation.pair import FRAMES_PER_PASS, make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
@@ -105,9 +106,9 @@ def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
 @pytest.mark.parametrize(
     "options",
     [
-        {"methods": (FLOAT32_METHOD,)},
-        {"methods": (FLOAT32_METHOD,), "highlight": "gray_mean", "saturated": "pinned"},
-        {"law": "poisson", "b_dn2": 3.0, "methods": (FLOAT32_METHOD,)},
+        {"accuracy": FAST},
+        {"accuracy": FAST, "highlight": "gray_mean", "saturated": "pinned"},
+        {"law": "poisson", "b_dn2": 3.0, "accuracy": FAST},
         {"physics": GOLDEN_PHYSICS, "effects": EFFECTS},
         {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
     ],
@@ -116,7 +117,7 @@ def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
 def test_levels_of_one_clean_frame_equal_separate_pairs(
     scene: np.ndarray, plan: Plan, options: dict[str, object]
 ) -> None:
-    """Plans with other methods and effects than the random plans of `test_random_plans`."""
+    """Plans with other tiers and effects than the random plans of `test_random_plans`."""
     assert_equal_separate_pairs(scene, levels_of(plan, **options))
 
 
@@ -189,11 +190,11 @@ def test_plans_of_different_clean_frames_are_refused(scene: np.ndarray, plan: Pl
 
 
 def in_float32(srgb: np.ndarray, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
-    return make_pair(srgb, plan.replace(methods=(FLOAT32_METHOD,)), origin)
+    return make_pair(srgb, plan.replace(accuracy=FAST), origin)
 
 
 def assert_within(differing: int, worst: int, sites: int) -> None:
-    """Error bounds as documented in `config.accuracy`."""
+    """Error bounds as documented in `kernels.clean`."""
 
     assert worst <= FLOAT32_CLEAN_DN
     assert differing <= FLOAT32_CHANGED_SHARE * sites
@@ -261,7 +262,7 @@ def test_float32_noisy_frames_and_counts_are_near_the_reference(
 
     apart = np.abs(single.noisy.astype(int) - exact.noisy)
     variance_dn2 = np.maximum(made.noise.a_dn * (exact.clean - float(made.sensor.black_level_dn)) + made.noise.b_dn2, 0)
-    moved_dn = POLYNOMIAL_NORMAL * np.sqrt(variance_dn2) + (0.01 if bits == 16 else 0.002)
+    moved_dn = COARSE_ERROR * np.sqrt(variance_dn2) + (0.01 if bits == 16 else 0.002)
     assert apart.max() <= 1
     assert (apart > 0).mean() <= moved_dn.mean()  # what moves a value by so much moves it over an edge so often
     for one, other in zip(astuple(single.counts), astuple(exact.counts), strict=True):
@@ -291,7 +292,7 @@ def test_float32_is_within_its_error_wherever_it_is_chosen(
         highlight=highlight,
         highlight_threshold=threshold,
     )
-    assume(not is_steep(made.camera, made.scene.exposure))
+    assume(not is_steep(made))
     codes = np.random.Generator(np.random.Philox(key=5)).integers(0, 256, (128, 256, 3)).astype(np.uint8)
 
     with np.errstate(under="ignore"):
@@ -328,7 +329,7 @@ def test_large_noise_is_clipped_in_float32(plan: Plan) -> None:
 
     apart = np.abs(in_float32(gray, wide).noisy.astype(int) - make_pair(gray, wide).noisy)
 
-    assert apart.max() <= POLYNOMIAL_NORMAL * np.sqrt(1e15)
+    assert apart.max() <= COARSE_ERROR * np.sqrt(1e15)
 
 
 # Limits ---------------------------------------------------------------------------------------------------------------

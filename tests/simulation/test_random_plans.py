@@ -26,7 +26,7 @@ from unprocess_gen.core.types import (
     FLOAT32,
     MOSAIC,
     PACKED,
-    REFERENCE_METHOD,
+    REFERENCE,
     UINT16,
     DarkFramePlan,
     DarkPixels,
@@ -286,7 +286,7 @@ def simulate_reference(one: Case) -> Pair:
     """Simulate the reference: with its formulas for integer frames, with the exact curve for frames in float32."""
     if not one.plan.output.clean_normalised:
         return reference_pair(one.srgb, one.plan, one.origin, one.dark_pixels)
-    return make_pair(one.srgb, one.plan.replace(methods=(REFERENCE_METHOD,)), one.origin, one.dark_pixels)
+    return make_pair(one.srgb, one.plan.replace(accuracy=REFERENCE), one.origin, one.dark_pixels)
 
 
 def differences(found: Pair, expected: Pair) -> str:

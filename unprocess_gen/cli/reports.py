@@ -34,36 +34,29 @@ def plan(call: Call) -> int:
 
 
 def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate, list[str]]:
-    from unprocess_gen.config.serialization import read_tiers
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run
     from unprocess_gen.reports.plan_text import format_estimate
 
-    estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, read_tiers())
+    estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all)
     blank = [""] if label and not label.startswith("1/") else []
     return 0, estimate, [*blank, f"out       {config.out}", format_estimate(estimate)]
 
 
 def accuracy(call: Call) -> int:
-    """Measure error and time of every method and tier, and write a report."""
+    """Measure error and time of every tier, stage by stage, and write a report."""
     return _compose_report(call, _accuracy)
 
 
 def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
-    from unprocess_gen.config.interpretation import uses_dark_frames
-    from unprocess_gen.reports.benchmark import measure
-    from unprocess_gen.reports.benchmark import report as benchmark_report
+    from unprocess_gen.reports.accuracy.measure import measure_accuracy
+    from unprocess_gen.reports.accuracy.report import REPORT_FILES, report_text, write_accuracy
 
-    if uses_dark_frames(config.noise):
-        raise ConfigError(
-            f"accuracy: noise.dark_frames={config.noise.dark_frames}: tiers are measured with the noise of a profile; "
-            "expected null; leave it out"
-        )
     require_photographs(config.source, "accuracy")
     out = _report_folder(config, "accuracy")
-    benchmark = measure.measure_accuracy(config, command=command)
-    benchmark_report.write_benchmark(benchmark, out)
-    return 0, None, [benchmark_report.report_text(benchmark), f"{out}: {', '.join(benchmark_report.REPORT_FILES)}"]
+    report = measure_accuracy(config, command)
+    write_accuracy(report, out)
+    return 0, None, [report_text(report), f"{out}: {', '.join(REPORT_FILES)}"]
 
 
 FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")

@@ -100,7 +100,7 @@ _VERBS = (
         Argument(("--all",), "read every photograph, for exact sizes"),
     ),
     _composing(
-        "accuracy", "measure error and time of each tier; write a report; default out: accuracy", "reports.accuracy"
+        "accuracy", "measure time and error of each tier, stage by stage; default out: accuracy", "reports.accuracy"
     ),
     _composing(
         "figures", "draw the article's figures for the first photograph; default out: figures", "reports.figures"

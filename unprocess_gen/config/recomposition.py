@@ -88,7 +88,7 @@ def _is_value(override: str) -> bool:
     return bool(equals) and (group in GROUPS if dot else key in Config.__dataclass_fields__ and key not in GROUPS)
 
 
-NAMED_GROUPS = ("camera", "noise", "scene", "accuracy")
+NAMED_GROUPS = ("camera", "noise", "scene")
 """Groups whose config contains the name of its option."""
 
 

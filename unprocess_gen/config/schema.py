@@ -20,6 +20,7 @@ from unprocess_gen.config.limits import Choice, Integers, IsoForm, Limit, Number
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
 from unprocess_gen.config.values import is_number
 from unprocess_gen.core.roots import Root
+from unprocess_gen.core.types import EXACT, TIERS
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.effects.numbers import SHAPE, SITES, Number
@@ -592,32 +593,6 @@ class CleanConfig(Group):
 
 @documented
 @dataclass(frozen=True)
-class AccuracyConfig(Group):
-    """Limit the errors accepted for speed.
-
-    Attributes
-    ----------
-    name
-        name of the tier, recorded in each row
-    readable
-        allow only the NumPy reference
-    clean_dn
-        largest error of a clean value
-    clean_changed_share
-        largest fraction of clean values that differ, at 14 bits
-    normal_error
-        largest error of a normal deviate against the true quantile
-    """
-
-    name: str = key("exact", limits.NAME)
-    readable: bool = key(False, limits.BOOLEAN)
-    clean_dn: float = key(0.0, Numbers(0), unit="DN")
-    clean_changed_share: float = key(0.0, Numbers(0))
-    normal_error: float = key(1e-06, Numbers(0), unit="standard deviations")
-
-
-@documented
-@dataclass(frozen=True)
 class OutputConfig(Group):
     """Define the format of the dataset.
 
@@ -714,6 +689,9 @@ class Config(Group):
     ----------
     seed
         seed of all random streams
+    accuracy
+        accuracy tier: reference is computed by NumPy and is slow, exact gives the same DN, fast is less exact for noise
+        with two numbers
     split
         shares of named parts of the dataset, such as {train: 0.8, val: 0.1, test: 0.1}; the column split names the
         part of each image, which depends on seed and file only: patches, noise levels and frames of a clip stay
@@ -739,11 +717,11 @@ class Config(Group):
     scene: SceneConfig = field(default_factory=SceneConfig)
     effects: EffectsConfig = field(default_factory=EffectsConfig)
     clean: CleanConfig = field(default_factory=CleanConfig)
-    accuracy: AccuracyConfig = field(default_factory=AccuracyConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
     body: BodyConfig = field(default_factory=BodyConfig)
     seed: int = key(0, Integers(0, 2**63 - 1))
+    accuracy: str = key(EXACT, Choice(*TIERS))
     split: Any = key(None, limits.SPLIT, null="no splits", since="0.3")
     out: str = key("ds", limits.OUTPUT_PLACE, decides_data=False)
     n_jobs: int = key(-1, Integers(1, 1024, other=-1, remark=" or -1 for one per core"), decides_data=False)

@@ -21,11 +21,10 @@ from unprocess_gen.config.interpretation import (
     saturated_as,
     uses_assumed,
 )
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import (
     GROUPS,
     NESTED,
-    AccuracyConfig,
     Config,
     all_settings,
 )
@@ -230,12 +229,6 @@ def read_option(group: str, name: str | Path) -> Any:
         return OmegaConf.to_object(OmegaConf.merge(writable_node(GROUPS[group]), loaded))
     except (OmegaConfBaseException, ValueError) as error:
         raise ConfigError(f"{path}: is no option of {group} ({error_in_one_line(error)})") from error
-
-
-def read_tiers() -> dict[str, AccuracyConfig]:
-    """Read every tier of ``conf/accuracy``, the reference first."""
-    names = sorted(group_options("accuracy"), key=lambda name: name != "reference")
-    return {name: read_option("accuracy", name) for name in names}
 
 
 def differences(config_yaml: str, other_yaml: str) -> list[str]:

@@ -13,13 +13,11 @@ import operator
 from dataclasses import replace
 from pathlib import Path
 
-from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.distributions import parse_drawn
 from unprocess_gen.config.interpretation import (
     UNCLIPPED,
     effect_switch,
     gain_distributions,
-    has_float_clean,
     is_normalised,
     is_physical,
     lights,
@@ -27,7 +25,6 @@ from unprocess_gen.config.interpretation import (
     noise_levels,
     patch_rule,
     uses_dark_frames,
-    uses_physics,
 )
 from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, MIN_GAIN, SWITCH, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
@@ -101,7 +98,6 @@ def _check_values(config: Config) -> None:
     _check_levels(config)
     _check_dark_frames(config)
     _check_effects(config)
-    choose_methods(config.accuracy, uses_physics(config.noise), is_normalised(config), has_float_clean(config))
     _check_output(config)
     executor = config.executor
     if executor.address is not None and executor.kind != "dask":

@@ -199,8 +199,8 @@ class Facts:
     raw: RawParts | None = None
 
 
-REFERENCE_METHOD, FLOAT32_METHOD = "colour:numpy_float64", "colour:fused_float32"
-"""Methods that select the NumPy reference and the float32 kernels; plans without them use the float64 kernels."""
+TIERS = REFERENCE, EXACT, FAST = "reference", "exact", "fast"
+"""Accuracy tiers: the NumPy reference, kernels with the same DN, and kernels in float32 where the noise allows it."""
 
 UINT16, FLOAT32 = "uint16", "float32"
 """Dtypes of frames."""
@@ -463,32 +463,6 @@ class NoisePlan:
 
 
 @dataclass(frozen=True, slots=True)
-class AccuracyPlan:
-    """Accuracy of the simulation.
-
-    Attributes
-    ----------
-    name : str
-        Name of the budget.
-    methods : tuple of str
-        Method of each stage.
-    """
-
-    name: str
-    methods: tuple[str, ...]
-
-    @property
-    def uses_reference(self) -> bool:
-        """True if the NumPy reference is selected."""
-        return REFERENCE_METHOD in self.methods
-
-    @property
-    def uses_float32(self) -> bool:
-        """True if the float32 kernels are selected."""
-        return FLOAT32_METHOD in self.methods
-
-
-@dataclass(frozen=True, slots=True)
 class OutputPlan:
     """Format of the frames: dtype and layout of both, and dtype of the clean frame if it differs, else empty."""
 
@@ -528,7 +502,7 @@ class CleanPlan(NamedTuple):
     camera: CameraPlan
     isp: IspPlan
     sensor: SensorPlan
-    accuracy: AccuracyPlan
+    accuracy: str
     output: OutputPlan
     brightest: float
     lens: tuple[tuple[float, float, float], tuple[int, int]] | None
@@ -551,8 +525,10 @@ class Plan:
         Preparation of the pixels, light, colours and gains, curves, and levels.
     noise : NoisePlan
         Noise and limits of the noisy frame.
-    accuracy, output : AccuracyPlan, OutputPlan
-        Methods of the simulation, and format of the frames.
+    accuracy : str
+        Accuracy tier, one of `TIERS`.
+    output : OutputPlan
+        Format of the frames.
     split : str
         Part of the dataset that the image belongs to; empty without splits. It decides no pixel.
     """
@@ -565,7 +541,7 @@ class Plan:
     isp: IspPlan
     sensor: SensorPlan
     noise: NoisePlan
-    accuracy: AccuracyPlan
+    accuracy: str
     output: OutputPlan = OutputPlan()
     split: str = ""
 
@@ -639,7 +615,7 @@ class Plan:
 
 PLAN_PARTS: dict[str, Any] = {
     "source": SourcePlan, "scene": ScenePlan, "camera": CameraPlan, "isp": IspPlan, "sensor": SensorPlan,
-    "noise": NoisePlan, "accuracy": AccuracyPlan, "output": OutputPlan,
+    "noise": NoisePlan, "output": OutputPlan,
 }  # fmt: skip
 """Records of a plan by the names of their fields."""
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.targets import FRAME_TARGETS
-from unprocess_gen.core.types import FLOAT32, Array, Frame, Pair, Patch, Plan, Row, Srgb, Value
+from unprocess_gen.core.types import EXACT, FLOAT32, Array, Frame, Pair, Patch, Plan, Row, Srgb, Value
 from unprocess_gen.dataset.training import noise_std
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.effects import dark_variance_dn2
@@ -62,7 +62,7 @@ def kernels_for(names: Sequence[str], plan: Plan) -> list[str]:
     own = self_test.kernels(plan)
     if "linear_rgb" not in names:
         return [own]
-    rounded = plan.replace(methods=())
+    rounded = plan.replace(accuracy=EXACT)
     plans = rounded, rounded.replace(clean_dtype=FLOAT32)
     return list(dict.fromkeys([own, *map(self_test.kernels, plans)]))
 

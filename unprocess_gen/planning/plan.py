@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unprocess_gen.config import interpretation
-from unprocess_gen.config.accuracy import choose_methods, is_steep
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
@@ -32,7 +31,7 @@ from unprocess_gen.planning.effect_selection import (
 )
 from unprocess_gen.planning.frame_model import SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
-from unprocess_gen.planning.raw_source import NEUTRAL, own_noise, parts_of, with_raw_sensor
+from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
@@ -155,7 +154,7 @@ def _planner_without_seed(config: Config) -> Planner:
 class Planner:
     """Draw plans for the images of one configuration, which is interpreted once.
 
-    Parsing distributions, choosing methods and interpreting the noise profile take longer than all draws of an image.
+    Parsing distributions and interpreting the noise profile take longer than all draws of an image.
 
     Parameters
     ----------
@@ -172,19 +171,7 @@ class Planner:
         self._is_physical = interpretation.is_physical(config.noise)
         kind = PhysicalLevel if self._is_physical else TwoNumberLevel
         self._levels = [kind(level, number) for number, level in enumerate(levels)]
-        budget, counts_electrons = config.accuracy, interpretation.uses_physics(config.noise)
-        self._accuracy, self._steep_accuracy = (
-            types.AccuracyPlan(
-                config.accuracy.name,
-                choose_methods(
-                    budget,
-                    counts_electrons,
-                    interpretation.is_normalised(config),
-                    steep or interpretation.has_float_clean(config),
-                ),
-            )
-            for steep in (False, True)
-        )
+        self._accuracy = config.accuracy
         self._scene_name, self._highlight = config.scene.name, (config.gains.highlight, config.gains.threshold)
         self._source = types.SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
         self._isp = types.IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
@@ -223,9 +210,6 @@ class Planner:
             camera = self.draw_camera(uniforms)
         else:
             source, camera, isp = own_noise(raw, scene.exposure, span_dn), raw.camera, raw.isp
-        steep = self._steep_accuracy != self._accuracy
-        steep = steep and is_steep(camera if raw is None else NEUTRAL, scene.exposure)
-        accuracy = self._steep_accuracy if steep else self._accuracy
         signals = None
         if self._is_physical and facts is not None:
             if raw is None:
@@ -239,7 +223,7 @@ class Planner:
                 for counter in NOISE_COUNTERS:
                     uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)
-            parts = source, scene, camera, isp, self._sensor, noise, accuracy, self._output
+            parts = source, scene, camera, isp, self._sensor, noise, self._accuracy, self._output
             yield Plan(seed, key, *parts, split), selection
 
     def _draw_split(self, seed: int, source_sha256: str) -> str:

@@ -5,11 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import CameraPlan, Plan, RawParts, SourcePlan
-from unprocess_gen.simulation.reference.colour import IDENTITY
-
-NEUTRAL = CameraPlan("", (0.0, 0.0, 0.0, 0.0), IDENTITY, 1.0, 1.0, 1.0, "none", 0.0)
-"""Colours through which the light of raw sources passes."""
+from unprocess_gen.core.types import Plan, RawParts, SourcePlan
 
 
 def parts_of(plan: Plan) -> RawParts | None:

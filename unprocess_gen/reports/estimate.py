@@ -10,20 +10,19 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from unprocess_gen.config.interpretation import without_dark_frames
-from unprocess_gen.config.schema import AccuracyConfig, Config
+from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.targets import FRAME_TARGETS
-from unprocess_gen.core.types import Frame, Plan, Source, Srgb
+from unprocess_gen.core.types import Frame, Plan, Source
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
@@ -32,10 +31,8 @@ from unprocess_gen.pipeline.targets import noise_law, targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
 from unprocess_gen.planning.source_noise import noise_ratio
-from unprocess_gen.reports.benchmark.timing import measure_in_turns, thread_ns
 from unprocess_gen.reports.empty_bands import NO_BANDS, EmptyBands, empty_bands
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import pixels_in_none
@@ -45,11 +42,6 @@ LOGGER = logging.getLogger("unprocess_gen")
 SAMPLE = 8
 """Number of sources of which pairs are made, unless all are asked for."""
 
-SLOW_TIER = "reference"
-"""The tier that is not timed for comparison."""
-
-TIMED_PX = (384, 512)
-"""Height and width of the crop whose pairs are timed."""
 
 COMMIT_SECONDS = 0.045
 """Time to sync and rename a shard (``docs/performance.md``)."""
@@ -94,7 +86,6 @@ class RunEstimate:
 
     ``start_seconds`` is the time until the first pair: imports, settings, workers, and loading the kernels.
     ``pair_seconds`` is the time to make the pairs with ``n_jobs`` workers, ``disk_seconds`` to write the shards.
-    ``tier_ns`` holds the time of a pair in ns per pixel under the chosen accuracy and other tiers, measured now.
     """
 
     run: Run
@@ -106,7 +97,6 @@ class RunEstimate:
     start_seconds: float
     pair_seconds: float
     disk_seconds: float
-    tier_ns: dict[str, float]
 
     @property
     def exact(self) -> bool:
@@ -125,19 +115,13 @@ class RunEstimate:
         return pairs if self.exact else pairs * len(self.run.sources) // len(self.source_estimates)
 
 
-def estimate_run(
-    config: Config, n_jobs: int, read_all: bool, tiers: Mapping[str, AccuracyConfig] | None = None
-) -> RunEstimate:
-    """Estimate a run by making the pairs of a sample of its sources, or of all; the time is divided by ``n_jobs``.
-
-    ``tiers`` are accuracy tiers whose time is measured for comparison.
-    """
+def estimate_run(config: Config, n_jobs: int, read_all: bool) -> RunEstimate:
+    """Estimate a run by making the pairs of a sample of its sources, or of all; the time is divided by ``n_jobs``."""
     run = resolve(config)
     config, sources, tasks = run.config, run.sources, run.tasks()
-    quick = {name: tier for name, tier in (tiers or {}).items() if name != SLOW_TIER}
     n_jobs = min(n_jobs, len(tasks))
     start_seconds = IMPORT_SECONDS * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
-    start_seconds += _compile_kernels(without_dark_frames(config), quick.values())
+    start_seconds += _compile_kernels(without_dark_frames(config))
     sample = sources if read_all else evenly_spaced(sources, SAMPLE)
     estimates = tuple(estimate_source(run.settings, source) for source in with_bar(sample, "photograph"))
     growth = len(sources) / len(sample)
@@ -153,7 +137,6 @@ def estimate_run(
         start_seconds=start_seconds,
         pair_seconds=sum(source.seconds for source in estimates) * growth / n_jobs,
         disk_seconds=len(tasks) * COMMIT_SECONDS + size * _seconds_per_byte(folder),
-        tier_ns=_tier_ns(without_dark_frames(config), estimates, quick),
     )
 
 
@@ -213,46 +196,21 @@ def count_levels(clean: Frame) -> int:
     return int(np.count_nonzero(np.bincount(clean.reshape(-1)))) if clean.dtype == np.uint16 else 0
 
 
-def _tier_ns(
-    config: Config, estimates: tuple[SourceEstimate, ...], tiers: Mapping[str, AccuracyConfig]
-) -> dict[str, float]:
-    """Measure the time of a pair of the first readable source under the given budget and every tier, ns per pixel."""
-    source = next((estimate.source for estimate in estimates if estimate.levels), None)
-    if source is None:
-        return {}
-    srgb: Srgb = load_source(config.source, source)[1].srgb[: TIMED_PX[0], : TIMED_PX[1]].copy()
-
-    def time_pair(plan: Plan) -> float:
-        forget_bodies()
-        return thread_ns(lambda: list(make_pairs(srgb, (plan,))), srgb[..., 0].size)
-
-    budgets = {**tiers, config.accuracy.name: config.accuracy}
-    configs = {name: replace(config, accuracy=budget) for name, budget in budgets.items()}
-    plans = {name: plan_pairs(other, "0" * 64, facts=facts_for(other, srgb))[0] for name, other in configs.items()}
-    calls = {name: lambda _, plan=plan: time_pair(plan) for name, plan in plans.items()}
-    return {name: min(times) for name, times in measure_in_turns(calls, 3).items()}
-
-
-def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> float:
+def _compile_kernels(config: Config) -> float:
     """Make pairs of a tiny image, so that the time of the first source does not include compilation.
 
-    Log first that kernels will be compiled, also for the tiers, because it takes up to 20 seconds. Return the
-    seconds that a run spends on its kernels, 0 if they had to be compiled: a run then only loads them.
+    Log first that kernels will be compiled, because it takes up to 20 seconds. Return the seconds that a run spends on
+    its kernels, 0 if they had to be compiled: a run then only loads them.
     """
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
-    configs = (config, *(replace(config, accuracy=tier) for tier in tiers))
-    plans = [plan_pairs(other, "0" * 64, facts=facts_for(other, srgb)) for other in configs]
-    needed = [{self_test.kernels(plan) for plan in group} for group in plans]
-    missing = {kernels for kernels in set().union(*needed) if not self_test.are_compiled(kernels)}
-    if missing:
+    plans = plan_pairs(config, "0" * 64, facts=facts_for(config, srgb))
+    needed = {self_test.kernels(plan) for plan in plans}
+    are_missing = not all(map(self_test.are_compiled, needed))
+    if are_missing:
         LOGGER.info(COMPILING)
     started = time.perf_counter()
-    for _ in make_pairs(srgb, plans[0]):
+    for _ in make_pairs(srgb, plans):
         pass
-    run_kernels = needed[0]
-    for kernels in run_kernels:
+    for kernels in needed:
         self_test.failures(kernels)  # a run does so before its first pair
-    seconds = time.perf_counter() - started
-    for kernels in missing - run_kernels:
-        self_test.failures(kernels)  # records that they are compiled
-    return 0.0 if run_kernels & missing else seconds
+    return 0.0 if are_missing else time.perf_counter() - started

@@ -10,7 +10,7 @@ import numpy as np
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.bodies import body_sentence
-from unprocess_gen.config.schema import BRANCH_FIELDS, AccuracyConfig, Config, NoiseConfig, SourceConfig
+from unprocess_gen.config.schema import BRANCH_FIELDS, Config, NoiseConfig, SourceConfig
 from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Patch, Plan
 from unprocess_gen.planning.dark_scene import dark_scene_warning
@@ -46,7 +46,7 @@ def format_estimate(estimate: RunEstimate) -> str:
         f"{format_duration(estimate.start_seconds)}, pairs {format_duration(estimate.pair_seconds)}, disk "
         f"{format_duration(estimate.disk_seconds)}",
         *_failure_lines(config, read),
-        _accuracy_line(config.accuracy, estimate.tier_ns),
+        f"accuracy  {config.accuracy}",
         *_pattern_lines(config),
         *noise_lines(config, readable, estimate.run.settings.dark_frames),
     ]
@@ -108,18 +108,6 @@ def _failure_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[
             f"filtered  {filtered} of {len(estimates)} sources read, by source.min_side={config.source.min_side}"
         )
     return lines
-
-
-def _accuracy_line(chosen: AccuracyConfig, tier_ns: dict[str, float]) -> str:
-    """The chosen budget, and its time compared with the time of the tiers."""
-    line = (
-        f"accuracy  {chosen.name}: clean within {chosen.clean_dn:g} DN ({100 * chosen.clean_changed_share:g} % "
-        f"changed), normals within {chosen.normal_error:g} σ"
-    )
-    if not tier_ns:
-        return line
-    others = ", ".join(f"{name} {ns:.3g}" for name, ns in tier_ns.items() if name != chosen.name)
-    return f"{line}; {tier_ns[chosen.name]:.3g} ns per pixel here" + (f" ({others})" if others else "")
 
 
 # ------------------------------------------------------------------------------------------------------ scene and noise

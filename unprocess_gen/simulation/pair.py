@@ -18,9 +18,11 @@ import numpy as np
 
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import (
+    EXACT,
     FLOAT32,
     MOSAIC,
     PACKED,
+    REFERENCE,
     Counts,
     DarkPixels,
     Float,
@@ -115,7 +117,7 @@ def _pairs(
     srgb = _dequantise(srgb, plans[0], origin)
     clean: Frame | None = None
     for group in _passes(plans):
-        if group[0].accuracy.uses_reference:
+        if plans[0].accuracy == REFERENCE:
             for plan in group:
                 yield _reference_pair(srgb, plan, origin, _curve(srgb, plan), dark_pixels)
             continue
@@ -152,7 +154,7 @@ def crop_maker(
     callable
         `CropMaker`, whose pairs are those of `make_pair` with ``plan.replace(epoch=epoch)``.
     """
-    if plan.noise.dark.sha256 or plan.accuracy.uses_reference:
+    if plan.noise.dark.sha256 or plan.accuracy == REFERENCE:
 
         def make(srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
             pair = make_pair(srgb, plan.replace(epoch=epoch), origin, dark_pixels)
@@ -194,7 +196,7 @@ def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Norm
     srgb, levels_dn = _dequantise(srgb, plan, origin), (plan.sensor.black_level_dn, plan.sensor.white_level_dn)
     channels: list[Normalised] = []
     for pattern in ONE_COLOUR:
-        colour = plan.replace(pattern=pattern, layout=MOSAIC, methods=())
+        colour = plan.replace(pattern=pattern, layout=MOSAIC, accuracy=EXACT)
         light = render_clean(srgb, colour.replace(clean_dtype=FLOAT32), origin).astype(np.float32, copy=False)
         if not plan.output.clean_normalised:
             dn = render_clean(srgb, colour, origin).astype(np.float64)

@@ -59,7 +59,7 @@ GOLDEN_PLAN = Plan(
         "imx385_iso25600", "gaussian", a_dn=55.0, b_dn2=2500.0, effects=("heteroscedastic",), skipped=(),
         sensor_clip="sensor", saturated="noisy",
     ),
-    accuracy=types.AccuracyPlan("exact", methods=()),
+    accuracy=types.EXACT,
 )  # fmt: skip
 GOLDEN_PHYSICS = Physics(
     iso=3200.0, exposure_s=0.1, temperature_c=30.0, frame_size=(4096, 4096), sensor_unit="0",
@@ -73,8 +73,8 @@ _PHYSICAL = _COUNTS.replace(effects=PHYSICAL_EFFECTS, exposure_ratio=1.5, level=
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,
     "gray_mean": GOLDEN_PLAN.replace(highlight="gray_mean"),
-    "float32": GOLDEN_PLAN.replace(methods=(types.FLOAT32_METHOD,), bits=16, black_level_dn=4096, white_level_dn=65535),
-    "reference": GOLDEN_PLAN.replace(methods=(types.REFERENCE_METHOD,)),
+    "float32": GOLDEN_PLAN.replace(accuracy=types.FAST, bits=16, black_level_dn=4096, white_level_dn=65535),
+    "reference": GOLDEN_PLAN.replace(accuracy=types.REFERENCE),
     "poisson": GOLDEN_PLAN.replace(law="poisson"),
     "plain": _COUNTS,
     "gaussian_read": _COUNTS.replace(physics=replace(GOLDEN_PHYSICS, read_law="gaussian")),
@@ -103,7 +103,7 @@ GOLDEN = {
 
 def kernels(plan: Plan) -> str:
     """Return the name of the set of kernels that simulates a plan; sets are compiled one by one, in seconds."""
-    if plan.accuracy.uses_reference:
+    if plan.accuracy == types.REFERENCE:
         return "reference"
     noise = "electrons" if plan.noise.counts_electrons else "gaussian"
     if plan.output.clean_normalised:

@@ -13,9 +13,8 @@ import pytest
 from helpers.kernels import coarse_normals, exact_values, exact_values_by_vectors, values_by_lines
 from helpers.promise_report import Figure
 
-from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL
 from unprocess_gen.core.lookup_tables import LINES_PER_OCTAVE, normal_table, tukey_table
-from unprocess_gen.simulation.kernels.normal import build_quantiles, normal_quantiles
+from unprocess_gen.simulation.kernels.normal import COARSE_ERROR, build_quantiles, normal_quantiles
 from unprocess_gen.simulation.reference import noise as effects
 
 SIGN = 2**31
@@ -89,7 +88,7 @@ def test_approximate_normals_are_within_their_error_for_every_word(figure: Figur
 @pytest.mark.parametrize("random_bits", RANDOM_BITS)
 def test_polynomial_normals_are_within_their_error(random_bits: int, figure: Figure) -> None:
     off = np.abs(coarse_normals(telling_words(random_bits)).astype(np.float64) - reference("normal", random_bits))
-    assert 0.9 * POLYNOMIAL_NORMAL < off.max() <= POLYNOMIAL_NORMAL
+    assert 0.9 * COARSE_ERROR < off.max() <= COARSE_ERROR
     figure("normal", f"coarse polynomial: at most {off.max():.2g} standard deviations off, {off.size} words")
 
 
@@ -107,5 +106,5 @@ def test_polynomial_normals_are_within_their_error_for_every_word(figure: Figure
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
         worst = max(worst, float(np.abs(coarse_normals(words).astype(np.float64) - exact_values(words, form)).max()))
-    assert worst <= POLYNOMIAL_NORMAL
+    assert worst <= COARSE_ERROR
     figure("normal", f"coarse polynomial: at most {worst:.2g} standard deviations off, all words")

@@ -54,7 +54,7 @@ SETTINGS_SHOWN = (
     *("camera.name", "camera.xyz2cam", "gains.red", "gains.blue", "gains.inverse_rgb", "gains.highlight"),
     *("isp.tone", "isp.gamma", "sensor.bits", "sensor.black_level_dn", "sensor.white_level_dn", "sensor.pattern"),
     *("sensor.clip", "sensor.saturated", "noise.name", "noise.law", "noise.iso", "noise.levels", "noise.draws"),
-    *("scene.name", "scene.exposure_ratio", "effects.all", "effects.tolerance", "accuracy.name"),
+    *("scene.name", "scene.exposure_ratio", "effects.all", "effects.tolerance", "accuracy"),
 )
 """Settings in the table; the others are in the folded ``config.yaml``."""
 

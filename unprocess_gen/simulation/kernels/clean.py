@@ -7,8 +7,8 @@ The first pass over a strip treats every site as unclipped. The second recompute
 `Scene.limits`: highlights, clipped or saturated values. Other vectors need neither its division nor its counts.
 
 Two forms: `Scene` is equal to `reference.unprocess` and `reference.sensor.to_dn` to the last bit (float64, in the
-reference's order of operations). `Scene32` (float32, for accuracy budgets that allow errors) tabulates products that
-include gains, exposure and span, so sums of them are DN above the black level; `config.accuracy` states its errors.
+reference's order of operations). `Scene32` (float32, of the tier ``fast``) tabulates products that include gains,
+exposure and span, so sums of them are DN above the black level; see `FLOAT32_CLEAN_DN`.
 """
 
 from __future__ import annotations
@@ -34,6 +34,31 @@ _ROW_SITES = VECTOR_WIDTH + 2
 
 FLOAT32_MARGIN = 2.0**-18
 """Largest relative error of white in float32, a quarter DN at 16 bits; light above white by less is not clipped."""
+
+FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE = 1.0, 5e-4
+"""Largest error of a clean value in float32, DN, and fraction of the values that differ, at 14 bits."""
+
+MAX_ERROR_GAIN, MAX_HIGHLIGHT_ERROR_GAIN = 8.0, 64.0
+"""Largest factors by which the rounding error of a table entry may grow in a clean value for these errors to hold. The
+cameras and gains of ``conf/`` reach 3, and 20 in highlights at the default threshold."""
+
+
+def is_steep(plan: Plan) -> bool:
+    """True if the colours and gains of a plan amplify rounding errors too much for float32.
+
+    The light of a channel is i · (gain + headroom · m²) with m = (i - threshold) / (1 - threshold). Here i is the sum
+    of table entries times one row of the matrix. The limits are `MAX_ERROR_GAIN` and `MAX_HIGHLIGHT_ERROR_GAIN`.
+    """
+    camera, exposure = plan.camera, plan.scene.exposure
+    if plan.source.is_raw:  # its light has no colours and gains
+        return exposure > MAX_ERROR_GAIN
+    rows = [sum(abs(entry) for entry in camera.rgb2cam[start : start + 3]) * exposure for start in (0, 3, 6)]
+    highlights = 0.0 if camera.highlight == "none" else 1 + 2 / (1 - camera.highlight_threshold)
+    return any(
+        row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN
+        for row, gain in zip(rows, camera.inverse_gains, strict=True)
+    )
+
 
 # ----------------------------------------------------------------------------------------------------------- parameters
 

@@ -2,7 +2,7 @@
 
 `Gaussian` decides every DN as `reference.noise.heteroscedastic` does. Noise is computed in float32, eight sites at a
 time, with an error bound; the read-out asks for the exact value of sites whose bound reaches a rounding boundary, about
-1 % at a standard deviation of 100 DN. `Gaussian32`, for accuracy budgets that allow errors, has polynomials in place of
+1 % at a standard deviation of 100 DN. `Gaussian32`, of the tier ``fast``, has polynomials in place of
 look-ups and asks for none; its DN count from the black level.
 
 Design: ``docs/design/kernels.md``.

@@ -140,6 +140,9 @@ _COARSE_QUANTILE = (
     3.96620536e-29,
 )  # fmt: skip
 
+COARSE_ERROR = 5.8e-4
+"""Largest error of `coarse_normal` against the true quantile, in standard deviations."""
+
 _MANTISSA, _ONE_BITS32 = np.uint32(0x7FFFFF), np.uint32(0x3F800000)
 _BITS_OF_2_32 = np.uint32((32 + 127) << 23)
 
@@ -162,7 +165,7 @@ def fill_coarse_depths(count: int, words: Pointer, depths: Pointer) -> None:
 
 @inner
 def coarse_normal(depths: Vector) -> Vector:
-    """Return the absolute normal deviates of these depths, with errors up to `accuracy.POLYNOMIAL_NORMAL`."""
+    """Return the absolute normal deviates of these depths, with errors up to `COARSE_ERROR`."""
     c, t = _COARSE_QUANTILE, depths
     t2 = t * t
     low = (c[0] + c[1] * t) + (c[2] + c[3] * t) * t2

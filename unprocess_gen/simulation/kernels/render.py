@@ -3,7 +3,7 @@
 Per strip: the clean frame (`clean`), then for each noisy frame a sampler and a read-out. Numba chooses the sampler by
 the class of ``noise``, the precision by the class of ``scene``, and the read-out by the class of ``readout``; so
 compiled code contains only what a pair needs. Every form gives the same DN as `pair.reference_pair` on every processor,
-except `clean.Scene32` with `gaussian.Gaussian32`, whose errors are stated in `config.accuracy`.
+except `clean.Scene32` with `gaussian.Gaussian32`, which state their errors.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.random_streams import frame_word
-from unprocess_gen.core.types import PACKED, Counts, DarkFramePlan, DarkPixels, Frame, Pair, Plan, Srgb
+from unprocess_gen.core.types import FAST, PACKED, Counts, DarkFramePlan, DarkPixels, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE, body_of, light_factor
 from unprocess_gen.simulation.kernels.clean import (
     KEPT_SCENES,
     Scene,
     Scene32,
     fill_clean,
+    is_steep,
     scene_of,
     with_response,
 )
@@ -211,8 +212,6 @@ def _records(
 def pass_key(plan: Plan) -> tuple[object, ...]:
     """Key that the plans of one pass have in common: the kernels, and the fixed patterns of the body."""
     return (
-        plan.accuracy.uses_reference,
-        plan.accuracy.uses_float32,
         plan.noise.averaged,
         plan.noise.counts_electrons,
         fixed_patterns(plan),
@@ -220,8 +219,9 @@ def pass_key(plan: Plan) -> tuple[object, ...]:
 
 
 def uses_scene32(plan: Plan) -> bool:
-    """True if a plan is rendered in float32, as only integer frames with one normal per site are."""
-    return plan.accuracy.uses_float32 and not plan.output.clean_normalised and not plan.noise.counts_electrons
+    """True if a plan is rendered in float32: tier ``fast``, integer frames with one normal per site, no `is_steep`."""
+    is_fast = plan.accuracy == FAST and not plan.output.clean_normalised and not plan.noise.counts_electrons
+    return is_fast and not is_steep(plan)
 
 
 @kernel

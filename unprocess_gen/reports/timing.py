@@ -1,7 +1,4 @@
-"""Measure times in turns, so that other programs disturb everything that is compared alike.
-
-Used by ``gen-dataset accuracy`` and by the benchmarks of ``tests/benchmarks``.
-"""
+"""Measure times in turns, so that other programs disturb everything that is compared alike."""
 
 from __future__ import annotations
 
@@ -21,18 +18,15 @@ def thread_ns(call: Callable[[], object], pixels: int) -> float:
     return max(time.thread_time_ns() - started, 1) / pixels
 
 
-def measure_in_turns(
-    measurements: Mapping[_Key, Callable[[int], _Time]], rounds: int, advance: Callable[[], None] = lambda: None
-) -> dict[_Key, list[_Time]]:
+def measure_in_turns(measurements: Mapping[_Key, Callable[[int], _Time]], rounds: int) -> dict[_Key, list[_Time]]:
     """Run every measurement once in each round, in reversed order in every second round; results by round.
 
-    A measurement gets the number of the round. ``advance`` is called after each.
+    A measurement gets the number of the round.
     """
     results: dict[_Key, list[_Time]] = {key: [] for key in measurements}
     for number in range(rounds):
         for key in list(measurements)[:: -1 if number % 2 else 1]:
             results[key].append(measurements[key](number))
-            advance()
     return results
 
 

@@ -1,0 +1,291 @@
+"""The cost of accuracy: complete runs by tier and stage, their errors, and the report."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Make, Settings, TreeHash
+from helpers.photographs import fill
+from helpers.promise_report import Figure
+
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.types import EXACT, FAST, REFERENCE, TIERS
+from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.reports import report_files
+from unprocess_gen.reports.accuracy import measure, report
+from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
+from unprocess_gen.reports.timing import measure_in_turns
+from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
+from unprocess_gen.simulation.kernels.render import uses_scene32
+from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.sources.loader import list_photographs
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measure, "ROUNDS", 2)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder for temporary files of this process."""
+    path = tmp_path / "temporary"
+    path.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(path))
+    return path
+
+
+# Tiers ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "steep",
+    ["", "gains.threshold=0.999", "gains.red=0.05", "camera=custom camera.xyz2cam=[1,0,0,0,0,1,1,-0.94,0]"],
+)
+def test_plans_that_amplify_rounding_errors_use_float64(settings: Settings, steep: str) -> None:
+    plan = plan_image(settings("accuracy=fast", "noise=imx385_iso3200", *steep.split()), "0" * 64)
+
+    assert uses_scene32(plan) == (not steep)
+    assert not uses_scene32(plan.replace(accuracy=EXACT))
+    assert not uses_scene32(plan.replace(clean_dtype="float32"))
+
+
+def test_reference_tier_uses_the_exact_table_of_the_curve(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last bit of the formulas differs between machines."""
+    plan, srgb = plan_image(settings("accuracy=reference"), "ab" * 32), np.zeros((4, 4, 3), dtype=np.uint8)
+    monkeypatch.setattr("unprocess_gen.simulation.reference.unprocess.linear_light", None)
+
+    make_pair(srgb, plan)
+    with pytest.raises(TypeError):
+        reference_pair(srgb, plan)
+
+
+# Measurement ----------------------------------------------------------------------------------------------------------
+
+
+def test_measurements_take_turns() -> None:
+    called: list[tuple[str, int]] = []
+    calls = {name: lambda number, name=name: called.append((name, number)) for name in "ab"}
+
+    assert measure_in_turns(calls, 3) == {"a": [None] * 3, "b": [None] * 3}
+    assert called == [("a", 0), ("b", 0), ("b", 1), ("a", 1), ("a", 2), ("b", 2)]
+
+
+OVERRIDES = (
+    (),
+    ("noise=sony_a7s2", "scene=night", "output.layout=packed"),
+    ("noise=brooks2019", "noise.levels=2", "output.dtype=float32", "source.patch=8"),
+)
+
+
+@pytest.mark.parametrize("overrides", OVERRIDES)
+def test_every_stage_of_every_tier_has_time_and_error(
+    overrides: tuple[str, ...], settings: Settings, folder: Path, figure: Figure
+) -> None:
+    root = fill(folder.parent / "photos", 3)
+    (root / "000.png").write_bytes(b"")  # is ignored
+    measured = measure.measure_accuracy(settings(*overrides, f"source.root={root}"), "gen-dataset accuracy")
+
+    assert [(row.tier, row.stage) for row in measured.rows] == [(tier, stage) for tier in TIERS for stage in STAGES]
+    for tier in TIERS:
+        stages = {row.stage: row for row in measured.rows if row.tier == tier}
+        total_ns = sum(stages[stage].ns_per_pixel or 0 for stage in STAGES[:-1])
+        assert stages["run"].ns_per_pixel == pytest.approx(total_ns)
+        assert tier != EXACT or all(row.ratio_to_exact == 1 for row in stages.values())
+        assert any(row[4:] != (0,) * 5 for row in stages.values()) == (tier == FAST and not overrides)
+        figure("tiers", f"{tier}: error of the noisy frame at most {stages['run'].max_dn:.2g} DN")
+    assert measured.photographs == "2 photographs (0.0 megapixels)"
+    assert measured.conditions["photographs"].startswith("001.png, 002.png, of ")
+    assert list(folder.iterdir()) == []
+
+
+def test_errors_are_those_of_the_frames_in_dn_and_in_standard_deviations(settings: Settings, tmp_path: Path) -> None:
+    config = settings("source.limit=1", "sensor=generic_14bit")
+    read = PairSettings.read(config)
+    samples = measure.select_inputs(config, tmp_path).samples
+    images = [[measure.plan_sample(read, tier, sample) for sample in samples] for tier in (FAST, REFERENCE)]
+    (pair,), (exact,) = ([next(image.pairs())[2] for image in planned] for planned in images)
+    plan = images[1][0].plans[0]
+    std = np.sqrt(noise_variance(exact.clean.astype(float), plan) + 1 / 12)
+    for error, ours, theirs in zip(
+        measure.deviations([pair], [exact], [plan]), (pair.clean, pair.noisy), (exact.clean, exact.noisy), strict=True
+    ):
+        apart = ours.astype(float) - theirs
+        assert 0 < error.changed_share == np.mean(apart != 0)
+        assert error.max_dn == np.abs(apart).max()
+        assert error.max_std == np.abs(apart / std).max()
+        np.testing.assert_allclose([error.rms_dn, error.rms_std], [np.std(apart), np.std(apart / std)], rtol=1e-2)
+
+
+def test_runs_have_the_bytes_of_generate(
+    folder: Path, photos: Path, settings: Settings, make: Make, tree_hash: TreeHash, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    true = measure.generate
+
+    def generate(config: Config) -> Any:
+        summary = true(config)
+        made.append(tree_hash(Path(config.out)))
+        return summary
+
+    monkeypatch.setattr(measure, "generate", generate)
+    monkeypatch.setattr(measure, "RUN_FILES", 2)
+    config = settings(f"source.root={photos}", "noise.levels=2")
+    inputs = measure.select_inputs(config, folder)
+    times = measure.time_run(config, inputs, FAST, folder / "dataset")
+    make(photos, folder / "ds", "accuracy=fast", "noise.levels=2", f"source.limit={inputs.source.limit}")
+
+    assert inputs.count == 2
+    assert min(times) > 0
+    assert made == [tree_hash(folder / "ds")]
+    assert not (folder / "dataset").exists()
+
+
+def test_ended_measurement_leaves_nothing(folder: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    level = measure.LOGGER.level
+
+    def generate(config: Config) -> Any:
+        Path(config.out).mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(measure, "generate", generate)
+    with pytest.raises(KeyboardInterrupt):
+        measure.measure_accuracy(settings("source.limit=1"))
+
+    assert list(folder.iterdir()) == []
+    assert measure.LOGGER.level == level
+    folder.rmdir()
+    with pytest.raises(MachineError, match=r"set TMPDIR to a folder with space"):
+        measure.measure_accuracy(settings())
+
+
+def test_built_in_scenes_are_read_from_files(settings: Settings, tmp_path: Path) -> None:
+    inputs = measure.select_inputs(settings("source.limit=2", "source.downscale=2"), tmp_path)
+
+    assert [source.path[-4:] for source in list_photographs(inputs.source).sources] == [".jpg"] * 2
+
+
+def test_photographs_end_with_enough_pixels(
+    settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = fill(tmp_path / "photos", 9)
+    (root / "000.png").write_bytes(b"")  # cannot be read
+    for pixels, overrides, count in (
+        (13 * 17 + 14 * 18, (), 2),
+        (13 * 17 + 14 * 18 - 1, (), 1),
+        (1, (), 1),
+        (10**6, (), 8),
+        (6 * (13 * 17 + 14 * 18), ("noise.levels=3", "noise.draws=2"), 2),
+    ):
+        monkeypatch.setattr(measure, "RUN_PIXELS", pixels)
+        inputs = measure.select_inputs(settings(f"source.root={root}", *overrides), tmp_path)
+        assert (inputs.count, inputs.source.limit) == (count, count + 1)
+    with pytest.raises(ConfigError, match=r"none of 1 photographs can be read"):
+        measure.select_inputs(settings(f"source.root={root}", "source.limit=1"), tmp_path)
+
+
+@pytest.mark.parametrize(("pixels", "runs"), [(24_000_000, 1), (24_000_001, 0)])
+def test_reference_runs_once_on_few_pixels(
+    pixels: int, runs: int, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(measure, "time_run", lambda *_: RunTimes(1.0, 2.0, 3.0))
+    config = settings()
+    times = measure.measure_runs(config, Inputs(config.source, 1, pixels, ()), Path())
+
+    assert {tier: len(of_tier) for tier, of_tier in times.items()} == {REFERENCE: runs, EXACT: 2, FAST: 2}
+
+
+def test_time_of_a_stage_is_its_shortest() -> None:
+    stages = measure.stages_ns([RunTimes(1.0, 4.0, 4.0), RunTimes(2.0, 2.0, 1.0)], clean_share=0.25)
+
+    assert stages == {"decode": 1, "clean": 0.5, "noise": 1.5, "write": 1, "run": 4}
+
+
+# The report -----------------------------------------------------------------------------------------------------------
+
+
+def rows_of(tier: str, ratio: float | None, changed: float) -> list[Measurement]:
+    return [Measurement(tier, stage, ratio, ratio, changed, 2.0, 0.1, 0.3, 0.004) for stage in STAGES]
+
+
+def measured(fast: float, ratios: list[float], reference: float | None = 31.0) -> AccuracyReport:
+    rows = [*rows_of(REFERENCE, reference, 0), *rows_of(EXACT, 1.0, 0), *rows_of(FAST, fast, 0.02)]
+    by_tier = {FAST: ratios, EXACT: [1.0], REFERENCE: [] if reference is None else [reference]}
+    return AccuracyReport(tuple(rows), by_tier, "2 photographs (5.2 megapixels)", "imx385_iso3200", {})
+
+
+TIME = "the processor time of exact"
+MOVES = "moves 2 % of the noisy DN by at most 2 DN or 0.3 standard deviations of the noise"
+
+
+@pytest.mark.parametrize(
+    ("given", "fast", "reference"),
+    [
+        (measured(0.9, [0.89, 0.91]), f"0.9 of {TIME}", f"takes 31 times {TIME}"),
+        (measured(0.96, [0.9, 1.1]), "about as long as exact (ratio 0.96)", f"takes 31 times {TIME}"),
+        (measured(0.9, [0.89], None), f"0.9 of {TIME}", "was too slow to be timed"),
+    ],
+)  # fmt: skip
+def test_conclusion_is_true_for_any_result(given: AccuracyReport, fast: str, reference: str) -> None:
+    assert report.conclude(given) == (
+        "In a complete run of 2 photographs (5.2 megapixels) with noise=imx385_iso3200, "
+        f"fast takes {fast} and {MOVES}; reference {reference} and changes no DN."
+    )
+    picture = cv2.imdecode(np.frombuffer(report.accuracy_figure(given.rows), np.uint8), cv2.IMREAD_COLOR)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_page_escapes_names(tmp_path: Path) -> None:
+    given = replace(measured(0.9, [0.9]), conditions={"<script>alert('&\")</script>": "x"})
+    report.write_accuracy(given, tmp_path)
+    page = (tmp_path / "accuracy.html").read_text(encoding="utf-8")
+
+    assert "<script" not in page
+    assert "&lt;script&gt;alert(&#39;&amp;&#34;)" in page
+    assert not re.search(r"(href|src)=\"(?!data:)", page)
+
+
+def test_accuracy_writes_three_files_and_prints_the_table(run_main: RunMain, tmp_path: Path) -> None:
+    written = tmp_path / "new/report"
+    written.mkdir(parents=True)
+    (written / "accuracy.csv").write_text("an earlier report")
+    done = run_main("accuracy", f"source.root={fill(tmp_path / 'photos', 2)}", "out=new/report")
+
+    assert done.code == 0
+    assert sorted(path.name for path in written.iterdir()) == sorted(report.REPORT_FILES)
+    lines = list(csv.DictReader((written / "accuracy.csv").read_text().splitlines()))
+    assert list(lines[0]) == [
+        *("tier", "stage", "ns_per_pixel", "ratio_to_exact", "changed_share", "max_dn", "rms_dn", "max_std", "rms_std")
+    ]
+    assert len(lines) == len(TIERS) * len(STAGES)
+    assert re.search(r"^fast +noise ", done.out, re.MULTILINE)
+    assert "In a complete run of 2 photographs (0.0 megapixels) with noise=imx385_iso3200, fast " in " ".join(
+        done.out.split()
+    )
+    assert "measurements" in done.err
+    assert "image" not in done.err  # of the runs that are measured
+    assert "gen-dataset accuracy source.root=" in (written / "accuracy.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["manifest.csv", None])
+def test_dataset_folder_and_file_are_refused(run_main: RunMain, tmp_path: Path, name: str | None) -> None:
+    assert "manifest.csv" in report_files.DATASET_ENTRIES
+    if name is None:
+        (tmp_path / "ds").write_text("")
+        problem = "is a file; expected a folder"
+    else:
+        (tmp_path / "ds" / name).mkdir(parents=True)
+        problem = f"contains a dataset ({name}); expected a folder without one; choose another out"
+    done = run_main("accuracy", "out=ds")
+
+    assert (done.code, done.err) == (2, f"gen-dataset: out=ds: {problem}\n")

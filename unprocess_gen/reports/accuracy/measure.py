@@ -1,0 +1,326 @@
+"""Measure what each accuracy tier costs in complete runs, stage by stage, and its error against the reference.
+
+A run reads files and commits shards with `pipeline.generate`, in this process, with one worker, below a temporary
+folder. Runs of the tiers take turns, so that other programs disturb all alike. A run counts with all processor time of
+the process: the thread that hashes and writes is included, waiting for the disk is not. The reported time of a stage is
+its shortest in all rounds. The reference is so slow that it runs once.
+
+Errors are those of pairs on subsampled photographs: all tiers use the same random numbers, so frames are compared site
+by site.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import platform
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from unprocess_gen.config.interpretation import is_physical, noise_levels
+from unprocess_gen.config.schema import Config, SourceConfig
+from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.types import EXACT, MOSAIC, REFERENCE, TIERS, Float, Pair, Photograph, Plan, Source
+from unprocess_gen.pipeline.generate import generate
+from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
+from unprocess_gen.pipeline.progress import Progress
+from unprocess_gen.reports.encoding import picture_jpeg
+from unprocess_gen.reports.formatting import counted
+from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.reports.timing import measure_in_turns, thread_ns
+from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
+from unprocess_gen.simulation.kernels.body import forget_bodies
+from unprocess_gen.simulation.kernels.render import render_clean
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.reference.sensor import in_dn
+from unprocess_gen.sources.loader import list_photographs, load_source
+
+LOGGER = logging.getLogger("unprocess_gen")
+
+STAGES = ("decode", "clean", "noise", "write", "run")
+"""Stages of a complete run, and the run. Noise includes planning and rounding, write hashing and committing."""
+
+ROUNDS = 7
+"""Rounds of the compiled tiers; one before them fills caches."""
+
+RUN_FILES, RUN_PIXELS = 16, 20_000_000
+"""Most photographs of a run, and most pixels of its noisy frames if there are several photographs."""
+
+MOST_REFERENCE_PIXELS = 24_000_000
+"""Pixels of noisy frames above which the reference is not timed: a megapixel takes seconds and much memory."""
+
+SAMPLES, SAMPLED_PIXELS = 8, 384 * 512
+"""Photographs whose pairs are compared, and most pixels of each."""
+
+
+class Deviation(NamedTuple):
+    """Errors of frames: fraction of the sites that differ, largest and RMS error in DN and in σ of the noise."""
+
+    changed_share: float
+    max_dn: float
+    rms_dn: float
+    max_std: float
+    rms_std: float
+
+
+NO_DEVIATION = Deviation(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Measurement(NamedTuple):
+    """Time and error of a stage in a tier: one row of ``accuracy.csv``. None means that a time was not measured."""
+
+    tier: str
+    stage: str
+    ns_per_pixel: float | None
+    ratio_to_exact: float | None
+    changed_share: float
+    max_dn: float
+    rms_dn: float
+    max_std: float
+    rms_std: float
+
+
+class RunTimes(NamedTuple):
+    """Processor time of one run, ns per pixel; ``write_ns`` is what decoding and simulation leave."""
+
+    decode_ns: float
+    simulate_ns: float
+    write_ns: float
+
+
+@dataclass(frozen=True, slots=True)
+class AccuracyReport:
+    """Rows of all tiers, the ratios of their runs to `EXACT` by round, and what was measured."""
+
+    rows: tuple[Measurement, ...]
+    ratios: dict[str, list[float]]
+    photographs: str
+    noise: str
+    conditions: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A photograph whose pairs are compared, subsampled to a regular grid: its centre would be brighter."""
+
+    source: Source
+    sha256: str
+    photograph: Photograph
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Files of the runs, as a config of sources, with their number and pixels, and samples for the errors."""
+
+    source: SourceConfig
+    count: int
+    pixels: int
+    samples: tuple[Sample, ...]
+
+
+def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
+    """Measure every tier with the given settings; report progress on stderr.
+
+    ConfigError if no photograph can be read; MachineError if the temporary folder cannot be written.
+    """
+    try:
+        temporary = tempfile.TemporaryDirectory(prefix="unprocess-gen-accuracy-")
+    except OSError as error:
+        raise machine_error(error, Path(tempfile.gettempdir()), "set TMPDIR to a folder with space") from error
+    with temporary as name:
+        inputs = select_inputs(config, Path(name))
+        times = measure_runs(config, inputs, Path(name) / "dataset")
+    complete = replace(config.source, patch=None), replace(config.output, layout=MOSAIC)
+    settings = PairSettings.read(replace(config, source=complete[0], output=complete[1]))
+    images = {tier: [plan_sample(settings, tier, sample) for sample in inputs.samples] for tier in TIERS}
+    pairs = {tier: [next(image.pairs())[2] for image in planned] for tier, planned in images.items()}
+    plans = [image.plans[0] for image in images[REFERENCE]]
+    stage_ns = {tier: stages_ns(runs, clean_share(images[tier])) for tier, runs in times.items() if runs}
+    rows: list[Measurement] = []
+    for tier in TIERS:
+        clean, noisy = deviations(pairs[tier], pairs[REFERENCE], plans)
+        errors = dict(zip(STAGES, (NO_DEVIATION, clean, noisy, NO_DEVIATION, noisy), strict=True))
+        for stage in STAGES:
+            ns = stage_ns[tier][stage] if tier in stage_ns else None
+            ratio = None if ns is None else ns / stage_ns[EXACT][stage]
+            rows.append(Measurement(tier, stage, ns, ratio, *errors[stage]))
+    totals = {tier: [sum(run) for run in runs] for tier, runs in times.items()}
+    ratios = {tier: [run / exact for run, exact in zip(totals[tier], totals[EXACT], strict=False)] for tier in TIERS}
+    photographs = f"{counted(inputs.count, 'photograph')} ({inputs.pixels / 1e6:.1f} megapixels)"
+    return AccuracyReport(tuple(rows), ratios, photographs, noise_text(config), _conditions(config, inputs, command))
+
+
+# -------------------------------------------------------------------------------------------------------------- inputs
+
+
+def select_inputs(config: Config, folder: Path) -> Inputs:
+    """Select the first photographs; built-in scenes are written to ``folder`` as JPEG files, so that runs decode files.
+
+    ConfigError if none can be read.
+    """
+    place, scenes = config.source.place, folder / "photographs"
+    most_pixels = RUN_PIXELS // (len(noise_levels(config.noise)) * config.noise.draws)
+    samples, count, pixels, limit = list[Sample](), 0, 0, 0
+    for source in list_photographs(config.source).sources:
+        limit += 1
+        with suppress(SourceError):
+            sha256, photograph = load_source(config.source, source, config.output.layout)
+            size = photograph.srgb[..., 0].size
+            if count and pixels + size > most_pixels:
+                limit -= 1
+                break
+            count, pixels = count + 1, pixels + size
+            if place is None:
+                _, scene = load_source(replace(config.source, downscale=1), source)
+                write_files(scenes, {f"{source.name}.jpg": picture_jpeg(scene.srgb, 95)})
+            if count <= SAMPLES:
+                step = max(1, math.ceil(math.sqrt(size / SAMPLED_PIXELS)))
+                sampled = photograph.srgb[::step, ::step].copy()  # a view would keep all pixels in memory
+                samples.append(Sample(source, sha256, replace(photograph, srgb=sampled)))
+        if count == RUN_FILES:
+            break
+    if not count:
+        raise ConfigError(
+            f"source.root={place}: none of {limit} photographs can be read with output.layout={config.output.layout}; "
+            "expected at least one"
+        )
+    files = replace(config.source, limit=limit)
+    if place is None:
+        files = replace(files, root=str(scenes), include=("*.jpg",), clips=False)
+    return Inputs(files, count, pixels, tuple(samples))
+
+
+# ---------------------------------------------------------------------------------------------------------------- times
+
+
+def measure_runs(config: Config, inputs: Inputs, out: Path) -> dict[str, list[RunTimes]]:
+    """Times of the runs of every tier by round; of the reference one, or none if its run would be too long."""
+    frames = len(noise_levels(config.noise)) * config.noise.draws
+    rounds = dict.fromkeys(TIERS, ROUNDS) | {REFERENCE: int(inputs.pixels * frames <= MOST_REFERENCE_PIXELS)}
+
+    def measure(tier: str, number: int) -> RunTimes | None:
+        times = time_run(config, inputs, tier, out) if number <= rounds[tier] else None
+        progress.advance()
+        return times if number else None
+
+    with Progress(len(TIERS) * (ROUNDS + 1), unit="measurement") as progress:
+        times = measure_in_turns({tier: partial(measure, tier) for tier in TIERS}, ROUNDS + 1)
+    return {tier: [run for run in runs if run is not None] for tier, runs in times.items()}
+
+
+def time_run(config: Config, inputs: Inputs, tier: str, out: Path) -> RunTimes:
+    """Generate a dataset with one worker, delete it, and return the processor time."""
+    forget_bodies()
+    level = LOGGER.level
+    LOGGER.setLevel(logging.ERROR)  # progress and warnings would repeat for every run
+    try:
+        started = time.process_time()
+        times = generate(replace(config, source=inputs.source, accuracy=tier, n_jobs=1, out=str(out))).times
+        total_s = time.process_time() - started
+    finally:
+        LOGGER.setLevel(level)
+        shutil.rmtree(out, ignore_errors=True)
+    write_s = max(total_s - times.decode_s - times.simulate_s, 0.0)
+    return RunTimes(*(1e9 * stage_s / inputs.pixels for stage_s in (times.decode_s, times.simulate_s, write_s)))
+
+
+def stages_ns(runs: Sequence[RunTimes], clean_share: float) -> dict[str, float]:
+    """Shortest time of each stage, ns per pixel; ``clean_share`` is the share of the clean frame in the simulation."""
+    decode_ns, simulate_ns, write_ns = (min(stage) for stage in zip(*runs, strict=True))
+    clean_ns = simulate_ns * clean_share
+    stages = decode_ns, clean_ns, simulate_ns - clean_ns, write_ns, decode_ns + simulate_ns + write_ns
+    return dict(zip(STAGES, stages, strict=True))
+
+
+def clean_share(images: Sequence[PlannedImage]) -> float:
+    """Share of the clean frames in the time of the pairs of images, from the shortest times of three rounds."""
+
+    def clean(image: PlannedImage) -> object:
+        plan = image.plans[0]
+        if plan.accuracy == REFERENCE:
+            return make_pair(image.srgb, plan.replace(physics=None, effects=("quantise",)))
+        return render_clean(image.srgb, plan)
+
+    def pairs(image: PlannedImage) -> object:
+        return list(image.pairs())
+
+    def time(work: Callable[[PlannedImage], object], _: int) -> float:
+        return sum(thread_ns(partial(work, image), 1) for image in images)
+
+    times = measure_in_turns({"clean": partial(time, clean), "pairs": partial(time, pairs)}, 3)
+    return min(min(times["clean"]) / min(times["pairs"]), 1.0)
+
+
+# --------------------------------------------------------------------------------------------------------------- errors
+
+
+def plan_sample(settings: PairSettings, tier: str, sample: Sample) -> PlannedImage:
+    """Plan a sample in a tier, with its first noise level and draw."""
+    in_tier = replace(settings, config=replace(settings.config, accuracy=tier))
+    image = plan_pixels(in_tier, sample.photograph, sample.source, sample.sha256)
+    return replace(image, plans=image.plans[:1])
+
+
+def deviations(pairs: Sequence[Pair], reference: Sequence[Pair], plans: Sequence[Plan]) -> tuple[Deviation, Deviation]:
+    """Errors of the clean and of the noisy frames; σ is that of shot, read and rounding noise at each site."""
+    frames: tuple[list[Float], list[Float], list[Float]] = ([], [], [])
+    for pair, exact, plan in zip(pairs, reference, plans, strict=True):
+        levels_dn = plan.sensor.black_level_dn, plan.sensor.white_level_dn
+        clean_dn = in_dn(exact.clean, levels_dn)
+        frames[0].append((in_dn(pair.clean, levels_dn) - clean_dn).ravel())
+        frames[1].append((in_dn(pair.noisy, levels_dn) - in_dn(exact.noisy, levels_dn)).ravel())
+        frames[2].append(np.sqrt(noise_variance(clean_dn, plan) + 1 / 12).ravel())
+    clean, noisy, std = map(np.concatenate, frames)
+    return _deviation(clean, clean / std), _deviation(noisy, noisy / std)
+
+
+def _deviation(in_dn: Float, in_std: Float) -> Deviation:
+    sizes = [float(size) for errors in (in_dn, in_std) for size in (np.abs(errors).max(), np.sqrt(np.mean(errors**2)))]
+    return Deviation(np.count_nonzero(in_dn) / in_dn.size, *sizes)
+
+
+# ----------------------------------------------------------------------------------------------------------- conditions
+
+
+def _conditions(config: Config, inputs: Inputs, command: str) -> dict[str, str]:
+    """Facts about the measurement that differ between reports."""
+    names = ", ".join(sample.source.name for sample in inputs.samples)
+    sites = sum(sample.photograph.srgb[..., 0].size for sample in inputs.samples)
+    versions = (f"{name} {version(name)}" for name in ("unprocess_gen", "numpy", "numba", "llvmlite"))
+    return {
+        "command": command,
+        "date": time.strftime("%Y-%m-%d %H:%M %Z"),
+        "machine": f"{processor()}; one thread of {os.cpu_count()}; {platform.system()} {platform.machine()}",
+        "versions": f"Python {platform.python_version()}, {', '.join(versions)}",
+        "photographs": f"{names}, of {config.source.place or 'the built-in scenes'}; errors on {sites:,} sites",
+        "settings": f"{config.sensor.bits} bits, noise {noise_text(config)}",
+    }
+
+
+def noise_text(config: Config) -> str:
+    """The noise profile; scene and ISO if it is physical."""
+    if not is_physical(config.noise):
+        return config.noise.name
+    iso = config.scene.iso if config.noise.iso is None else config.noise.iso
+    return f"{config.noise.name}, scene {config.scene.name}, ISO {iso}"
+
+
+def processor() -> str:
+    """The model name of the processor."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
