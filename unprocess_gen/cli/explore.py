@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import check_overrides, option_folders
-from unprocess_gen.cli.messages import print_result, print_results
+from unprocess_gen.cli.messages import print_results
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.paths import any_path
@@ -18,7 +16,7 @@ HIGHEST_PORT = 65535
 
 
 def explore(call: Call) -> int:
-    """Serve a page on this machine until it is interrupted, or save one."""
+    """Serve a page on this machine until it is interrupted."""
     for library in ("bokeh", "jinja2"):
         require(library, f"explore: the page needs {library}", "explore")
     if refused := sorted(call.hydra.keys() - CHOOSING):
@@ -37,11 +35,6 @@ def explore(call: Call) -> int:
         raise ConfigError(f"explore: {place}: is the folder of a sweep; expected one of its datasets")
     folders = option_folders(call.hydra)
     choices = open_place(place, call.values.get("keys"), call.overrides, call.hydra_arguments, folders)
-    if "save" in call.values:
-        to = Path(call.values["save"])
-        server.save(choices, to)
-        print_result(to)
-        return 0
     server.serve(choices, port, "no_browser" not in call.values, _print_address)
     return 0
 

@@ -149,7 +149,6 @@ _VERBS = (
             KEYS,
             _integer("--port", "number of the port on 127.0.0.1; default: a free one", 0),
             Argument(("--no-browser",), "print the address, and open no browser"),
-            _file("--save", "write FILE, a page of this state without controls, and stop"),
             SETTINGS_SOURCE,
         ),
         PlaceArgument("PHOTO", "a photograph, a folder of photographs, or a dataset", "files", optional=True),

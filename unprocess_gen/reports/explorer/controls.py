@@ -9,17 +9,13 @@ from bokeh.models import InputWidget, Select, Slider, TextInput
 from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import conf_dir, group_options, option_summary
 from unprocess_gen.config.recomposition import override_text
-from unprocess_gen.config.schema import all_settings
+from unprocess_gen.config.schema import Config, all_settings
 from unprocess_gen.config.settings import Setting
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects import EFFECTS
-from unprocess_gen.simulation.reference.colour import CAMERAS
-
-WEIGHTS = {f"camera.weights.{name}": number for number, name in enumerate(CAMERAS)}
-"""Names of the controls of ``camera.weights``, one for each camera, and their places in the list."""
 
 SECTIONS = {
-    "Camera": ("body", "camera", *WEIGHTS),
+    "Camera": ("body", "camera", "camera.weights"),
     "Gains and highlights": (
         *("gains", "gains.light", "gains.red", "gains.blue", "gains.inverse_rgb"),
         *("gains.highlight", "gains.threshold"),
@@ -34,21 +30,11 @@ SECTIONS = {
     ),
 }
 """Groups and keys by the title of their section."""
-
-
-SLIDERS = {
-    "gains.red": (0.5, 4),
-    "gains.blue": (0.5, 4),
-    "gains.inverse_rgb": (0.3, 2.2),
-    "gains.threshold": (0, 0.99),
-    **dict.fromkeys(WEIGHTS, (0, 1)),
-}
+SLIDERS = {"gains.red": (0.5, 4), "gains.blue": (0.5, 4), "gains.inverse_rgb": (0.3, 2.2), "gains.threshold": (0, 0.99)}
 """Ends of sliders by key."""
-
-NONE = "(none)"
 DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}
 """Keys of which sliders show the value in the plan, which may be drawn."""
-
+NONE = "(none)"
 SETTINGS: dict[str, Setting] = {f"{group}.{name}".lstrip("."): setting for group, name, setting in all_settings()}
 
 
@@ -68,16 +54,16 @@ def widget(name: str, folders: list[Any]) -> InputWidget:
     return TextInput(title=name, description=setting.description)
 
 
-def shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], config: Any, plan: Plan) -> Any:
+def shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], config: Config, plan: Plan) -> Any:
     """Return the value of a control: an option, the number in the plan, or the text of a setting."""
     if name in DRAWN:
         return float(getattr(plan.camera, DRAWN[name]))
-    if name in WEIGHTS:
-        return plan.camera.weights[WEIGHTS[name]]
-    group, _, key = name.rpartition(".")
+    if name == "camera.weights":
+        return override_text([round(weight, 4) for weight in plan.camera.weights])
     if name not in SETTINGS:
         return choices.get(name) or NONE
     if name in settings and name not in SLIDERS:
         return settings[name].strip("'\"")
+    group, _, key = name.rpartition(".")
     value = getattr(getattr(config, group) if group else config, key)
     return float(value) if name in SLIDERS else override_text(value).strip("'")

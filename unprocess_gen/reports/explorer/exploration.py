@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import functools
-import io
 import shlex
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.recomposition import Recomposition
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.libraries import require
 from unprocess_gen.core.types import PACKED, DarkPixels, Pair, Photograph, Plan, Row, Source, Srgb
-from unprocess_gen.dataset import dng
 from unprocess_gen.dataset.keys import pair_key, patch_key
-from unprocess_gen.dataset.manifest import pair_row, row_json
+from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.planning.plan import plan_levels
@@ -52,28 +48,11 @@ class Shown:
     pair: Pair
     clean: MosaicArray
     noisy: MosaicArray
-    saturated: NDArray[np.bool_]
+    saturated: NDArray[Any]
     row: Row
     keys: tuple[str, ...]
     lines: tuple[str, ...]
     dark_pixels: DarkPixels | None = None
-
-    def archive(self, form: str) -> bytes:
-        """Return a ZIP file of both frames as ``npy`` or ``dng``, with the row.
-
-        ConfigError if a frame cannot be a DNG, or tifffile is missing.
-        """
-        if form == "dng":
-            require("tifffile", "dng: tifffile is missing", "dng")
-        content, key = io.BytesIO(), self.row["key"]
-        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, frame in (("clean", self.pair.clean), ("noisy", self.pair.noisy)):
-                file = io.BytesIO(dng.encode(frame, self.row, name) if form == "dng" else b"")
-                if form == "npy":
-                    np.save(file, frame)
-                archive.writestr(f"{key}.{name}.{form}", file.getvalue())
-            archive.writestr(f"{key}.json", row_json([self.row]))
-        return content.getvalue()
 
 
 @dataclass
@@ -125,7 +104,7 @@ class Exploration:
         """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
         config = self.composition.config(self.overrides)
         require_photographs(config.source, "explore")
-        source = _listed_sources(config.source)[self.index]
+        source = listed_sources(config.source)[self.index]
         sha256, photograph = _loaded_source(config.source, source, config.output.layout)
         settings = PairSettings.read(config)
         image = plan_pixels(settings, photograph, source, sha256)
@@ -170,7 +149,8 @@ def _plan_lines(
 
 
 @functools.lru_cache(maxsize=4)
-def _listed_sources(config: SourceConfig) -> tuple[Source, ...]:
+def listed_sources(config: SourceConfig) -> tuple[Source, ...]:
+    """List photographs, or return them as they were listed before."""
     return list_photographs(config).sources
 
 

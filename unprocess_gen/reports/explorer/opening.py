@@ -9,18 +9,17 @@ from functools import partial
 from unprocess_gen.config.composition import OptionFolders
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.recomposition import Recomposition, override_text, overrides_of
+from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.random_streams import stream_key
 from unprocess_gen.core.roots import root_path
 from unprocess_gen.core.types import NO_CLIP, Row, Source
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.selection import select_rows
-from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_of, source_root
-from unprocess_gen.reports.explorer.exploration import Exploration
-from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_root
+from unprocess_gen.reports.explorer.exploration import Exploration, listed_sources
 
 SOURCES_LISTED = 1000
 """Photographs or rows that a page offers; the others are opened by their name or key."""
@@ -46,7 +45,9 @@ def open_place(
         if root := start.settings.get("source.root"):
             raise ConfigError(f"explore: {place}: the source is also given by source.root={root}; expected one of them")
         start.settings["source.root"] = _path_text(str(place))
-    return _open_sources(start)
+    config = _source_config(start)
+    sources = listed_sources(config)[:SOURCES_LISTED]
+    return {f"{source.index} {source.name}": partial(_open_source, start, config, source) for source in sources}
 
 
 def _path_text(path: str) -> str:
@@ -54,23 +55,23 @@ def _path_text(path: str) -> str:
     return path.replace("${", "\\${")
 
 
-def _open_sources(start: Exploration) -> Choices:
-    config = start.composition.config(start.overrides).source
+def _source_config(state: Exploration) -> SourceConfig:
+    config = state.composition.config(state.overrides).source
     require_photographs(config, "explore")
+    return config
+
+
+def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Exploration:
+    """Choose a source: a photograph of a folder by itself, others with the sources that are listed before them."""
     root = config.root
-    is_folder = root is not None and config.list is None and not config.clips and root_path(root).is_dir()
-
-    def opened(source: Source) -> Exploration:
-        """One photograph of a folder is a source of its own, and so are the scenes up to one of them."""
-        if is_folder:
-            path = _path_text(f"{str(root).rstrip('/')}/{source.path}")
-            kept = {key: text for key, text in start.settings.items() if key not in ("source.limit", "source.include")}
-            return replace(start, settings=kept | {"source.root": path})
-        limit = {"source.limit": str(source.index + 1)} if config.place is None else {}
-        return replace(start, settings=start.settings | limit, index=source.index)
-
-    sources = list_photographs(config).sources[:SOURCES_LISTED]
-    return {f"{source.index} {source.name}": partial(opened, source) for source in sources}
+    is_alone = config.list is None and source.clip == NO_CLIP and not source.occurrence
+    if root is not None and is_alone and root_path(root).is_dir():
+        path = _path_text(f"{root.rstrip('/')}/{source.path}")
+        kept = {key: text for key, text in state.settings.items() if key not in ("source.limit", "source.include")}
+        return replace(state, settings=kept | {"source.root": path})
+    is_last = source.index + 1 == len(listed_sources(config))
+    limit = {} if is_last else {"source.limit": str(source.index + 1)}
+    return replace(state, settings=state.settings | limit, index=source.index)
 
 
 def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices:
@@ -85,38 +86,25 @@ def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices
 
 def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
     """Return the settings of a dataset as overrides that give the pair of the row."""
-    manifest, source, given = folder / "manifest.csv", source_of(row), dict(start.settings)
-    config, kind = read_dataset_yaml(folder / "config.yaml")
-    require_photographs(config.source, "explore")
-    settings = overrides_of(config)
+    manifest, given = folder / "manifest.csv", dict(start.settings)
+    recorded, kind = read_dataset_yaml(folder / "config.yaml")
+    settings = overrides_of(recorded)
     settings.pop("source.limit", None)
-    index = int(image_key(row))
-    root = source_root(manifest, given.pop("source.root", None)) if kind == "folder" else None
+    root = source_root(manifest, given.pop("source.root", None))
     if kind == "folder" and root is None:
-        raise ConfigError(f"explore: {folder} does not record the folder of its sources; give --source ROOT")
-    if root is None:
-        settings["source.limit"] = str(index + 1)
-    elif (
-        isinstance(root, str)
-        and source.clip == NO_CLIP
-        and f"{stream_key(config.seed, str(row['source_sha256']), 0):016x}" == row["stream_key"]
-        and root_path(root).is_dir()
-    ):
-        settings["source.root"], index = _path_text(f"{root.rstrip('/')}/{source.path}"), 0
-        settings.pop("source.include", None)
-    else:  # twins and frames of clips need their neighbours
-        changes = source_changes(root, folder)
-        settings |= {
-            key: _path_text(value) if isinstance(value, str) else override_text(value)
-            for key, value in changes.items()
-            if value
-        }
-    if (dark_frames := dark_frames_root(manifest)) is not None:
-        settings["noise.dark_frames"] = override_text(dark_frames)
-    return replace(
+        raise ConfigError(f"explore: {folder} does not record the folder of its sources; give source.root=ROOT")
+    places = source_changes(root, folder) | {"noise.dark_frames": dark_frames_root(manifest)}
+    for key, place in places.items():
+        if place:
+            settings[key] = _path_text(place) if isinstance(place, str) else override_text(place)
+    state = replace(
         start,
         settings=settings | given,
-        index=index,
         part=str(row["key"]).removeprefix(image_key(row)),
         digests=None if given or start.others else (str(row["clean_xxh3"]), str(row["noisy_xxh3"])),
     )
+    config = _source_config(state)
+    source = next((source for source in listed_sources(config) if source.name == row["source"]), None)
+    if source is None:
+        raise ConfigError(f"explore: {row['source']}: is not among the sources of {folder}; restore the photograph")
+    return _open_source(state, config, source)

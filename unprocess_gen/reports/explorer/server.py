@@ -1,4 +1,4 @@
-"""Serve the page on this machine, or save it as a file."""
+"""Serve the page on this machine."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import socket
 import threading
 import webbrowser
 from collections.abc import Callable
-from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.reports.explorer.opening import Choices
-from unprocess_gen.reports.report_files import check_page_file, write_files
 
 HOST = "127.0.0.1"
 
@@ -44,26 +42,18 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
 
 
 def _run(choices: Choices, port: int, ready: threading.Event) -> None:
-    from bokeh.application import Application
-    from bokeh.application.handlers.function import FunctionHandler
     from bokeh.server.server import Server
 
     from unprocess_gen.reports.explorer.page import Page
 
     asyncio.set_event_loop(asyncio.new_event_loop())
-    label = next(iter(choices))
-    application = Application(FunctionHandler(lambda document: Page(choices, label).document(document)))
     origins = [f"{name}:{port}" for name in (HOST, "localhost")]  # no other name that leads to this machine
-    server = Server({"/": application}, port=port, address=HOST, allow_websocket_origin=origins)
+    server = Server(
+        {"/": lambda document: Page(choices, document).fill()},
+        port=port,
+        address=HOST,
+        allow_websocket_origin=origins,
+    )
     server.start()
     ready.set()
     server.io_loop.start()
-
-
-def save(choices: Choices, to: Path) -> None:
-    """Write a page of the first choice to a file, which may replace an HTML page."""
-    from unprocess_gen.reports.explorer.page import Page
-
-    check_page_file(to, f"--save {to}")
-    content = Page(choices, next(iter(choices)), saved=True).html()
-    write_files(to.parent, {to.name: content.encode()})

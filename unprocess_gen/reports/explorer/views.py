@@ -34,19 +34,19 @@ VIEW_PX = (360, 480)
 Columns = dict[str, Any]
 
 
-def _block_side(window: Window, most: tuple[int, int]) -> int:
+def _block_side(window: Window) -> int:
     """Return the side of the blocks of sites that become one pixel: 1, or an even number."""
-    side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, most, strict=True))
+    side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, VIEW_PX, strict=True))
     return side + side % 2 if side > 1 else 1
 
 
-def view(shown: Shown, window: Window, common: bool, most: tuple[int, int]) -> Columns:
+def view(shown: Shown, window: Window, common: bool) -> Columns:
     """Return the pictures of a window as RGBA words ``[h, w]``, their place, and the values under the pointer.
 
     With ``common``, raw frames are drawn from black to white (square root) and developed ones as photographs; else each
     picture is stretched by itself.
     """
-    side = _block_side(window, most)
+    side = _block_side(window)
     white = float(np.iinfo(shown.srgb.dtype).max)
     source = shown.srgb[window] if side == 1 else _block_means(shown.srgb[window].astype(np.float32), side)
     frames = {"clean": shown.clean, "noisy": shown.noisy}
@@ -123,18 +123,20 @@ def source_histogram(shown: Shown) -> Curves:
 
 
 def raw_histogram(shown: Shown) -> Curves:
-    """Return the shares of DN in both frames, over the DN of the clean frame and all but 0.2 % of the noisy one."""
+    """Return the shares of DN in both frames, over the DN of the clean frame and all but 0.2 % of the noisy one.
+
+    DN that do not occur are NaN, because the axis is logarithmic.
+    """
     top = 2**shown.plan.sensor.bits
     counts = {}
     for name, frame in (("clean", shown.clean), ("noisy", shown.noisy)):
         dn = frame if frame.dtype == np.uint16 else np.clip(np.rint(frame), 0, top - 1).astype(np.uint16)
         counts[name] = np.bincount(dn.ravel(), minlength=top)
-    used, sums = np.flatnonzero(counts["clean"]), np.cumsum(counts["noisy"]) / shown.noisy.size
-    low, high = min(used[0], np.searchsorted(sums, 0.001)), max(used[-1], np.searchsorted(sums, 0.999))
+    used, below = np.flatnonzero(counts["clean"]), np.cumsum(counts["noisy"]) / shown.noisy.size
+    low, high = min(used[0], np.searchsorted(below, 0.001)), max(used[-1], np.searchsorted(below, 0.999))
     starts = np.arange(low, high + 1, 1 + (high - low) // BINS)
-    return {
-        name: (starts, np.add.reduceat(count[: high + 1], starts) / shown.clean.size) for name, count in counts.items()
-    }
+    sums = {name: np.add.reduceat(count[: high + 1], starts) for name, count in counts.items()}
+    return {name: (starts, np.where(total, total / shown.clean.size, np.nan)) for name, total in sums.items()}
 
 
 def highlight_curves(shown: Shown) -> Curves:
