@@ -456,7 +456,7 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
             "make_pair returns complete frames; expected null; cut the arrays of the pair at even rows and columns"
         )
         raise refusal("source.patch", config.source.patch, problem)
-    source = dataclasses.replace(config.source, root=None, roots=(), list=None, limit=None, clips=False, include=("*",))
+    source = dataclasses.replace(config.source, root=None, list=None, limit=None, clips=False, include=("*",))
     config = dataclasses.replace(config, source=source, seed=config.seed if seed is None else seed)
     validate_config(config)
     return config

@@ -36,7 +36,7 @@ from unprocess_gen.core.errors import SourceError, UnprocessGenError
 
 REFUSED = [
     (["camera=nope"], r"camera=nope: no such option; expected one of canon_5d4, canon_700d, "),
-    (["source.rot=photos"], r"source.rot=photos: no such key; source has root, kind, roots, list, include, "),
+    (["source.rot=photos"], r"source.rot=photos: no such key; source has root, kind, list, include, "),
     (["~camera"], r"~camera: a setting cannot be removed"),
     (["+camera=convex"], r".*camera.*more than once"),
     (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),

@@ -298,7 +298,7 @@ def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> N
     loaded = yaml.safe_load(dataset_yaml(settings()))
     assert NOT_DATA == {
         "": ("out", "n_jobs", "self_test", "check_disk"),
-        "source": ("root", "roots", "list", "max_failed"),
+        "source": ("root", "list", "max_failed"),
         "noise": ("dark_frames", "provenance"),
         "executor": ("kind", "address", "chunk_s", "window", "no_workers_s", "lost_worker_s"),
         "body": ("name", "missing", "replaced"),

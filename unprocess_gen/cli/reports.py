@@ -24,7 +24,6 @@ from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import Config
-    from unprocess_gen.core.roots import Root
     from unprocess_gen.reports.estimate import RunEstimate
 
 
@@ -149,7 +148,7 @@ def preview(call: Call) -> int:
     return code
 
 
-def _check_not_among_photographs(to: Path, root: Root | None) -> None:
+def _check_not_among_photographs(to: Path, root: str | None) -> None:
     """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
     for source_root in root if isinstance(root, tuple) else [root] if root is not None else []:
         place = any_path(source_root).resolve()

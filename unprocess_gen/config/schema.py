@@ -19,7 +19,6 @@ from unprocess_gen.config import limits
 from unprocess_gen.config.limits import Choice, Integers, IsoForm, Limit, NumberList, NumberOrWord, Numbers
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
 from unprocess_gen.config.values import is_number
-from unprocess_gen.core.roots import Root
 from unprocess_gen.core.types import EXACT, TIERS
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
@@ -95,11 +94,9 @@ class SourceConfig(Group):
     kind
         srgb: photographs; raw: clean frames of a camera, DNG and other raw files or 16-bit mosaics (extra raw), of
         which the light is used: camera, gains and isp are not applied
-    roots
-        several folders or URLs, instead of root; names of images begin with the number of their folder, 0/, 1/, …
     list
         text file with the path of an image in each line, or CSV file with paths in the column file, else in the first
-        one; relative paths are below root or roots, without them below the folder of the list; include is not applied
+        one; relative paths are below root, without it below the folder of the list; include is not applied
     include
         glob patterns of images; one with a slash matches the path below root, others the file name, in any case
     recursive
@@ -139,7 +136,6 @@ class SourceConfig(Group):
         None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
     )
     kind: str = key("srgb", Choice("srgb", "raw"), since="0.3")
-    roots: tuple[str, ...] = key((), Limit("a list of folders and URLs, each once"), decides_data=False, since="0.3")
     list: Optional[str] = key(
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False, since="0.3"
     )
@@ -161,10 +157,10 @@ class SourceConfig(Group):
     raw: RawConfig = field(default_factory=RawConfig)
 
     @property
-    def place(self) -> Root | None:
+    def place(self) -> str | None:
         """Folder, or folders, that names of sources are relative to; None for the built-in scenes."""
-        if self.roots or self.root is not None or self.list is None:
-            return self.roots or self.root
+        if self.root is not None or self.list is None:
+            return self.root
         return str(Path(self.list).parent)
 
 
@@ -760,11 +756,6 @@ def all_settings() -> Iterator[tuple[str, str, Setting]]:
     for group, kind in [*GROUPS.items(), *NESTED.items(), ("", Config)]:
         for name, setting in settings_of(kind).items():
             yield group, name, setting
-
-
-def at_place(place: Root | None) -> dict[str, Any]:
-    """Return the fields of `SourceConfig` that give a place."""
-    return {"root": None, "roots": place} if isinstance(place, tuple) else {"root": place, "roots": ()}
 
 
 def replaced(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -45,7 +45,6 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import any_path, local_path
-from unprocess_gen.core.roots import SourceRoots, absolute_root
 from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
@@ -147,21 +146,11 @@ def _check_environment(config: Config) -> None:
 
 
 def _check_places(source: SourceConfig) -> None:
-    """Check the folders of ``roots`` and the file of ``list``."""
-    if source.roots and source.root is not None:
-        raise refusal("source.roots", source.roots, f"source.root={source.root} is set too; expected one of both")
-    for number, root in enumerate(source.roots):
-        if not isinstance(root, str) or not root or absolute_root(root) in map(absolute_root, source.roots[:number]):
-            raise refusal(f"source.roots[{number}]", root, "is empty or repeated; expected folders, each once")
+    """Check the file of ``list``."""
     if source.list is not None:
         expected = f"source.list={source.list}: a list is a local text or CSV file; copy it to one"
         if not local_path(source.list, expected).is_file():
             raise ConfigError(f"source.list={source.list}: no such file; expected a text file with a path in each line")
-    if source.roots:
-        try:
-            SourceRoots(source.roots).entry()
-        except StoreAccessError as error:
-            raise ConfigError(f"source.roots={error}") from None
 
 
 def _check_root(root: str) -> None:

@@ -18,7 +18,6 @@ class SourceFacts(msgspec.Struct, frozen=True):
 
     kind: Literal["folder", "synthetic", "raw"]
     root: str | None
-    roots: tuple[str, ...] = ()
     list: str | None = None
 
 

@@ -10,7 +10,6 @@ from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.core.roots import Root, root_path
 from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_changes, source_root
 from unprocess_gen.pipeline.verify import have_same_rows
 
@@ -31,7 +30,7 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
     return config
 
 
-def _root(folder: AnyPath, kind: str, root: str | None) -> Root | None:
+def _root(folder: AnyPath, kind: str, root: str | None) -> str | None:
     """Return the root of the sources, given or recorded; None for the built-in scenes."""
     if kind == "synthetic":
         if root is not None:
@@ -52,7 +51,7 @@ def _root(folder: AnyPath, kind: str, root: str | None) -> Root | None:
 def check_sources(folder: AnyPath, config: Config) -> None:
     """Raise SourceChangedError if sources are missing or have other sizes than the manifest records."""
     manifest, root = folder / "manifest.csv", config.source.place
-    if root is not None and root_path(root).exists() and manifest.exists():
+    if root is not None and any_path(root).exists() and manifest.exists():
         check_source_sizes(manifest, root)
 
 

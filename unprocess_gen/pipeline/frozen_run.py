@@ -22,14 +22,13 @@ from typing import Annotated
 
 import msgspec
 
-from unprocess_gen.config.schema import Config, at_place, replaced
+from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.core.records import Count, Digest, parse_record
-from unprocess_gen.core.roots import Root, absolute_root
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import row_json
 from unprocess_gen.dataset.shards import ShardWriter
@@ -67,8 +66,6 @@ class FrozenPlan(msgspec.Struct, frozen=True):
         Digests of ``config.yaml`` and of the index of the recorded listing.
     root, dark_frames : str or None
         Absolute places of the sources and the dark frames; None without them.
-    roots : tuple of str
-        Absolute places of the sources, if there are several.
     not_matched, skipped_links : int
         What the listing left out.
     canary_source : int or None
@@ -92,7 +89,6 @@ class FrozenPlan(msgspec.Struct, frozen=True):
     canary_sha256: str
     dark_frames: str | None = None
     parts: Positive | None = None
-    roots: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.parts is not None and self.parts > self.shards:
@@ -141,15 +137,14 @@ def _new_plan(workspace: Workspace, run: Run, on_compiling: OnCompiling | None, 
         write_listing(workspace.storage, run.sources)
     smallest_first = sorted(run.sources[:TRIED], key=lambda source: source.size_bytes or 0)
     index, sha256 = _make_canary(run.settings, smallest_first, on_compiling)
-    config, place = run.config, absolute_root(run.config.source.place)
+    config = run.config
     return FrozenPlan(
         version=version(PACKAGE),
         config_sha256=text_sha256(workspace.config_yaml),
         sources=len(run.sources),
         listing_sha256=text_sha256(workspace.storage.read(INDEX)),
         pairs_per_shard=config.output.pairs_per_shard,
-        root=None if isinstance(place, tuple) else place,
-        roots=place if isinstance(place, tuple) else (),
+        root=absolute_text(config.source.place),
         max_failed=config.source.max_failed,
         n_jobs=config.n_jobs,
         self_test=config.self_test,
@@ -244,14 +239,14 @@ class FrozenRun:
         The committed shards.
     """
 
-    def __init__(self, out: str, root: Root | None = None) -> None:
+    def __init__(self, out: str, root: str | None = None) -> None:
         self.storage = Storage(out)
         self.records = ShardRecords(self.storage)
         self.plan = read_plan(self.storage)
         self.config = self._config(root)
         self._listing = RecordedListing(self.storage)
 
-    def _config(self, root: Root | None) -> Config:
+    def _config(self, root: str | None) -> Config:
         plan = self.plan
         try:
             config, _ = parse_dataset_yaml(self.storage.read("config.yaml"))
@@ -259,8 +254,11 @@ class FrozenRun:
         except (ValueError, ConfigError) as error:
             raise DamageError(f"{self.storage.out}/config.yaml: cannot be read ({error_in_one_line(error)})") from error
         changes = {"out": self.storage.out, "n_jobs": plan.n_jobs, "self_test": plan.self_test}
-        changes |= {f"source.{key}": value for key, value in at_place(root or plan.roots or plan.root).items()}
-        changes |= {"source.max_failed": plan.max_failed, "noise.dark_frames": plan.dark_frames}
+        changes |= {
+            "source.root": root or plan.root,
+            "source.max_failed": plan.max_failed,
+            "noise.dark_frames": plan.dark_frames,
+        }
         return replaced(config, changes)
 
     @cached_property
@@ -296,7 +294,7 @@ class FrozenRun:
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def open_run(out: str, plan_sha256: str, root: Root | None = None) -> FrozenRun:
+def open_run(out: str, plan_sha256: str, root: str | None = None) -> FrozenRun:
     """Open a frozen run once for this process, and check the host.
 
     ``plan_sha256`` identifies the run, because a later one can be in the same folder; ``root`` is the place of the
@@ -308,7 +306,7 @@ def open_run(out: str, plan_sha256: str, root: Root | None = None) -> FrozenRun:
 
 
 @lru_cache(maxsize=2)
-def _open_run(out: str, plan_sha256: str, root: Root | None) -> FrozenRun:
+def _open_run(out: str, plan_sha256: str, root: str | None) -> FrozenRun:
     run = FrozenRun(out, root)
     if text_sha256(run.plan.text) != plan_sha256:
         raise ConfigError(f"out={out}: its plan is not that of this run; prepare another out")

@@ -27,7 +27,6 @@ from typing import Any
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
-from unprocess_gen.core.roots import absolute_root
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.frozen_run import freeze_run
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -212,7 +211,7 @@ def execute_on_dask(workspace: Workspace, run: Run, todo: list[ShardTask], progr
     from unprocess_gen.pipeline.executors.dask import REPORTS, ChunkRequest, DaskRun, connected
 
     config = run.config
-    out, root = absolute_text(config.out), absolute_root(config.source.place)
+    out, root = absolute_text(config.out), absolute_text(config.source.place)
     assert out is not None
     with connected(config.executor, effective_jobs(config.n_jobs, len(todo)), workspace.storage) as client:
         plan = freeze_run(workspace, run, progress.report_compiling)
@@ -286,10 +285,8 @@ def dataset_json_facts(
 
 def source_facts(config: Config) -> dict[str, Any]:
     """Kind and places of the sources, for ``dataset.json`` only."""
-    place, file = absolute_root(config.source.place), absolute_text(config.source.list)
-    facts: dict[str, Any] = {"kind": source_kind(config), "root": place}
-    if isinstance(place, tuple):
-        facts |= {"root": None, "roots": list(place)}
+    facts = {"kind": source_kind(config), "root": absolute_text(config.source.place)}
+    file = absolute_text(config.source.list)
     return facts if file is None else facts | {"list": file}
 
 

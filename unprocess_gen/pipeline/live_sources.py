@@ -149,7 +149,7 @@ class PlannedPairs:
     """Pairs of listed photographs, planned when they are read, as a run would make them."""
 
     def __init__(self, config: Config, root: str | None, cache: PixelCache | None) -> None:
-        config = config if root is None else replaced(config, {"source.root": root, "source.roots": ()})
+        config = config if root is None else replaced(config, {"source.root": root})
         validate_config(config)
         rule = patch_rule(config.source)
         if rule is not None and rule.kind == "grid":

@@ -20,7 +20,7 @@ from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.files import file_sha256, machine_errors
-from unprocess_gen.core.roots import Root, absolute_root
+from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.core.types import Array, Row
 from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import has_frames, read_rows, write_rows
@@ -46,7 +46,7 @@ class RepairStep(NamedTuple):
     exit_code: int = 0
 
 
-def repair(folder: Path, root: Root | None, dark_frames: str | None = None) -> Iterator[RepairStep]:
+def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> Iterator[RepairStep]:
     """Regenerate every damaged file of a dataset; yield a step for each.
 
     ``root`` is the folder of the sources, None for built-in scenes or if no source is needed; ``dark_frames`` is that
@@ -74,7 +74,7 @@ def repair(folder: Path, root: Root | None, dark_frames: str | None = None) -> I
             if not _is_intact(folder, number, rows):
                 yield _regenerate_shard(storage, number, [*filter(has_frames, rows)], regenerator)
         if not facts:
-            storage.write("dataset.json", _dataset_json(folder, {"kind": kind, "root": absolute_root(root)}))
+            storage.write("dataset.json", _dataset_json(folder, {"kind": kind, "root": absolute_text(root)}))
             yield RepairStep("dataset.json: rewritten; host, time and versions of the run are lost")
 
 
@@ -86,7 +86,7 @@ def _digest(path: Path) -> str:
         return ""
 
 
-def _read_config(folder: Path, root: Root | None) -> tuple[Config, str]:
+def _read_config(folder: Path, root: str | None) -> tuple[Config, str]:
     """Read the settings with the place of the sources, and the kind of the sources."""
     config, kind = read_dataset_yaml(folder / "config.yaml")
     return replaced(config, source_changes(None if kind == "synthetic" else root or "", folder)), kind

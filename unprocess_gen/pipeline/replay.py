@@ -14,14 +14,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from unprocess_gen.config.schema import RawConfig, SourceConfig, at_place
+from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_errors
+from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.output_paths import check_output_folder
-from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.records import parse_record
-from unprocess_gen.core.roots import Root, is_remote, root_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source, SourcePlan
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
@@ -39,7 +39,6 @@ from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
-from unprocess_gen.sources.listing import place_text
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import source_file
@@ -98,17 +97,16 @@ def _recorded_places(manifest: AnyPath) -> _Places:
         return _Places()
 
 
-def source_root(manifest: AnyPath, root: str | None) -> Root | None:
+def source_root(manifest: AnyPath, root: str | None) -> str | None:
     """Find the place of the sources: the given one, or the one that ``dataset.json`` records."""
     recorded = _recorded_places(manifest).source
-    return root if root is not None else recorded.roots or recorded.root
+    return root if root is not None else recorded.root
 
 
-def source_changes(root: Root | None, folder: AnyPath) -> dict[str, Any]:
+def source_changes(root: str | None, folder: AnyPath) -> dict[str, Any]:
     """Return the settings that give the place of the sources, and the list that ``dataset.json`` records."""
     recorded = _recorded_places(folder / "manifest.csv").source.list
-    places = at_place(root) | {"list": recorded if root else None}
-    return {f"source.{key}": value for key, value in places.items()}
+    return {"source.root": root, "source.list": recorded if root else None}
 
 
 def dark_frames_root(manifest: AnyPath, given: str | None = None) -> str | None:
@@ -116,15 +114,16 @@ def dark_frames_root(manifest: AnyPath, given: str | None = None) -> str | None:
     return given or (_recorded_places(manifest).dark_frames or DarkFrameFacts()).root
 
 
-def check_source_sizes(manifest: AnyPath, root: Root) -> None:
+def check_source_sizes(manifest: AnyPath, root: str) -> None:
     """Compare the sizes of the source files with those that a manifest records; opens no source.
 
     Raises SourceChangedError if a file is missing or has another size; names the first one; DamageError if the manifest
     cannot be read.
     """
     last = ""
+    place = any_path(root)
     # one listing instead of a request for each object
-    sizes = {entry.path: entry.size for entry in root_path(root).walk_entries()} if is_remote(root) else None
+    sizes = {entry.path: entry.size for entry in place.walk_entries()} if isinstance(place, ObjectPath) else None
     for row in read_rows(manifest):
         name, recorded = str(row["source"]), row["source_bytes"]
         if name == last or not recorded:  # built-in scenes and unreadable files have no size
@@ -134,10 +133,10 @@ def check_source_sizes(manifest: AnyPath, root: Root) -> None:
         try:
             size = sizes[path] if sizes else source_file(root, path).stat().st_size
         except (OSError, ValueError, KeyError, SourceError):
-            raise SourceChangedError(f"source {name}: is missing from {place_text(root)}; {ADVICE}") from None
+            raise SourceChangedError(f"source {name}: is missing from {root}; {ADVICE}") from None
         if size != recorded:
             raise SourceChangedError(
-                f"source {name}: has {size} bytes in {place_text(root)}; expected {recorded}, as recorded; {ADVICE}"
+                f"source {name}: has {size} bytes in {root}; expected {recorded}, as recorded; {ADVICE}"
             )
 
 
@@ -164,7 +163,7 @@ def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
 
 
 def replay(
-    rows: Iterable[Row], root: Root | None, to: Path | None = None, dark_frames: str | None = None
+    rows: Iterable[Row], root: str | None, to: Path | None = None, dark_frames: str | None = None
 ) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
@@ -206,7 +205,7 @@ class PairRegenerator:
     one image are consecutive.
     """
 
-    def __init__(self, root: Root | None, dark_frames: str | None = None) -> None:
+    def __init__(self, root: str | None, dark_frames: str | None = None) -> None:
         self._root, self._dark_frames = root, dark_frames
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
@@ -292,10 +291,10 @@ class PairRegenerator:
         return self._kept[2:]
 
 
-def recorded_source(root: Root | None, source: Source, prepared: SourcePlan) -> SourceConfig:
+def recorded_source(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
     """Return the settings with which the source of a row is decoded again."""
-    place = at_place(None if source.size_bytes == 0 else root)  # built-in scenes have no bytes
-    config = SourceConfig(**place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
+    place = None if source.size_bytes == 0 else root  # built-in scenes have no bytes
+    config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
     if not prepared.is_raw:
         return config
     pattern = None if PurePosixPath(source.path).suffix.lower() in RAW_FILES else prepared.raw_pattern

@@ -33,7 +33,6 @@ from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
-from unprocess_gen.sources.listing import place_setting
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.read_ahead import ReadFile, reading_ahead
 from unprocess_gen.sources.reading import read_bytes, source_file
@@ -184,7 +183,7 @@ def _check_not_deleted(config: Config, source: Source, error: SourceError) -> No
         return
     if not source_file(config.source.place or "", source.path).exists():
         raise MachineError(
-            f"{place_setting(config.source.place or '')}: {source.name} was deleted or moved after listing; expected "
+            f"source.root={config.source.place}: {source.name} was deleted or moved after listing; expected "
             "the listed files; restore it and run the same command again"
         ) from error
 

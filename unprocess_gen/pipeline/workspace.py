@@ -37,7 +37,6 @@ from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import MAX_BYTES, parse_json
-from unprocess_gen.core.roots import Root
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256, check_dataset_json
@@ -114,7 +113,7 @@ class Workspace:
         except DamageError as error:
             raise DamageError(f"{error}; gen-dataset verify {self.out} --repair restores it") from error
 
-    def check_begun(self, sources: Sequence[Source], root: Root | None) -> None:
+    def check_begun(self, sources: Sequence[Source], root: str | None) -> None:
         """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences.
 
         Files that the earlier run hashed, because others had their size and end, are hashed again: if one of them has
@@ -178,7 +177,7 @@ class Workspace:
         self.storage.remove_work(keep_records=False)
         return facts
 
-    def _check_same_settings(self, root: Root | None = None) -> None:
+    def _check_same_settings(self, root: str | None = None) -> None:
         if (self.storage / "config.yaml").size() is None:
             return
         try:
@@ -259,7 +258,7 @@ def add_parquet(storage: Storage, manifest: Path) -> dict[str, Any]:
     return {PARQUET_SHA256: sha256}
 
 
-def _digest_if_recorded(root: Root | None, source: Source, recorded: str | None) -> str | None:
+def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:
     """Return the digest of a source whose digest was recorded; hash the file if this listing did not.
 
     An object of a store is not hashed, because its ETag is compared.

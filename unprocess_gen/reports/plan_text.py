@@ -22,7 +22,7 @@ from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.expectation import Site
 from unprocess_gen.simulation.reference.cfa import MONO
-from unprocess_gen.sources.listing import place_text, unmatched_sentence
+from unprocess_gen.sources.listing import unmatched_sentence
 
 
 def format_estimate(estimate: RunEstimate) -> str:
@@ -30,7 +30,7 @@ def format_estimate(estimate: RunEstimate) -> str:
     run, read, config = estimate.run, estimate.source_estimates, estimate.run.config
     about = "" if estimate.exact else "about "
     notes = unmatched_sentence(run.listing.unmatched), *run.listing.warnings
-    place = place_text(config.source.place or "the built-in scenes")
+    place = config.source.place or "the built-in scenes"
     readable = [source for source in read if source.levels]
     lines = [
         f"sources   {len(run.sources)} in {config.source.list or place}; {len(read)} of them read",

@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from unprocess_gen.core.roots import Root
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.reading import content_sha256, name_sha256
 
 
-def number_clips(root: Root | None, sources: Sequence[Source]) -> tuple[Source, ...]:
+def number_clips(root: str | None, sources: Sequence[Source]) -> tuple[Source, ...]:
     """Make each folder a clip whose files are frames 0, 1, … in listing order.
 
     The digest of a clip's first file identifies the clip, so that adding or removing other clips changes nothing. If

@@ -30,7 +30,6 @@ from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import Entry, EntryKind, StoreAccessError
 from unprocess_gen.core.paths import absolute_text, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.core.roots import Root, root_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.names import encode_name
 
@@ -75,7 +74,7 @@ class Listing:
         return sum(self.unmatched.values())
 
 
-def list_folder(root: Root, include: Sequence[str], recursive: bool, limit: int | None) -> Listing:
+def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int | None) -> Listing:
     """List the files below ``root`` that the globs match, ordered by the bytes of their relative paths.
 
     Parameters
@@ -106,7 +105,7 @@ def list_folder(root: Root, include: Sequence[str], recursive: bool, limit: int 
     matched: list[Entry] = []
     suffixes, skipped_links = Counter[str](), 0
     try:
-        for entry in root_path(root).walk_entries(recursive):
+        for entry in any_path(root).walk_entries(recursive):
             if matches(entry.path):
                 matched.append(entry)
             elif entry.kind is EntryKind.FILE:
@@ -123,7 +122,7 @@ def list_folder(root: Root, include: Sequence[str], recursive: bool, limit: int 
         advice = f"{unmatched_sentence(unmatched)}; " if unmatched else ""
         advice += "choose a folder of photographs or other globs"
         raise ConfigError(
-            f"{place_setting(root)}: no file matches source.include={list(include)} "
+            f"source.root={root}: no file matches source.include={list(include)} "
             f"({'with' if recursive else 'without'} sub-folders); {advice}"
         )
     in_order = sorted(matched, key=lambda entry: os.fsencode(entry.path))
@@ -131,7 +130,7 @@ def list_folder(root: Root, include: Sequence[str], recursive: bool, limit: int 
     return Listing(sources, skipped_links, unmatched)
 
 
-def list_file(root: Root, file: str, limit: int | None) -> Listing:
+def list_file(root: str, file: str, limit: int | None) -> Listing:
     """List the sources that a text or CSV file names, ordered by the bytes of their paths below ``root``.
 
     A path that is no regular file becomes a source that fails. ConfigError for paths outside of ``root`` and repeated
@@ -142,14 +141,14 @@ def list_file(root: Root, file: str, limit: int | None) -> Listing:
         path = _path_below(root, text)
         problem = f"is repeated from line {lines[path]}; expected each path once" if path in lines else ""
         if leads_outside(path) or "\0" in path or len(path) > MAX_LISTED:
-            problem = f"is no path below {place_text(root)}; expected files in it"
+            problem = f"is no path below {root}; expected files in it"
         if problem:
             raise ConfigError(f"source.list={file}: line {number}: {encode_name(text)[:200]} {problem}")
         lines[path] = number
     if not lines:
         raise ConfigError(f"source.list={file}: names no file; expected a path in each line")
     in_order = sorted(lines, key=os.fsencode)[:limit]
-    entries = root_path(root).map(partial(_listed_entry, root), in_order)
+    entries = any_path(root).map(partial(_listed_entry, root), in_order)
     return Listing(tuple(_source(index, entry) for index, entry in enumerate(entries)))
 
 
@@ -171,36 +170,24 @@ def _listed_paths(file: str) -> Iterator[tuple[int, str]]:
         raise ConfigError(f"source.list={file}: cannot be read ({error}); expected a text or CSV file") from None
 
 
-def _path_below(root: Root, text: str) -> str:
+def _path_below(root: str, text: str) -> str:
     """Return the path of a listed file below the root, with ``/`` between its segments; others stay as they are."""
-    roots = [(f"{number}/", folder) for number, folder in enumerate(root)] if isinstance(root, tuple) else [("", root)]
-    for prefix, folder in roots:
-        start = f"{absolute_text(folder)}".rstrip("/") + "/"
-        if text.startswith(start):
-            return prefix + posixpath.normpath(text.removeprefix(start))
+    start = f"{absolute_text(root)}".rstrip("/") + "/"
+    if text.startswith(start):
+        return posixpath.normpath(text.removeprefix(start))
     return text if text.startswith("/") else posixpath.normpath(text.replace(os.sep, "/"))
 
 
-def _listed_entry(root: Root, path: str) -> Entry:
+def _listed_entry(root: str, path: str) -> Entry:
     try:
-        return (root_path(root) / path).entry()._replace(path=path)
+        return (any_path(root) / path).entry()._replace(path=path)
     except StoreAccessError as error:
         raise ConfigError(f"source.list={error}") from None
     except OSError:
         return Entry(path, None, EntryKind.BROKEN_LINK)
 
 
-def place_text(root: Root) -> str:
-    """Return a place for a message."""
-    return ", ".join(root) if isinstance(root, tuple) else root
-
-
-def place_setting(root: Root) -> str:
-    """Return a place as the setting that gives it, for a message."""
-    return f"source.root{'s' * isinstance(root, tuple)}={place_text(root)}"
-
-
-def check_root(root: Root) -> None:
+def check_root(root: str) -> None:
     """Raise ConfigError unless a source root is a folder, a regular file, or the URL of a prefix or object."""
     _single_file(root)
 
@@ -237,19 +224,19 @@ def matcher(include: Iterable[str]) -> Callable[[str], bool]:
     return lambda path: matches_name(path.rpartition("/")[2]) is not None or matches_path(path) is not None
 
 
-def _unreadable_folder(root: Root, folder: str, reason: str) -> ConfigError:
+def _unreadable_folder(root: str, folder: str, reason: str) -> ConfigError:
     name = "" if folder == os.curdir else encode_name(folder)
     ways_out = "change its permissions, move it, or set source.recursive=false" if name else "change its permissions"
     return ConfigError(
-        f"{place_setting(root)}: {name or 'the folder itself'} cannot be read ({reason}); expected readable folders; "
+        f"source.root={root}: {name or 'the folder itself'} cannot be read ({reason}); expected readable folders; "
         f"{ways_out}"
     )
 
 
-def _single_file(root: Root) -> Entry | None:
+def _single_file(root: str) -> Entry | None:
     """Return the file or object that a root is, or None if it is a folder or prefix."""
     try:
-        entry = root_path(root).entry()
+        entry = any_path(root).entry()
     except StoreAccessError as error:
         raise ConfigError(f"source.root={error}") from None
     except (OSError, ValueError) as error:

@@ -12,11 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
 
-from unprocess_gen.core.object_store import started_ahead
-from unprocess_gen.core.roots import Root, is_remote
+from unprocess_gen.core.object_store import ObjectPath, started_ahead
+from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Source
 
-ReadFile = Callable[[Root, Source], bytes]
+ReadFile = Callable[[str, Source], bytes]
 """Function that returns the bytes of a source below a root: `reading.read_bytes`, or one that has read ahead."""
 
 AHEAD = 8
@@ -27,12 +27,12 @@ AHEAD_BYTES = 2**28
 
 
 @contextmanager
-def reading_ahead(root: Root | None, read: ReadFile, sources: Sequence[Source]) -> Iterator[ReadFile]:
+def reading_ahead(root: str | None, read: ReadFile, sources: Sequence[Source]) -> Iterator[ReadFile]:
     """Read sources of an object store ahead while the body processes them in order; yield a function like ``read``.
 
     A source that is read a second time, or out of order, is read when it is asked for.
     """
-    if root is None or not is_remote(root):
+    if root is None or not isinstance(any_path(root), ObjectPath):
         yield read
         return
     later = deque(sources)
@@ -41,7 +41,7 @@ def reading_ahead(root: Root | None, read: ReadFile, sources: Sequence[Source]) 
         closing(started_ahead(pool, partial(read, root), sources, AHEAD, _size_bytes, AHEAD_BYTES)) as started,
     ):
 
-        def read_next(root: Root, source: Source) -> bytes:
+        def read_next(root: str, source: Source) -> bytes:
             while later and later[0].index < source.index:  # sources that were not needed after all
                 later.popleft()
                 next(started).cancel()

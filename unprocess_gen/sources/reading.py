@@ -10,8 +10,7 @@ from typing import BinaryIO
 from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import ObjectChangedError, ObjectPath
-from unprocess_gen.core.paths import LocalPath, NotAFileError
-from unprocess_gen.core.roots import Root, SourceRoots, root_path
+from unprocess_gen.core.paths import LocalPath, NotAFileError, any_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.names import encode_name
 
@@ -21,13 +20,13 @@ MAX_FILE_BYTES = 2**30
 _RESTORE = "restore it, or choose another out when nothing writes to source.root"
 
 
-def source_file(root: Root, path: str) -> LocalPath | ObjectPath:
+def source_file(root: str, path: str) -> LocalPath | ObjectPath:
     """Return the file of a source.
 
     Parameters
     ----------
-    root : Root
-        Place of the sources: a folder or several, or the single picture.
+    root : str
+        Place of the sources: a folder, or the single picture.
     path : str
         `Source.path`.
 
@@ -39,14 +38,12 @@ def source_file(root: Root, path: str) -> LocalPath | ObjectPath:
     """
     if leads_outside(path):
         raise SourceError("unreadable", f"{encode_name(path)} leads outside source.root")
-    folder = root_path(root)
-    if isinstance(folder, SourceRoots):
-        return folder / path
+    folder = any_path(root)
     return folder if folder.name == path and not folder.is_dir() else folder / path
 
 
 @contextmanager
-def opened(root: Root, source: Source) -> Iterator[BinaryIO]:
+def opened(root: str, source: Source) -> Iterator[BinaryIO]:
     """Open a source, unless it is not, or no longer, the regular file that was listed.
 
     Raises
@@ -74,7 +71,7 @@ def opened(root: Root, source: Source) -> Iterator[BinaryIO]:
         raise SourceError("unreadable", f"{source.name}: {why}") from None
 
 
-def read_bytes(root: Root, source: Source) -> bytes:
+def read_bytes(root: str, source: Source) -> bytes:
     """Return the content of a photograph; raise as `opened`, or SourceError ``empty``."""
     with opened(root, source) as file:
         if source.size_bytes == 0:  # files below /proc grow while they are read
@@ -91,7 +88,7 @@ def _check_size(source: Source, size_bytes: int, when: str) -> None:
         )
 
 
-def content_sha256(root: Root, source: Source) -> str:
+def content_sha256(root: str, source: Source) -> str:
     """SHA-256 of a source's file, known or computed; of its name if the file cannot be read."""
     if source.sha256 is not None:
         return source.sha256

@@ -13,7 +13,7 @@ from functools import partial
 import xxhash
 
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.core.roots import Root, root_path
+from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.reading import opened
 
@@ -22,7 +22,7 @@ TAIL_BYTES = 4096
 their beginnings, which hold the metadata of a camera, often do not."""
 
 
-def number_twins(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
+def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     """Assign files of equal content the numbers 0, 1, … in listing order (``occurrence``).
 
     Files of one size are compared by their last `TAIL_BYTES`. Only files that share size and tail are read completely;
@@ -35,7 +35,7 @@ def number_twins(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
             by_size.setdefault(source.size_bytes, []).append(source)
     groups = [group for group in by_size.values() if len(group) > 1]
     candidates = list(_sharing_tails(root, groups))
-    digests = root_path(root).map(partial(_complete_digest, root), candidates)
+    digests = any_path(root).map(partial(_complete_digest, root), candidates)
     numbered, seen = {source.index: source for source in sources}, Counter[str]()
     for source, digest in zip(candidates, digests, strict=True):
         if digest is not None:
@@ -44,10 +44,10 @@ def number_twins(root: Root, sources: Sequence[Source]) -> tuple[Source, ...]:
     return tuple(numbered.values())
 
 
-def _sharing_tails(root: Root, groups: Iterable[Sequence[Source]]) -> Iterator[Source]:
+def _sharing_tails(root: str, groups: Iterable[Sequence[Source]]) -> Iterator[Source]:
     """Yield the sources whose last bytes equal the last bytes of another source of their group, group by group."""
     groups = list(groups)
-    tails = root_path(root).map(partial(_tail_digest, root), itertools.chain.from_iterable(groups))
+    tails = any_path(root).map(partial(_tail_digest, root), itertools.chain.from_iterable(groups))
     for group in groups:
         group_tails = list(itertools.islice(tails, len(group)))
         counts = Counter(group_tails)
@@ -56,7 +56,7 @@ def _sharing_tails(root: Root, groups: Iterable[Sequence[Source]]) -> Iterator[S
         )
 
 
-def _tail_digest(root: Root, source: Source) -> int | None:
+def _tail_digest(root: str, source: Source) -> int | None:
     """Digest of a file's last `TAIL_BYTES`, None if it cannot be read."""
     with suppress(SourceError), opened(root, source) as file:
         file.seek(max(0, (source.size_bytes or 0) - TAIL_BYTES))
@@ -64,7 +64,7 @@ def _tail_digest(root: Root, source: Source) -> int | None:
     return None
 
 
-def _complete_digest(root: Root, source: Source) -> str | None:
+def _complete_digest(root: str, source: Source) -> str | None:
     """SHA-256 of a file, None if it cannot be read."""
     with suppress(SourceError), opened(root, source) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]

@@ -43,7 +43,6 @@ from distributed.versions import VersionMismatchWarning
 from unprocess_gen.config.schema import ExecutorConfig
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, MachineError, SourceChangedError, UnprocessGenError
-from unprocess_gen.core.roots import Root
 from unprocess_gen.pipeline.executors.local import interrupts_ignored
 from unprocess_gen.pipeline.frozen_run import FrozenRun, open_run
 from unprocess_gen.pipeline.run_records import ShardRecords, forget_deaths
@@ -96,7 +95,7 @@ class ChunkRequest:
     """Hold what a task needs: dataset, sources, digest of the plan, time between reports, shards, and a Dask topic."""
 
     out: str
-    root: Root | None
+    root: str | None
     plan_sha256: str
     report_s: float
     shards: tuple[int, ...] = ()

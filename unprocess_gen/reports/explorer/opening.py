@@ -13,8 +13,7 @@ from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import is_dataset
-from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.roots import root_path
+from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.types import NO_CLIP, Row, Source
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.selection import select_rows
@@ -65,7 +64,7 @@ def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Ex
     """Choose a source: a photograph of a folder by itself, others with the sources that are listed before them."""
     root = config.root
     is_alone = config.list is None and source.clip == NO_CLIP and not source.occurrence
-    if root is not None and is_alone and root_path(root).is_dir():
+    if root is not None and is_alone and any_path(root).is_dir():
         path = _path_text(f"{root.rstrip('/')}/{source.path}")
         kept = {key: text for key, text in state.settings.items() if key not in ("source.limit", "source.include")}
         return replace(state, settings=kept | {"source.root": path})

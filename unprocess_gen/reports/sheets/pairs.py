@@ -9,7 +9,6 @@ from typing import NamedTuple
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.roots import Root
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Photograph, Plan, Row, Source, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
@@ -58,7 +57,7 @@ def selected_pairs(folder: AnyPath, keys: Sequence[str], source: AnyPath | None)
         yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_from_row(row), part, missing)
 
 
-def _load_part(row: Row, root: Root | None, load: Load) -> tuple[Srgb | None, str]:
+def _load_part(row: Row, root: str | None, load: Load) -> tuple[Srgb | None, str]:
     """Load the part of the source that a row's frames show; None and the reason if it is not available."""
     if root is None and row["source_bytes"] != 0:
         return None, "the dataset does not record where its photographs are; give --source ROOT"
