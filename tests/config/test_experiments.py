@@ -151,7 +151,7 @@ def clean_planes_of_brooks(srgb: Srgb, row: dict[str, Any]) -> np.ndarray:
 @pytest.fixture(scope="module")
 def brooks(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("recipes") / "brooks"
-    make(None, out, f"+{RECIPE}=brooks2019_training", "source.limit=2", "source.patch=[random,128,4]")
+    make(None, out, f"+{RECIPE}=brooks2019_training", "source.limit=3", "source.patch=[random,128,4]")
     return out
 
 

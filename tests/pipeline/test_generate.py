@@ -389,7 +389,7 @@ def test_data_contain_no_path_host_or_version(name: str, dataset: Path, photos: 
 def test_built_in_scenes_are_the_source_without_a_root(make: Make, tmp_path: Path) -> None:
     summary = make(None, tmp_path / "ds", "source.limit=3")
     assert (summary.pairs, summary.made, summary.rows) == (3, 3, 3)
-    assert [row["source"] for row in rows(tmp_path / "ds")] == ["dead_leaves-0", "colour_chart-0", "gradients-0"]
+    assert [row["source"] for row in rows(tmp_path / "ds")] == ["dead_leaves-0", "colour_chart-0", "highlights-0"]
     assert [row["source_bytes"] for row in rows(tmp_path / "ds")] == [0] * 3
     assert facts(tmp_path / "ds")["source"] == {"kind": "synthetic", "root": None}
 

@@ -77,7 +77,7 @@ def flat(*colour: int, height: int = 40, width: int = 56) -> Srgb:
 @pytest.fixture(scope="module")
 def pictures() -> dict[str, Srgb]:
     """Return crops of scenes, gray flats, and flats of colours with a dark channel."""
-    cuts = {name: cut(name, 40, 56) for name in ("highlights-0", "night_lamps-0", "gradients-0")}
+    cuts = {name: cut(name, 40, 56) for name in ("highlights-0", "colour_chart-0", "dead_leaves-0")}
     grays = {f"gray {code}": flat(code, code, code, height=30, width=40) for code in (0, 255)}
     return cuts | grays | {"cyan": flat(0, 200, 200, height=31, width=41)}
 
@@ -130,7 +130,7 @@ def test_omitted_effects_are_masked_by_the_noise(
 ) -> None:
     """No number is marked as assumed, and a full well cuts bright signals."""
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
-    some = {name: pictures[name] for name in ("night_lamps-0", "gradients-0", "gray 255", "cyan")}
+    some = {name: pictures[name] for name in ("colour_chart-0", "dead_leaves-0", "gray 255", "cyan")}
     assert hold(config, some) > 0
 
 
@@ -140,7 +140,7 @@ def test_omitted_effects_are_masked_by_the_noise(
 def test_omitted_effects_are_masked_in_larger_frames(settings: Settings, noise: str, scene: str) -> None:
     """Means over more sites reveal smaller effects."""
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
-    names = ("highlights-0", "night_lamps-0", "gradients-0", "dead_leaves-0")
+    names = ("highlights-0", "colour_chart-0", "dead_leaves-0")
     pictures = {name: cut(name, 380, 440) for name in names} | {"cyan": flat(0, 200, 200, height=381, width=441)}
     hold(config, pictures)
 
@@ -287,7 +287,7 @@ def test_omitted_effects_are_masked_if_bodies_decide(settings: Settings, picture
             settings, "noise=nikon_d850", f"scene={scene}", "noise.assumed=[]", "noise.prnu_std=3e-4",
             "effects.scope=body",
         )  # fmt: skip
-        some = {name: pictures[name] for name in ("night_lamps-0", "gradients-0", "gray 255", "cyan")}
+        some = {name: pictures[name] for name in ("colour_chart-0", "dead_leaves-0", "gray 255", "cyan")}
         held += hold(config, some, tuple(one for one in EFFECTS if one not in ("hot_pixels", "dead_pixels")))
     assert held > 0
 

@@ -51,7 +51,7 @@ SETTINGS = {
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scenes as JPEG and PNG, every corner of the cube, all gray codes, and a 16-bit PNG."""
     folder = tmp_path_factory.mktemp("photographs")
-    for name in ("dead_leaves-1", "highlights-0", "night_lamps-0"):
+    for name in ("dead_leaves-1", "highlights-0", "colour_chart-0"):
         cv2.imwrite(str(folder / f"{name}.jpg"), synthetic.scene(name)[..., ::-1])
     corners = np.array(np.meshgrid([0, 128, 254, 255], [0, 128, 254, 255], [0, 128, 254, 255])).T.reshape(1, -1, 3)
     grays = np.repeat(np.arange(256)[None, :, None], 3, axis=2)
