@@ -257,8 +257,7 @@ def command_line_page() -> str:
 
 
 def _summary(verb: Verb) -> str:
-    summary = verb.summary.replace('eval "$(gen-dataset completion bash)"', '`eval "$(gen-dataset completion bash)"`')
-    return f"{summary[0].upper()}{summary[1:]}."
+    return f"{verb.summary[0].upper()}{verb.summary[1:]}."
 
 
 def _argument(argument: Argument) -> list[str]:

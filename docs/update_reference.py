@@ -1,4 +1,4 @@
-"""Write the parts of documentation and help that follow from the code: reference, packages, listed keys.
+"""Write the parts of documentation that follow from the code: reference and packages.
 
 ``python docs/update_reference.py`` rewrites the text between the markers ``<!-- NAME: from the code -->`` and
 ``<!-- end of NAME -->`` of each page, and the files of `GENERATED_FILES`; a test compares them with the code.
@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from collections.abc import Callable
@@ -14,10 +13,6 @@ from functools import cache
 from pathlib import Path
 
 import grimp
-
-from unprocess_gen.config.schema import GROUPS, Config, group_settings
-from unprocess_gen.config.settings import settings_of
-from unprocess_gen.config.values import value_text
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
@@ -107,16 +102,6 @@ def _reachable(package: str) -> set[str]:
     return {*imported, *(further for one in imported for further in _reachable(one))}
 
 
-def keys_of_help() -> str:
-    """Return the JSON text of the keys that ``gen-dataset --help`` lists."""
-    top = {
-        f"{name}={value_text(getattr(Config, name))}": setting.description
-        for name, setting in settings_of(Config).items()
-    }
-    groups = {group: list(group_settings(group)) for group in GROUPS}
-    return json.dumps({"groups": groups, "top": top}, indent=1) + "\n"
-
-
 def purpose(package: str) -> str:
     """Return the docstring of a package in one line."""
     text = (ROOT / PACKAGE / package / "__init__.py").read_text(encoding="utf-8")
@@ -131,7 +116,6 @@ GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
 
 GENERATED_FILES: dict[str, Callable[[], str]] = {
     "docs/design/packages.svg": package_drawing,
-    "conf/keys.json": keys_of_help,
     **PAGES,
 }
 """Generated files, and the functions that return their text."""

@@ -339,7 +339,7 @@ def replay(
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     if keys is not None and not isinstance(keys, str):
         keys = str(keys) if isinstance(keys, int) else ",".join(map(str, keys))
-    rows = select_rows(manifest, None, keys)
+    rows = select_rows(manifest, keys)
     source_root = _replay.source_root(manifest, None if root is None else os.fspath(root))
     frames_root = _replay.dark_frames_root(manifest, None if dark_frames is None else os.fspath(dark_frames))
     return list(_replay.replay(rows, source_root, None if to is None else Path(to), frames_root))

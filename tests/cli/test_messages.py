@@ -38,7 +38,6 @@ COMMANDS = {
     "preview": ["preview", "ds", "--keys", "0", "--to", "sheets"],
     "dng": ["dng", "wide", "--keys", "0", "--to", "dngs"],
     "again": ["again", "ds", "out=copy"],
-    "completion": ["completion", "bash"],
 }
 """Commands that print something, one for each verb that takes seconds."""
 

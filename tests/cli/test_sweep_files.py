@@ -40,14 +40,13 @@ def write(path: Path, content: dict[str, Any], header: str = "# @package _global
 
 def jobs(*overrides: str, own: Path | None = None, multirun: bool = False) -> list[str]:
     """Return the names of the folders that overrides expand to."""
-    expansion = expand(overrides, OptionFolders(own=own), multirun)
-    assert expansion.node is None
-    return [",".join(sorted(job.named)) for job in expansion.jobs]
+    node, jobs = expand(overrides, OptionFolders(own=own), multirun)
+    assert node is None
+    return [",".join(sorted(job.named)) for job in jobs]
 
 
 WAYS = {
     "sweep": ("sweep/two.yaml", {}, ["+sweep=two"]),
-    "experiment": ("experiment/two.yaml", {}, ["+experiment=two"]),
     "primary config": ("two.yaml", {"defaults": ["config", "_self_"]}, ["-cn", "two"]),
 }
 """Each way in which a file reaches Hydra: the file, its other content, and the arguments."""
@@ -64,7 +63,7 @@ def swept(run_main: RunMain, mine: Path, tmp_path: Path, tmp_path_factory: pytes
     return kept
 
 
-@pytest.mark.parametrize("way", slow_except(("experiment",), WAYS))
+@pytest.mark.parametrize("way", slow_except(("sweep",), WAYS))
 def test_sweep_in_a_file_equals_the_command_line(
     way: str, mine: Path, swept: Path, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
@@ -104,12 +103,6 @@ def test_values_on_the_command_line_multiply_those_of_a_file(mine: Path) -> None
     assert jobs("+sweep=two", "seed=1,2", own=mine) == [
         f"{folder},seed={seed}" for seed in (1, 2) for folder in FOLDERS
     ]
-
-
-def test_several_sweep_files_are_run_one_after_the_other(mine: Path) -> None:
-    write(mine / "sweep/two.yaml", SWEEP)
-    write(mine / "sweep/seeds.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"seed": "1,2"}}}})
-    assert jobs("+sweep=two,seeds", own=mine, multirun=True) == [*FOLDERS, "seed=1", "seed=2"]
 
 
 def test_all_forms_of_values_are_expanded(mine: Path) -> None:
@@ -196,15 +189,6 @@ def test_params_in_an_option_that_the_sweep_selects_are_refused(mine: Path, run_
     done = run_main("-m", "noise=hides", *REST)
     assert (done.code, done.err.count("\n")) == (2, 1), done.err
     assert not list((tmp_path).glob("sweep/*/dataset.json"))
-
-
-def test_unknown_key_in_a_sweep_fails_its_jobs_only(mine: Path, run_main: RunMain) -> None:
-    write(mine / "sweep/bad.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"sed": "1,2"}}}})
-    done = run_main("+sweep=bad", *REST)
-    assert done.code == 2
-    assert [line.split(": ", 2)[2].split(";")[0] for line in done.err.splitlines()] == [
-        "sed=1: no such key", "sed=2: no such key",
-    ]  # fmt: skip
 
 
 def test_sweep_file_without_package_line_is_refused_with_advice(mine: Path, run_main: RunMain) -> None:

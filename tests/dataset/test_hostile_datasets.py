@@ -123,7 +123,7 @@ def test_value_outside_its_range_names_row_column_and_value(name: str, value: st
 def test_every_reader_of_a_hostile_manifest_reports_damage(copy: Path) -> None:
     edit(copy, gamma="-7")
     assert [damage.file for damage in verify(copy)] == ["manifest.csv"]
-    for read in (RawPairs, lambda folder: list(select_rows(folder / "manifest.csv", None, "1"))):
+    for read in (RawPairs, lambda folder: list(select_rows(folder / "manifest.csv", "1"))):
         with pytest.raises(DamageError, match=f"row {KEY}: gamma="):
             read(copy)
 
@@ -140,7 +140,7 @@ def test_source_outside_the_root_is_never_looked_up(copy: Path, monkeypatch: pyt
     monkeypatch.setattr("os.open", refuse)
     monkeypatch.setattr("os.stat", refuse)
     with pytest.raises(DamageError, match=r"source='\.\./secret\.png': expected a path below the source folder"):
-        list(replay(select_rows(manifest, None, "1"), str(copy.parent / "p")))
+        list(replay(select_rows(manifest, "1"), str(copy.parent / "p")))
 
 
 def test_line_of_megabytes_is_damage(copy: Path) -> None:

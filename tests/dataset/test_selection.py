@@ -54,12 +54,12 @@ def manifest(tmp_path: Path) -> Path:
     ],
 )
 def test_indices_ranges_and_keys_select_rows(keys: str, selected: list[str], manifest: Path) -> None:
-    assert [row["key"] for row in select_rows(manifest, None, keys)] == selected
+    assert [row["key"] for row in select_rows(manifest, keys)] == selected
 
 
 def test_failed_rows_inside_a_range_are_skipped_and_counted(manifest: Path) -> None:
     skipped: list[Row] = []
-    selected = [row["key"] for row in select_rows(manifest, None, "0-2", skipped)]
+    selected = [row["key"] for row in select_rows(manifest, "0-2", skipped)]
     assert (selected, [row["key"] for row in skipped]) == (["00000000", "00000002"], ["00000001"])
     assert select_pairs(manifest, "0-5").failed == 1
 
@@ -97,7 +97,7 @@ def test_failed_row_named_alone_is_no_pair(manifest: Path) -> None:
 )
 def test_selection_without_rows_is_refused(keys: str, problem: str, manifest: Path) -> None:
     with pytest.raises(ConfigError, match=problem):
-        list(select_rows(manifest, None, keys))
+        list(select_rows(manifest, keys))
 
 
 def test_huge_range_of_keys_costs_nothing() -> None:

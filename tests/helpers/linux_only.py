@@ -10,7 +10,6 @@ import pytest
 TESTS = Path(__file__).parents[1]
 
 MODULES = {
-    "cli/test_completion.py": "runs bash and zsh in pseudo-terminals",
     "cli/test_messages.py": "writes to /dev/full, sends SIGHUP",
     "pipeline/test_faults.py": "stops and kills processes found in /proc, mounts small disks",
     "pipeline/test_refusals.py": "limits the address space",

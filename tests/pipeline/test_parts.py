@@ -302,7 +302,7 @@ def test_ranges_are_written_as_batch_systems_read_them(numbers: list[int], text:
         (("part", "ds", "6"), "part 6: ds has 6 parts; expected 0 to 5"),
         (("part", "ds", "-1"), "part: -1: expected an integer of 0 or more"),
         (("part", "ds", "0", "n_jobs=0"), "n_jobs=0: expected 1 to 1024 or -1 for one per core"),
-        (("part", "ds", "0", "--source", "none"), "source.root=none: no such folder or file; expected an "
+        (("part", "ds", "0", "source.root=none"), "source.root=none: no such folder or file; expected an "
          "existing folder of photographs"),
         (("part", "ds", "x"), "part: x: expected an integer of 0 or more"),
         (("part", "ds"), "part: its number is missing; expected it after ds, or in one of SLURM_ARRAY_TASK_ID, "

@@ -76,9 +76,9 @@ def test_what_needs_frames_refuses_a_manifest(folders: tuple[Path, Path], run_ma
         assert (done.code, done.err.count("\n")) == (2, 1), done
         assert "without frames" in done.err
     assert run_main("replay", planned).code == run_main("verify", planned, "--regenerate=1").code == 2
-    done = run_main("replay", planned, "--rows", "0:2", "--to", "arrays")
-    assert (done.code, len([*(tmp_path / "arrays").iterdir()])) == (0, 4)
-    assert "2 rows without digests" in done.out
+    done = run_main("replay", planned, "--keys", "0", "--to", "arrays")
+    assert (done.code, len([*(tmp_path / "arrays").iterdir()])) == (0, 8)
+    assert "4 rows without digests" in done.out
 
 
 def test_a_row_with_one_digest_is_no_row(folders: tuple[Path, Path], run_main: RunMain, tmp_path: Path) -> None:

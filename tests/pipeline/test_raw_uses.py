@@ -54,7 +54,7 @@ def test_clips_levels_draws_and_splits_are_in_the_rows(made: Path) -> None:
 
 USES = {
     "regenerate": (("verify", "ds", "--regenerate", "8"), "8 pairs regenerated, bit for bit"),
-    "replay": (("replay", "ds", "--source", "clips"), "0 are not"),
+    "replay": (("replay", "ds", "source.root=clips"), "0 are not"),
     "preview": (("preview", "ds", "--keys", "0", "--to", "pictures"), "pictures"),
     "dng": (("dng", "ds", "--keys", "0", "--to", "dngs"), "16 DNG files written"),
     "export": (("export", "ds", "--format", "npy", "--to", "arrays"), "48 pairs written"),

@@ -12,19 +12,18 @@ from helpers.modules import MODULES, PACKAGE, tree
 
 ONLY_IN = {
     "hydra": {
-        *("cli.jobs", "config.composition", "config.composition_errors", "config.sweep_expansion"),
-        *("cli.sweep_plugins", "config.recomposition"),
+        *("config.composition", "config.composition_errors", "config.sweep_expansion", "config.recomposition"),
     },
     "omegaconf": {
         *(
-            "cli.jobs",
+            "cli.hydra_app",
             "config.body_composition",
             "config.composition",
             "config.composition_errors",
             "config.raw_composition",
             "config.serialization",
         ),
-        *("cli.sweep_plugins", "config.recomposition", "config.sweep_expansion"),
+        *("config.recomposition", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},

@@ -397,7 +397,7 @@ def test_changed_photograph_is_named_and_its_panel_omitted(
     shutil.copytree(gray_world, tmp_path / "moved")
     spoil(tmp_path / "moved")
 
-    done = run_main("preview", few, "--keys=00000000,00000001", "--to=to", "--source=moved", "--stages")
+    done = run_main("preview", few, "--keys=00000000,00000001", "--to=to", "source.root=moved", "--stages")
 
     assert (done.code, done.out, done.err.count("\n")) == (5, "3 pictures in to\n", 1)
     assert done.err.startswith("gen-dataset: 00000000 (a.png): the source's panel and the stages are omitted: ")
@@ -411,11 +411,11 @@ def test_changed_photograph_is_named_and_its_panel_omitted(
         ("DS --to sheets --keys 77", "--keys 77: "),
         ("DS --to sheets --keys 00000000,", "--keys 00000000,: '' is no key; "),
         ("DS --to sheets --keys 00000002", "--keys 00000002: failed (unsupported), so it has no frames"),
-        ("DS --to sheets --source nowhere", "source.root=nowhere: no such folder or file"),
+        ("DS --to sheets source.root=nowhere", "source.root=nowhere: no such folder or file"),
         ("DS --to file", "--to file: is a file; expected a folder"),
         ("DS --to file/sheets", "--to file/sheets: cannot be written (Not a directory)"),
         ("DS --to DS/sheets", "--to DS/sheets: is inside the dataset "),
-        ("DS --to sheets --draw 1", "preview: --draw: no such flag; expected --keys, --to, --source"),
+        ("DS --to sheets --draw 1", "preview: --draw: no such flag; expected --keys, --to, source.root"),
         ("DS", "preview: --to is missing; give --to FOLDER"),
         ("--to sheets", "preview: expected the folder of a dataset"),
     ],

@@ -257,10 +257,10 @@ def test_quotes_around_a_folder_name_are_removed(mark: str, run_main: RunMain, t
 
 
 VERB_ARGUMENTS = {
-    "verify": ["--regenerate", "1", "--source", "SOURCE"],
+    "verify": ["--regenerate", "1", "source.root=SOURCE"],
     "replay": ["--keys", "0", "source.root=SOURCE"],
-    "report": ["--to", "page.html", "--source=SOURCE"],
-    "preview": ["--keys", "0", "--to", "sheets", "--source", "SOURCE"],
+    "report": ["--to", "page.html", "source.root=SOURCE"],
+    "preview": ["--keys", "0", "--to", "sheets", "source.root=SOURCE"],
     "dng": ["--keys", "0", "--clean", "--to", "dngs"],
     "again": ["out=copy", "n_jobs=1", "source.root=SOURCE"],
 }

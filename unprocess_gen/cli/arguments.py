@@ -24,11 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """One argument of a verb.
+    """One argument of a verb: the spellings of a flag, or the key of a setting, which is written ``key=value``.
 
-    Its names are spellings: ``--flag`` is followed by its value, ``key`` means ``key=value``. A switch has no metavar.
-    ``read`` converts the text of the value and raises ValueError unless it is as ``expected`` says. Shells complete
-    the value as ``folders`` or ``files``, or as one of its ``choices``.
+    A switch has no metavar. ``read`` converts the text of the value and raises ValueError unless it is as ``expected``
+    says.
     """
 
     names: tuple[str, ...]
@@ -36,37 +35,29 @@ class Argument:
     metavar: str = ""
     read: Callable[[str], Any] = str
     expected: str = "text"
-    completes: str = ""
     required: bool = False
     choices: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
-        """Name in `Call.values`: the first long spelling, without hyphens."""
-        longest = next((name for name in self.names if not re.match("-[^-]", name)), self.names[0])
-        return longest.lstrip("-").rpartition(".")[2].replace("-", "_")
+        """Name in `Call.values`: a setting's key, or the last spelling of a flag without leading hyphens."""
+        return self.names[-1].lstrip("-").replace("-", "_")
 
     @property
-    def flags(self) -> tuple[str, ...]:
-        """Spellings that begin with a hyphen."""
-        return tuple(name for name in self.names if name.startswith("-"))
-
-    @property
-    def settings(self) -> tuple[str, ...]:
-        """Spellings of the form ``key=value``."""
-        return tuple(name for name in self.names if not name.startswith("-"))
+    def is_flag(self) -> bool:
+        """True for a flag, False for a setting."""
+        return self.names[0].startswith("-")
 
     @property
     def spelled(self) -> str:
-        """Spellings with the name of the value, such as ``--source ROOT, source.root=ROOT``."""
-        flags = [f"{', '.join(self.flags)} {self.metavar}".rstrip()] if self.flags else []
-        return ", ".join([*flags, *(f"{key}={self.metavar}" for key in self.settings)])
+        """Spelling with the name of the value, such as ``--to FOLDER`` or ``source.root=ROOT``."""
+        return f"{', '.join(self.names)} {self.metavar}".rstrip() if self.is_flag else f"{self.key}={self.metavar}"
 
 
 STANDARD = (
     Argument(("-q", "--quiet"), "show only warnings and errors on stderr; results still go to stdout"),
     Argument(("-v", "--verbose"), "show details on stderr"),
-    Argument(("--log-file",), "append all messages to FILE, with the time of each", "FILE", completes="files"),
+    Argument(("--log-file",), "append all messages to FILE, with the time of each", "FILE"),
 )
 """Flags of every verb."""
 
@@ -76,35 +67,23 @@ def choice(names: tuple[str, ...], text: str, *choices: str, required: bool = Fa
     return Argument(names, text, f"{{{','.join(choices)}}}", required=required, choices=choices)
 
 
-def _hydra_value(names: tuple[str, ...], text: str) -> Argument:
-    return Argument(names, text, "VALUE", completes="files")
-
-
-INFORMATION = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
-COMPLETION_TEXT = "Hydra's completion of settings; see gen-dataset completion"
 HYDRA_FLAGS = (
     Argument(("-m", "--multirun"), "sweep over comma-separated values"),
     choice(("-c", "--cfg"), "print the settings and stop", "job", "hydra", "all"),
-    _hydra_value(("-cd", "--config-dir"), "add a folder of your own options"),
-    _hydra_value(("-cn", "--config-name"), "use another primary config"),
-    _hydra_value(("-cp", "--config-path"), "use another folder for the primary config"),
-    _hydra_value(("-p", "--package"), "with --cfg: print only this part of the settings"),
     Argument(("--resolve",), "with --cfg: resolve interpolations"),
-    choice(("-i", "--info"), "print information about Hydra and stop", *INFORMATION),
-    Argument(("-r", "--run"), "run once; the default"),
-    _hydra_value(("-sc", "--shell-completion"), COMPLETION_TEXT),
-    Argument(("--hydra-help",), "print Hydra's help and stop"),
+    Argument(("-cd", "--config-dir"), "add a folder of your own options", "FOLDER"),
+    Argument(("-cn", "--config-name"), "use another primary config", "NAME"),
+    Argument(("-cp", "--config-path"), "use another folder for the primary config", "FOLDER"),
 )
 """Flags of Hydra, for the verbs that take settings."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceArgument:
-    """The file or folder that a verb works on: its name in ``--help``, what it must be, what shells complete."""
+    """The file or folder that a verb works on: its name in ``--help``, and what it must be."""
 
     metavar: str
     expected: str
-    completes: str = "folders"
     optional: bool = False
 
 
@@ -113,8 +92,8 @@ class Verb:
     """A verb of the command line.
 
     ``run`` names a module of this package and its function, which takes a `Call` and returns the exit code:
-    ``checks.verify``. ``composes`` verbs take config overrides and Hydra's flags. ``words`` are accepted instead of a
-    place, and an ``extra`` word may follow the place. ``resumes``: a rerun continues interrupted work.
+    ``checks.verify``. ``composes`` verbs take config overrides and Hydra's flags. An ``extra``
+    word may follow the place. ``resumes``: a rerun continues interrupted work.
     """
 
     name: str
@@ -123,7 +102,6 @@ class Verb:
     arguments: tuple[Argument, ...] = ()
     place: PlaceArgument | None = None
     composes: bool = False
-    words: tuple[str, ...] = ()
     extra: Argument | None = None
     resumes: bool = False
 
@@ -134,8 +112,8 @@ class Verb:
 
     @property
     def settings(self) -> dict[str, Argument]:
-        """Arguments of the verb by their spellings of the form ``key=value``."""
-        return {name: argument for argument in self.arguments for name in argument.settings}
+        """Settings of the verb by key."""
+        return {argument.key: argument for argument in self.arguments if not argument.is_flag}
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,21 +128,12 @@ class Call:
     path: AnyPath | None = None
     overrides: list[str] = field(default_factory=list)
     hydra: Mapping[str, Any] = field(default_factory=dict)
-    words: list[str] = field(default_factory=list)
 
     @property
     def hydra_arguments(self) -> list[str]:
         """Hydra's flags and their values, as on a command line."""
         parts = ([flag] if value is True else [flag, value] for flag, value in self.hydra.items())
         return [word for part in parts for word in part]
-
-
-SOURCE = Argument(
-    ("--source", "source.root"),
-    "folder of the photographs; by default the one recorded in dataset.json",
-    "ROOT",
-    completes="folders",
-)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -179,11 +148,11 @@ def flag_parser(verb: Verb) -> argparse.ArgumentParser:
     """Return the parser of a verb's flags; it knows no words."""
     parser = _Parser(prog=f"gen-dataset {verb.name}", add_help=False, allow_abbrev=False)
     for argument in verb.accepted:
-        if argument.flags and argument.metavar:
+        if argument.is_flag and argument.metavar:
             choices = argument.choices or None
-            parser.add_argument(*argument.flags, dest=argument.key, metavar=argument.metavar, choices=choices)
-        elif argument.flags:
-            parser.add_argument(*argument.flags, dest=argument.key, action="store_true", default=None)
+            parser.add_argument(*argument.names, dest=argument.key, metavar=argument.metavar, choices=choices)
+        elif argument.is_flag:
+            parser.add_argument(*argument.names, dest=argument.key, action="store_true", default=None)
     return parser
 
 
@@ -195,11 +164,11 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
     cut = arguments.index("--") if "--" in arguments else len(arguments)
     parsed, rest = flag_parser(verb).parse_known_args(arguments[:cut])
     for word in rest:
-        if word.startswith("-") and word != "-" and not (verb.extra and word[1:].isdecimal()):
+        if word.startswith("-") and word != "-":
             raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}{_setting_hint(verb, word)}")
     flags = {argument.key: argument for argument in verb.accepted}
     values = {
-        key: _read(flags[key], f"{verb.name}: {flags[key].flags[-1]} ", text)
+        key: _read(flags[key], f"{verb.name}: {flags[key].names[-1]} ", text)
         for key, text in vars(parsed).items()
         if text is not None
     }
@@ -210,12 +179,12 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
     others = _take_settings(verb, words, values)
     for argument in verb.arguments:
         if argument.required and argument.key not in values:
-            problem = f"{argument.names[0]} is missing; give {argument.spelled}: {argument.help}"
+            problem = f"{argument.names[-1]} is missing; give {argument.spelled}: {argument.help}"
             raise ConfigError(f"{verb.name}: {problem}")
     if verb.composes:
-        hydra = {flag.flags[-1]: values.pop(flag.key) for flag in HYDRA_FLAGS if flag.key in values}
-        return Call(verb, values, _any_path(path), _with_source(others, values.get("source")), hydra)
-    return Call(verb, values, _any_path(path), words=others)
+        hydra = {flag.names[-1]: values.pop(flag.key) for flag in HYDRA_FLAGS if flag.key in values}
+        return Call(verb, values, _any_path(path), others, hydra)
+    return Call(verb, values, _any_path(path))
 
 
 def _any_path(path: str | None) -> AnyPath | None:
@@ -259,10 +228,9 @@ def _take_settings(verb: Verb, words: Iterable[str], values: dict[str, Any]) -> 
         key, equals, text = word.partition("=")
         if equals and (argument := verb.settings.get(key)):
             if argument.key in values:
-                twice = f"given twice, also as {argument.names[0]}"
-                raise ConfigError(f"{verb.name}: {word}: {twice}; expected one of them")
+                raise ConfigError(f"{verb.name}: {word}: {key} is given twice; expected one value")
             values[argument.key] = _read(argument, f"{verb.name}: {key}=", text)
-        elif verb.words or (verb.composes and (equals or word.startswith("~"))):
+        elif verb.composes and (equals or word.startswith("~")):
             others.append(word)
         elif verb.composes:
             raise ConfigError(f"{verb.name}: {word}: expected a setting key=value{path_hint(word)}")
@@ -272,15 +240,6 @@ def _take_settings(verb: Verb, words: Iterable[str], values: dict[str, Any]) -> 
                 hint += f"; to write to {word}, add --to {word}"
             raise ConfigError(f"{verb.name}: {word}: unknown argument; {hint}")
     return others
-
-
-def _with_source(overrides: list[str], root: str | None) -> list[str]:
-    """Return overrides in which ``--source ROOT`` is ``source.root=ROOT``."""
-    if root is None:
-        return overrides
-    if other := next((word for word in overrides if word.startswith("source.root=")), None):
-        raise ConfigError(f"--source {root}: the source is also given by {other}; expected one of them")
-    return [*overrides, f"source.root={root}"]
 
 
 # ------------------------------------------------------------------------------------------------------------- hints

@@ -66,11 +66,9 @@ def make_build(build: Build, folder: Path, n_jobs: int = -1) -> int:
     if not build.recipe.sweep:
         return compose(Call(VERBS["generate"], overrides=settings), _generate)
     folders = OptionFolders()
-    jobs = [
-        replace(job, named=tuple(f"{key}={value}" for key, value in job.swept.items()))
-        for job in expand(settings, folders, multirun=True).jobs
-    ]
-    return run_sweep(folders, jobs, _generate, sweep_csv=True)
+    _, jobs = expand(settings, folders, multirun=True)
+    short = [replace(job, named=tuple(f"{key}={value}" for key, value in job.swept.items())) for job in jobs]
+    return run_sweep(folders, short, _generate, sweep_csv=True)
 
 
 def _generate(config: Config, label: str) -> tuple[int, Summary, list[str]]:

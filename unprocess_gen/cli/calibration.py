@@ -19,8 +19,6 @@ def calibrate(call: Call) -> int:
     from unprocess_gen.calibration.calibrate import check_outputs
 
     assert call.path is not None
-    if call.words:
-        raise ConfigError(f"calibrate: {call.words[0]}: unexpected; expected one folder of captures")
     folder = local_path(call.path, f"calibrate: {call.path} is in an object store; expected a local folder")
     to, page = Path(call.values["to"]), call.values.get("report")
     if "from" in call.values and page is not None:

@@ -30,7 +30,8 @@ def verify(call: Call) -> int:
     """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
     folder = dataset_folder(call, sweeps=True)
     given_root(call)
-    _check_to(call)
+    if {"noise", "against"} <= call.values.keys():
+        raise ConfigError("verify: --noise and --against exclude each other; expected one of them")
     if not is_sweep(folder):
         return _finish(folder, verify_dataset(folder), call)
     if "against" in call.values:
@@ -43,23 +44,6 @@ def verify(call: Call) -> int:
             codes.append(report_error(error))
     print_result(f"{folder}: {codes.count(0)} of {len(codes)} datasets are intact")
     return worst(codes)
-
-
-def _check_to(call: Call) -> None:
-    """Refuse, before any work, a file of ``--to`` that no flag writes, or that cannot be written."""
-    if "against" in call.values:
-        from unprocess_gen.reports.against import check_list
-
-        if "noise" in call.values:
-            raise ConfigError("verify: --noise, --against: both write --to; expected one of them")
-        if "to" in call.values:
-            check_list(Path(call.values["to"]))
-    elif "to" in call.values:
-        if "noise" not in call.values:
-            raise ConfigError(f"verify: --to {call.values['to']}: is for --noise or --against; add one of them")
-        from unprocess_gen.reports.photon_transfer import check_figure_file
-
-        check_figure_file(Path(call.values["to"]))
 
 
 def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
@@ -81,7 +65,7 @@ def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
     if not texts and "noise" in call.values:
         texts = _check_noise(folder, call)
     if not texts and "against" in call.values:
-        texts = _compare_frames(folder, Path(call.values["against"]), call.values.get("to"))
+        texts = _compare_frames(folder, Path(call.values["against"]))
     if texts:
         return worst(codes) or DamageError.exit_code
     print_result(f"{folder} is intact{done}")
@@ -92,7 +76,7 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
     """Restore damaged files, report each step, and return the exit codes of the steps."""
     refusal = f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset"
     manifest, codes = folder / "manifest.csv", []
-    root, dark = source_root(manifest, call.values.get("source")), dark_frames_of(manifest, call)
+    root, dark = source_root(manifest, call.values.get("source.root")), dark_frames_of(manifest, call)
     for step in repair(local_path(folder, refusal), root, dark):
         if step.exit_code:
             report(step.text, logging.ERROR)
@@ -106,7 +90,7 @@ def _regenerated(folder: AnyPath, call: Call) -> list[ReplayResult]:
     """Regenerate rows that are spread evenly over the dataset, and compare them."""
     manifest = folder / "manifest.csv"
     rows = evenly_spaced_rows(manifest, call.values["regenerate"])
-    root = source_root(manifest, call.values.get("source"))
+    root = source_root(manifest, call.values.get("source.root"))
     return list(replay_rows(rows, root, dark_frames=dark_frames_of(manifest, call)))
 
 
@@ -119,11 +103,11 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     from unprocess_gen.reports import photon_transfer
     from unprocess_gen.sources.dark_frames import dark_folder
 
-    to, dark_frames = call.values.get("to"), dark_frames_of(folder / "manifest.csv", call)
+    dark_frames = dark_frames_of(folder / "manifest.csv", call)
     try:
         access = None if dark_frames is None else dark_folder(dark_frames)
     except ConfigError:  # without the recorded files, the pairs are counted as not checked
-        if "dark_frames" in call.values:
+        if "noise.dark_frames" in call.values:
             raise
         access = None
     summary = photon_transfer.examine_dataset(folder, access)
@@ -144,15 +128,12 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
         f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong"
         + (unchecked if checks.unchecked else "")
     )
-    if to is not None:
-        Path(to).write_bytes(photon_transfer.draw_fits(summary.first))
-        print_result(f"drawn in {to}")
     unlisted = checks.wrong_pairs - sum(bool(alarm.key) for alarm in checks.alarms)
     more = [f"noise of {counted(unlisted, 'other pair')}: wrong too"] if unlisted else []
     return _reported(folder, [*map(str, checks.alarms), *more])
 
 
-def _compare_frames(folder: AnyPath, frames: Path, to: str | None) -> list[str]:
+def _compare_frames(folder: AnyPath, frames: Path) -> list[str]:
     """Compare raw frames of a camera with the profile of a dataset; return what differs."""
     from unprocess_gen.reports import against
 
@@ -165,9 +146,6 @@ def _compare_frames(folder: AnyPath, frames: Path, to: str | None) -> list[str]:
         f"{frames}: {counted(len(compared), 'number')} compared with the profile {config.noise.name}, "
         f"{len(comparisons.differences)} wrong"
     )
-    if to is not None:
-        against.write_list(comparisons, Path(to))
-        print_result(f"listed in {to}")
     return _reported(folder, map(str, comparisons.differences))
 
 
@@ -181,13 +159,11 @@ def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
 
 def replay(call: Call) -> int:
     """Regenerate rows of a manifest, and compare or write their arrays."""
-    if {"rows", "keys"} <= call.values.keys():
-        raise ConfigError("replay: --rows and --keys exclude each other; expected one of them")
     manifest = dataset_folder(call, files=True)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     to = Path(call.values["to"]) if "to" in call.values else None
     failed: list[Row] = []
-    rows = _ok_rows(select_rows(manifest, call.values.get("rows"), call.values.get("keys"), failed), failed)
+    rows = _ok_rows(select_rows(manifest, call.values.get("keys"), failed), failed)
     codes, written, unknown = [], False, 0
     for result in replay_rows(rows, source_root(manifest, given_root(call)), to, dark_frames_of(manifest, call)):
         codes.append(result.exit_code)

@@ -30,7 +30,7 @@ EXIT_CODES = (
         (ConfigError.exit_code,),
         "usage or settings",
         "An argument or a setting is wrong. One line on stderr names it, its value and what is expected; nothing was "
-        "written. A sweep prints a line for each refused job.",
+        "written.",
     ),
     ExitCode(
         (TOO_MANY_FAILED,),

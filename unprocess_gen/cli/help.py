@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
+import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Verb
@@ -30,30 +30,17 @@ Verbs:
 
 SETTINGS_HELP = """
 Settings are key=value, in any order. group=option selects an option, group.key=value changes one
-value. gen-dataset --help GROUP explains the options and keys of a group. Each group is listed with
-its options and, in parentheses, its keys:
+value. gen-dataset --help GROUP explains the options and keys of a group:
 """
 
-SHOWN_HYDRA_FLAGS = ("multirun", "cfg", "config_dir", "hydra_help")
+SHOWN_HYDRA_FLAGS = ("multirun", "cfg", "config_dir")
 """Flags of Hydra that the help of the program names; the help of a verb names all."""
-
-ENDING = """
-Tab completion: eval "$(gen-dataset completion bash)", or zsh.
-
-"""
-
-KEYS_FILE = "keys.json"
-"""File of ``conf/`` with the keys of each group, and the top-level keys, written by ``docs/update_reference.py``.
-
-``config.schema`` imports NumPy, which is too slow for --help.
-"""
 
 
 def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
     """Return the help of ``gen-dataset``."""
     lines = [f"  gen-dataset {verb.name:<11} {verb.summary}" for verb in verbs.values()]
-    described = json.loads((conf / KEYS_FILE).read_text(encoding="utf-8"))
-    groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(described["groups"], conf)]
+    groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(conf)]
     keys = key_help("", conf)
     blocks = [INTRODUCTION + "\n".join(lines), SETTINGS_HELP + "\n".join(groups), "\nKeys at the top level:", *keys]
     shown = [*(flag for flag in HYDRA_FLAGS if flag.key in SHOWN_HYDRA_FLAGS), *STANDARD]
@@ -64,22 +51,24 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
         ("--", "everything after it is a file or folder, even with a leading hyphen"),
     ]
     blocks += ["\nFlags:", *(_two_columns(*flag) for flag in flags)]
-    return "\n".join(blocks) + "\n" + ENDING + exit_code_lines()
+    return "\n".join(blocks) + "\n\n" + exit_code_lines()
 
 
 def key_help(name: str, conf: Path) -> list[str]:
-    """Return the help of the key at the top level with this name, or of all without a name."""
-    keys = json.loads((conf / KEYS_FILE).read_text(encoding="utf-8"))["top"]
-    named = {key: text for key, text in keys.items() if name in ("", key.partition("=")[0])}
-    return [_hanging(f"  {key:<{INDENT + 6}}", text) for key, text in named.items()]
+    """Return the help of the key at the top level with this name, or of all without a name.
+
+    The comments of ``config.yaml`` explain them; `config.schema` imports NumPy, which is too slow for ``--help``.
+    """
+    lines = re.findall(r"^(\w+): (\S+) +# (.*)", (conf / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
+    return [_hanging(f"  {f'{key}={value}':<{INDENT + 6}}", text) for key, value, text in lines if name in ("", key)]
 
 
-def group_lines(keys: Mapping[str, Sequence[str]], conf: Path) -> list[tuple[str, str]]:
-    """Return each group with its options and, in parentheses, its keys, in the order of the config."""
+def group_lines(conf: Path) -> list[tuple[str, str]]:
+    """Return each group with its options, in the order of the defaults list; without any, with what its keys are."""
     lines = []
-    for group, names in keys.items():
+    for group in re.findall(r"^  - (\w+): ", (conf / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE):
         options = [name for name in group_options(group, conf) if name != "default"]
-        lines.append((group, " ".join([*options, f"({', '.join(names)})"])))
+        lines.append((group, " ".join(options) or option_summary(group, "default", conf)))
     for group, added in ADDED_GROUPS.items():
         options = group_options(group, conf)
         if options:
@@ -153,7 +142,6 @@ def synopsis(verb: Verb) -> str:
     """Return the command line of a verb with its required arguments."""
     words = [f"[{verb.place.metavar}]" if verb.place.optional else verb.place.metavar] if verb.place else []
     words += [f"[{verb.extra.metavar}]"] if verb.extra else []
-    words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
     words += [argument.spelled for argument in verb.arguments if argument.required]
     words += ["[key=value ...]"] if verb.composes else []
     return " ".join(["gen-dataset", verb.name, *words, "[flags]"])

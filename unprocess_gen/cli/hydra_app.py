@@ -1,35 +1,35 @@
 """Compose the config of a command line, or the configs of a sweep, and run a task on each.
 
-Configs are composed by `config.composition`. Hydra itself runs only to print (``--cfg``, ``--info``, completion) and to
-run a sweep with a launcher or sweeper plugin of the user.
-
 Design: ``docs/design/composition_and_sweeps.md``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.jobs import JobResult, Task, run_hydra, run_job
-from unprocess_gen.cli.messages import print_result, print_results
-from unprocess_gen.cli.sweep import worst, write_table
+from unprocess_gen.cli.messages import print_result, print_results, report_error
+from unprocess_gen.cli.signals import SIGNALS
+from unprocess_gen.cli.sweep import job_folder, job_row, named_overrides, sweep_out, worst, write_row
 from unprocess_gen.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
     from unprocess_gen.config.composition import OptionFolders
+    from unprocess_gen.config.schema import Config
     from unprocess_gen.config.sweep_expansion import SweepJob
 
-PRINTING = {"--hydra-help", "--shell-completion", "--info"}
-"""Flags with which Hydra prints something that is independent of the config."""
+Task = Callable[["Config", str], tuple[int, Any, list[str]]]
+"""Run on a config and a label, such as ``3/20 camera=sony_a7r`` (empty outside sweeps).
 
-HYDRA_SETTINGS = (
-    *("hydra.searchpath", "hydra.mode", "hydra.sweeper", "hydra.launcher"),
-    *("hydra/sweeper", "hydra/launcher"),
-)
+Returns exit code, result and the texts to print. The result of a task that generates a dataset is its `Summary`. The
+caller prints, because a stdout that cannot be written is no failure of the job.
+"""
+
+HYDRA_SETTINGS = ("hydra.mode", "hydra.sweeper.params")
 """Settings of Hydra that an override may set."""
 
 
@@ -38,32 +38,26 @@ def compose(
 ) -> int:
     """Run a task on the config of a command line, or on each config of a sweep; return the worst exit code.
 
-    A job of a sweep that fails does not stop the others. With ``sweep_csv``, a sweep writes ``sweep.csv`` in ``out``.
-    ``totals`` returns the text to print after a sweep, from the results of its jobs.
+    With ``sweep_csv``, a sweep writes ``sweep.csv`` in ``out``. ``totals`` returns the text to print after a sweep,
+    from the results of its jobs.
     """
     check_overrides(call.overrides)
-    if PRINTING & call.hydra.keys():
-        return run_hydra(call, call.overrides)
-    prints_config = "--cfg" in call.hydra
-    if "--resolve" in call.hydra and not prints_config:
+    if "--resolve" in call.hydra and "--cfg" not in call.hydra:
         raise ConfigError("--resolve: --cfg is missing; expected both; add --cfg job")
-    from unprocess_gen.config.composition import validated_config
+    from unprocess_gen.config.composition import compose_node, validated_config
     from unprocess_gen.config.sweep_expansion import expand
 
     folders = option_folders(call.hydra)
-    expansion = expand(call.overrides, folders, "--multirun" in call.hydra, sweep_csv and not prints_config)
-    if prints_config:
-        jobs = [call.overrides] if expansion.node is not None else [job.overrides for job in expansion.jobs]
-        return worst(run_hydra(call, overrides) for overrides in jobs)
-    if expansion.node is not None:
-        code, _, texts = task(validated_config(expansion.node, call.overrides), "")
-        print_results(texts)
-        return code
-    if expansion.plugins:
-        from unprocess_gen.cli.sweep_plugins import run_with_plugins
-
-        return run_with_plugins(call, expansion, task)
-    return run_sweep(folders, expansion.jobs, task, sweep_csv, totals)
+    node, jobs = expand(call.overrides, folders, "--multirun" in call.hydra)
+    if "--cfg" in call.hydra:
+        for each in [node] if node is not None else (compose_node(job.overrides, folders) for job in jobs):
+            print_results([_config_text(each, call)])
+        return 0
+    if node is None:
+        return run_sweep(folders, jobs, task, sweep_csv, totals)
+    code, _, texts = task(validated_config(node, call.overrides), "")
+    print_results(texts)
+    return code
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
@@ -73,7 +67,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
     for override in overrides:
         check_override(override)
         key = override.lstrip("+").partition("=")[0]
-        if key.startswith("hydra") and not any(key == known or key.startswith(f"{known}.") for known in HYDRA_SETTINGS):
+        if key.startswith("hydra") and not key.startswith(HYDRA_SETTINGS):
             raise ConfigError(
                 f"{override}: Hydra's own settings are fixed; expected one of {', '.join(HYDRA_SETTINGS)}"
             )
@@ -88,6 +82,20 @@ def option_folders(hydra: Mapping[str, Any]) -> OptionFolders:
     return OptionFolders(main, None if name is None else name.removesuffix(".yaml"), own)
 
 
+def _config_text(node: DictConfig, call: Call) -> str:
+    """Return the YAML text that ``--cfg`` prints: the settings, those of Hydra, or both."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from unprocess_gen.config.composition_errors import explain
+
+    shown = {"job": set(node) - {"hydra"}, "hydra": {"hydra"}, "all": set(node)}[call.hydra["--cfg"]]
+    try:
+        return OmegaConf.to_yaml(OmegaConf.masked_copy(node, list(shown)), resolve="--resolve" in call.hydra).rstrip()
+    except OmegaConfBaseException as error:
+        raise ConfigError(explain(error, call.overrides)) from error
+
+
 # ------------------------------------------------------------------------------------------------------------ sweeps
 
 
@@ -100,19 +108,48 @@ def run_sweep(
 ) -> int:
     """Run every job of a sweep, one after the other, and return the worst exit code.
 
-    A job's row is written before its results are printed, so that an error of stdout ends the sweep without losing it.
+    All jobs are composed first: a refused config refuses the sweep. A job that fails while it runs does not stop the
+    others. Its row is written before its results are printed, so that an error of stdout loses no row.
     """
-    from unprocess_gen.config.sweep_expansion import composed_job
+    from unprocess_gen.config.schema import replaced
 
-    done: list[JobResult] = []
-    for number, job in enumerate(jobs, start=1):
-        done.append(run_job(job, task, f"{number}/{len(jobs)}", partial(composed_job, job, folders)))
-        # a refused job has no out; its row goes where the others are
-        sweep_folder = next((result.out for result in reversed(done) if result.out is not None), None)
-        if sweep_csv and sweep_folder is not None:
-            write_table(sweep_folder, [result.row for result in done])
-        print_results(done[-1].texts)
-    results = [job.result for job in done if job.result is not None]
+    named = [named_overrides(job.named) for job in jobs]
+    names = [job_folder(overrides, job.swept) for overrides, job in zip(named, jobs, strict=True)]
+    configs = [_composed(job, folders, name) for job, name in zip(jobs, names, strict=True)]
+    codes, results = [], []
+    for number, (job, name, config) in enumerate(zip(jobs, names, configs, strict=True), start=1):
+        out = sweep_out(config.out)
+        done = replaced(config, {"out": str(out / name)})
+        code, result, texts = _run(task, done, name, f"{number}/{len(jobs)} {name}")
+        codes.append(code)
+        if result is not None:
+            results.append(result)
+        if sweep_csv:
+            write_row(out, job_row(name, ",".join(named[number - 1]), job.swept, code, result))
+        print_results(texts)
     if totals is not None and results:
         print_result(totals(results))
-    return worst(job.row.exit for job in done)
+    return worst(codes)
+
+
+def _composed(job: SweepJob, folders: OptionFolders, name: str) -> Config:
+    """Return the config of a job; ConfigError with the name of its folder."""
+    from unprocess_gen.config.composition import validated_config
+    from unprocess_gen.config.sweep_expansion import composed_job
+
+    try:
+        config = validated_config(composed_job(job, folders), job.overrides)
+        sweep_out(config.out)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from error
+    return config
+
+
+def _run(task: Task, config: Config, name: str, label: str) -> tuple[int, Any, list[str]]:
+    """Run a task as a job of a sweep: an error becomes its exit code, unless a signal arrived."""
+    try:
+        return task(config, label)
+    except Exception as error:
+        if SIGNALS.received is not None:  # libraries may fail in their own way when they are interrupted
+            raise
+        return report_error(error, f"{name}: "), None, []

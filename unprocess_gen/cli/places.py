@@ -38,7 +38,7 @@ def given_root(call: Call) -> str | None:
     """Return the root that the user gives; ConfigError if it is no folder or photograph, None if none is given."""
     from unprocess_gen.sources.listing import check_root
 
-    root: str | None = call.values.get("source")
+    root: str | None = call.values.get("source.root")
     if root is not None:
         check_root(root)
     return root
@@ -48,4 +48,4 @@ def dark_frames_of(manifest: AnyPath, call: Call) -> str | None:
     """Folder of the dark frames of a dataset, by the call or by ``dataset.json``; None without one."""
     from unprocess_gen.pipeline.replay import dark_frames_root
 
-    return dark_frames_root(manifest, call.values.get("dark_frames"))
+    return dark_frames_root(manifest, call.values.get("noise.dark_frames"))

@@ -106,7 +106,7 @@ def report(call: Call) -> int:
         return _report_sweep(folder, to, call)
     root = given_root(call)
     dark = dark_frames_of(folder / "manifest.csv", call)
-    if "dark_frames" in call.values and dark is not None:
+    if "noise.dark_frames" in call.values and dark is not None:
         dark_folder(dark)  # refuses a folder that the user names and that does not exist
     print_result(write_dataset_report(folder, to, None if root is None else any_path(root), dark))
     return 0
@@ -115,8 +115,8 @@ def report(call: Call) -> int:
 def _report_sweep(folder: Path, to: Path | None, call: Call) -> int:
     from unprocess_gen.reports.sweep_page import write_sweep_page
 
-    if others := sorted(call.values.keys() & {"source", "dark_frames"}):
-        raise ConfigError(f"report: {folder}: is a sweep; --{others[0]} is for one of its datasets; leave it out")
+    if others := sorted(call.values.keys() & {"source.root", "noise.dark_frames"}):
+        raise ConfigError(f"report: {folder}: is a sweep; {others[0]} is for one of its datasets; leave it out")
     jobs = read_table(folder / "sweep.csv")
     print_result(write_sweep_page(folder, jobs, swept_keys(jobs), to))
     return 0

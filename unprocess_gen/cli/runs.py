@@ -53,8 +53,8 @@ def again(call: Call) -> int:
     folder = dataset_folder(call)
     changes = {"out": call.values["out"], "executor": _executor(call)}
     changes |= {"n_jobs": call.values["n_jobs"]} if "n_jobs" in call.values else {}
-    changes |= {"output.frames": call.values["frames"] == "true"} if "frames" in call.values else {}
-    changes |= {"source.max_failed": call.values["max_failed"]} if "max_failed" in call.values else {}
+    changes |= {"output.frames": call.values["output.frames"] == "true"} if "output.frames" in call.values else {}
+    changes |= {"source.max_failed": call.values["source.max_failed"]} if "source.max_failed" in call.values else {}
     changes |= {"noise.dark_frames": dark_frames_of(folder / "manifest.csv", call)}
     config = recorded_config(folder, given_root(call), changes)
     check_sources(folder, config)
@@ -74,4 +74,4 @@ def _executor(call: Call) -> ExecutorConfig:
     name = call.values.get("executor", "local")
     one_of("executor", name, tuple(group_options("executor")))
     executor: ExecutorConfig = read_option("executor", name)
-    return replace(executor, address=call.values.get("address"))
+    return replace(executor, address=call.values.get("executor.address"))

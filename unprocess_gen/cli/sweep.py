@@ -7,7 +7,6 @@ import hashlib
 import io
 import os
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,37 +49,26 @@ def sweep_out(out: str) -> Path:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class JobRow:
-    """The row of one job in ``sweep.csv``: the dataset's folder, the exit code, and the text of each column.
+def job_row(folder: str, overrides: str, swept: Mapping[str, str], code: int, summary: Summary | Any) -> dict[str, str]:
+    """Return the row of a job in ``sweep.csv``; ``summary`` is None if it has no dataset.
 
-    ``generated`` is False for a job that found its dataset complete.
+    ``seconds`` is left out if the job found its dataset complete.
     """
-
-    folder: str
-    exit: int
-    cells: Mapping[str, str] = field(default_factory=dict)
-    generated: bool = True
-
-    @classmethod
-    def from_summary(
-        cls, folder: str, overrides: str, swept: Mapping[str, str], code: int, summary: Summary | Any
-    ) -> JobRow:
-        """Return the row of a job; ``summary`` is None if it has no dataset."""
-        cells = {"folder": folder, "overrides": overrides, **swept, "exit": str(code)}
-        sites = getattr(summary, "sites", None)
-        if sites is None:
-            return cls(folder, code, cells)
-        cells |= {
-            "rows": str(summary.rows),
-            "failed": str(sum(summary.failed.values())),
-            "filtered": str(summary.filtered),
-            "seconds": f"{summary.seconds:.3f}",
-            "bytes": str(summary.bytes),
-        }
-        if sites["all"]:
-            cells |= {f"{name}_share": repr(sites[name] / sites["all"]) for name in SHARES}
-        return cls(folder, code, cells, generated=bool(summary.made))
+    row = {"folder": folder, "overrides": overrides, **swept, "exit": str(code)}
+    sites = getattr(summary, "sites", None)
+    if sites is None:
+        return row | {"seconds": ""}
+    row |= {
+        "rows": str(summary.rows),
+        "failed": str(sum(summary.failed.values())),
+        "filtered": str(summary.filtered),
+        "bytes": str(summary.bytes),
+    }
+    if summary.made:
+        row["seconds"] = f"{summary.seconds:.3f}"
+    if sites["all"]:
+        row |= {f"{name}_share": repr(sites[name] / sites["all"]) for name in SHARES}
+    return row
 
 
 def named_overrides(overrides: Iterable[str]) -> list[str]:
@@ -119,41 +107,33 @@ def worst(exit_codes: Iterable[int]) -> int:
     return max(exit_codes, key=SEVERITY.index, default=0)
 
 
-def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
-    """Write ``sweep.csv`` in the sweep's folder, if the folder exists and is not inside a dataset.
+def write_row(out: Path, row: Mapping[str, str]) -> None:
+    """Write the row of a job to ``sweep.csv`` in the sweep's folder, unless the folder is missing or in a dataset.
 
-    Earlier rows keep their places, so that the indices of `RawPairs` do not change; new rows follow them.
+    A row of the same folder is replaced and keeps its place, so that the indices of `RawPairs` do not change. A job
+    that found its dataset complete has no time; the earlier one remains.
     """
-    if not out.is_dir() or enclosing_dataset(out) is not None:  # every job was refused
+    if not out.is_dir() or enclosing_dataset(out) is not None:  # the job was refused
         return
+    path = out / "sweep.csv"
     with machine_errors(out, RESUME):
         lock = LockFile(out / "sweep.csv.lock")
         lock.acquire(wait=True)  # several processes may sweep into one folder
         try:
-            _update_table(out / "sweep.csv", jobs)
+            rows = {other["folder"]: other for other in read_table(path)}
+            rows[row["folder"]] = {"seconds": rows.get(row["folder"], {}).get("seconds", ""), **row}
+            table = io.StringIO()
+            columns = [*FIRST_COLUMNS, *swept_keys(rows.values()), *LAST_COLUMNS]
+            writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows.values())
+            LocalPath(path).write(table.getvalue().encode(), str(out))
         finally:
             lock.release()
 
 
-def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:
-    """Read the rows of the file, add the rows of jobs, and replace the file."""
-    rows = {row["folder"]: row for row in read_table(path)}
-    for job in jobs:
-        row = dict(job.cells)
-        seconds = rows.get(job.folder, {}).get("seconds")
-        if not job.generated and seconds:
-            row["seconds"] = seconds
-        rows[job.folder] = row
-    keys = swept_keys(rows.values())
-    table = io.StringIO()
-    writer = csv.DictWriter(table, [*FIRST_COLUMNS, *keys, *LAST_COLUMNS], restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows.values())
-    LocalPath(path).write(table.getvalue().encode(), str(path.parent))
-
-
 def read_table(path: Path) -> list[dict[str, str]]:
-    """Read the rows of ``sweep.csv``, of which version 0.1 has fewer columns; none if the file does not exist."""
+    """Read the rows of ``sweep.csv``; none if the file does not exist."""
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(stream, restval=""))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from unprocess_gen.cli.arguments import SOURCE, Argument, PlaceArgument, Verb, choice
+from unprocess_gen.cli.arguments import Argument, PlaceArgument, Verb, choice
 
 
 def _integer(name: str, text: str, low: int | None = None, metavar: str = "N", *, required: bool = False) -> Argument:
@@ -27,21 +27,18 @@ def _local_path(text: str) -> str:
 
 
 def _file(flag: str, text: str, metavar: str = "FILE", *, required: bool = False) -> Argument:
-    return Argument((flag,), text, metavar, _local_path, "a local file", "files", required)
+    return Argument((flag,), text, metavar, _local_path, "a local file", required)
 
 
 def _folder(flag: str, text: str, metavar: str = "FOLDER", *, required: bool = False) -> Argument:
-    return Argument((flag,), text, metavar, _local_path, "a local folder", "folders", required)
+    return Argument((flag,), text, metavar, _local_path, "a local folder", required)
 
 
 def _composing(name: str, summary: str, run: str, *arguments: Argument, resumes: bool = False) -> Verb:
     """Return a verb that takes the settings of a run."""
-    return Verb(name, summary, run, (*arguments, SETTINGS_SOURCE), composes=True, resumes=resumes)
+    return Verb(name, summary, run, arguments, composes=True, resumes=resumes)
 
 
-SETTINGS_SOURCE = Argument(
-    ("--source",), "folder of the photographs, or one photograph: source.root=ROOT", "ROOT", completes="files"
-)
 PARTS = _integer("parts", "number of parts", 1, required=True)
 PREPARED = PlaceArgument("OUT", "the folder of a prepared run")
 PART = _integer("part", "number of the part, from 0", 0, "K")
@@ -50,14 +47,14 @@ KEYS = Argument(
     ("--keys",), "rows by source index, range or key, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
 )
 REGENERATE = _integer("--regenerate", "regenerate N pairs and compare them", 0)
-OUT = Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True)
+OUT = Argument(("out",), "folder of the new dataset", "FOLDER", required=True)
+SOURCE = Argument(("source.root",), "folder of the photographs; by default the one recorded in dataset.json", "ROOT")
 INPUTS = (
     SOURCE,
     Argument(
-        ("--dark-frames", "noise.dark_frames"),
+        ("noise.dark_frames",),
         "folder of the dark frames, if it is not the recorded one",
         "FOLDER",
-        completes="folders",
     ),
 )
 """Where the files are that pairs are regenerated from."""
@@ -112,7 +109,6 @@ _VERBS = (
         (
             *INPUTS,
             REGENERATE,
-            _file("--to", "with --noise: draw the fits in FILE (PNG); with --against: list all numbers in FILE (CSV)"),
             Argument(("--repair",), "restore damaged files to the same bytes"),
             Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
             _folder("--against", "compare raw darks and flats of a camera with the noise profile", "FRAMES"),
@@ -125,11 +121,10 @@ _VERBS = (
         "checks.replay",
         (
             *INPUTS,
-            Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
             KEYS,
             _folder("--to", "write the arrays to FOLDER"),
         ),
-        PlaceArgument("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
+        PlaceArgument("MANIFEST", "a manifest.csv, or the folder of a dataset"),
     ),
     Verb(
         "report",
@@ -149,9 +144,8 @@ _VERBS = (
             KEYS,
             _integer("--port", "number of the port on 127.0.0.1; default: a free one", 0),
             Argument(("--no-browser",), "print the address, and open no browser"),
-            SETTINGS_SOURCE,
         ),
-        PlaceArgument("PHOTO", "a photograph, a folder of photographs, or a dataset", "files", optional=True),
+        PlaceArgument("PHOTO", "a photograph, a folder of photographs, or a dataset", optional=True),
         composes=True,
     ),
     Verb(
@@ -247,13 +241,7 @@ _VERBS = (
             _file("--to", "write the matrix of the camera to CAMERA.yaml", "CAMERA", required=True),
             _file("--sensor", "write pattern, bits and levels to SENSOR.yaml", "SENSOR"),
         ),
-        PlaceArgument("FILE", "the raw file: a DNG, or another one that LibRaw reads", "files"),
-    ),
-    Verb(
-        "completion",
-        'print a completion script: eval "$(gen-dataset completion bash)"',
-        "completion.completion",
-        words=("bash", "zsh"),
+        PlaceArgument("FILE", "the raw file: a DNG, or another one that LibRaw reads"),
     ),
 )
 

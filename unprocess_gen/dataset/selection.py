@@ -1,8 +1,7 @@
-"""Select manifest rows by position, source index or key: the options ``--rows`` and ``--keys`` of every verb."""
+"""Select manifest rows by source index or key: the option ``--keys`` of every verb."""
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -98,19 +97,15 @@ def parse_keys(text: str) -> KeySelection:
     return KeySelection(names, ranges)
 
 
-def select_rows(
-    manifest: AnyPath, rows: str | None = None, keys: str | None = None, skipped: list[Row] | None = None
-) -> Iterator[Row]:
+def select_rows(manifest: AnyPath, keys: str | None = None, skipped: list[Row] | None = None) -> Iterator[Row]:
     """Select rows of a manifest.
 
     Parameters
     ----------
     manifest : Path or ObjectPath
         A ``manifest.csv``.
-    rows : str, optional
-        ``A:B``: positions from 0, B not included. Ignored if ``keys`` is given.
     keys : str, optional
-        See `parse_keys`. Neither: all rows.
+        See `parse_keys`. None: all rows.
     skipped : list, optional
         Failed rows that a range of ``keys`` contains are skipped and appended here. A failed row that is named by its
         own index or key is selected.
@@ -123,20 +118,12 @@ def select_rows(
     Raises
     ------
     ConfigError
-        If ``rows`` or ``keys`` cannot be read, ``rows`` selects no row, or the manifest has no row for an index, a key
-        or a complete range.
+        If ``keys`` cannot be read, or the manifest has no row for an index, a key or a complete range.
     DamageError
         If the manifest cannot be read.
     """
     if keys is None:
-        first, last = _positions(rows)
-        empty = rows is not None
-        for row in itertools.islice(read_rows(manifest), first, last):
-            empty = False
-            yield row
-        if empty:
-            count = sum(1 for _ in read_rows(manifest))
-            raise ConfigError(f"--rows {rows}: selects no row; expected A:B with A below B and below {count}")
+        yield from read_rows(manifest)
         return
     selection = parse_keys(keys)
     matches: set[str] = set()
@@ -178,16 +165,9 @@ def select_pairs(manifest: AnyPath, keys: str) -> SelectedPairs:
         If the manifest cannot be read.
     """
     skipped: list[Row] = []
-    rows = {str(row["key"]): row for row in select_rows(manifest, None, keys, skipped)}
+    rows = {str(row["key"]): row for row in select_rows(manifest, keys, skipped)}
     for row in rows.values():
         if row["status"] != "ok":
             raise ConfigError(f"--keys {row['key']}: {row['status']} ({row['reason']}), so it has no frames")
     pairs = (str(row["key"]) for row in read_rows(manifest) if row["status"] == "ok")
     return SelectedPairs({number: rows[key] for number, key in enumerate(pairs) if key in rows}, len(skipped))
-
-
-def _positions(rows: str | None) -> tuple[int, int | None]:
-    span = re.fullmatch(r"(\d{0,12}):(\d{0,12})", rows if rows is not None else ":")
-    if span is None:
-        raise ConfigError(f"--rows {rows}: expected A:B, such as 0:10")
-    return int(span[1] or 0), int(span[2]) if span[2] else None

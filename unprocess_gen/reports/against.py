@@ -6,9 +6,7 @@ the measurement, would be as far away with the probability of an alarm of ``veri
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,8 +29,6 @@ from unprocess_gen.config.interpretation import is_physical, noise_distributions
 from unprocess_gen.config.noise_validation import check_noise
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import machine_errors
-from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.planning.draws import DRAW_COUNT
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.plan import TwoNumberLevel
@@ -87,16 +83,6 @@ class Comparison(NamedTuple):
     def percent(self) -> float:
         """Difference relative to the number of the profile; NaN without one."""
         return 100 * self.score.total / self.profile if self.profile else math.nan
-
-    @property
-    def cells(self) -> list[str]:
-        """Cells of the line in the list."""
-        name, iso, site, number = self.measured
-        number = number or Estimate(math.nan, math.nan, math.nan)
-        values = [number.value, number.low, number.high, math.nan if self.profile is None else self.profile]
-        values += [math.nan] * 2 if self.verdict == NOT_COMPARED else [self.percent, self.score.errors]
-        numbers = [f"{value:.7g}" if math.isfinite(value) else "" for value in values]
-        return [name, "" if iso is None else f"{iso:g}", site or "", self.measured.unit, *numbers, self.verdict]
 
 
 class Comparisons(NamedTuple):
@@ -213,17 +199,3 @@ class Profile:
             colours = "GGGG" if self.config.sensor.pattern == "MONO" else self.config.sensor.pattern
             return [value, *(value * physics.gain_by_colour["RGB".index(colour)] for colour in colours)]
         return [value] * 5
-
-
-def check_list(to: Path) -> None:
-    """Refuse, before any work, a file to which the list of comparisons cannot be written."""
-    check_output_file(to, f"--to {to}", "an earlier list of --against", ",".join(FIELDS).encode())
-
-
-def write_list(comparisons: Comparisons, to: Path) -> None:
-    """Write all comparisons as CSV."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerows([FIELDS, *(comparison.cells for comparison in comparisons.numbers)])
-    with machine_errors(to):
-        to.write_text(file.getvalue(), encoding="utf-8")

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Float
 from unprocess_gen.dataset.reader import RawPairs, Sample
@@ -21,7 +18,6 @@ from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.noise_check.checks import Checker, overlaps, pair_sums
 from unprocess_gen.reports.noise_check.scores import joined_points, row_offsets, variance_points
 from unprocess_gen.reports.noise_check.sums import Plane, Sums
-from unprocess_gen.reports.report_files import require_libraries
 from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 FITS_DRAWN = 8
@@ -145,14 +141,6 @@ def _row_variances(sums: Sums, planes: list[Plane], influence: Float) -> Float:
     return np.asarray(
         2 * offsets.variance**2 * offsets.squares * squares + offsets.variance * offsets.magnitudes * linear
     )
-
-
-def check_figure_file(to: Path) -> None:
-    """Refuse a file for the figure, before the pairs are fitted, if it is no PNG or cannot be written."""
-    if to.suffix.lower() != ".png":
-        raise ConfigError(f"--to {to}: is not a PNG file; expected a name that ends with .png")
-    check_output_file(to, f"--to {to}", "an earlier figure", b"matplotlib")
-    require_libraries(f"--to {to}", ("matplotlib",))
 
 
 def draw_fits(fits: list[NoiseFit]) -> bytes:

@@ -74,7 +74,7 @@ def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Ex
 
 
 def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices:
-    rows = [row for row in select_rows(folder / "manifest.csv", None, keys) if keys or row["status"] == "ok"]
+    rows = [row for row in select_rows(folder / "manifest.csv", keys) if keys or row["status"] == "ok"]
     for row in rows:
         if row["status"] != "ok":
             raise ConfigError(f"--keys {keys}: {row['key']} has no pair ({row['reason']}); expected a row with a pair")

@@ -44,7 +44,7 @@ class SheetPair(NamedTuple):
 def selected_pairs(folder: AnyPath, keys: Sequence[str], source: AnyPath | None) -> Iterator[SheetPair]:
     """Yield pairs in the order of the manifest; a photograph shared by adjacent pairs is decoded once."""
     if source is not None and not source.is_dir():
-        raise ConfigError(f"--source {source}: is not a folder; expected the folder of the photographs")
+        raise ConfigError(f"source.root={source}: is not a folder; expected the folder of the photographs")
     pairs, manifest = RawPairs(folder), folder / "manifest.csv"
     if not len(pairs):
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
@@ -60,7 +60,7 @@ def selected_pairs(folder: AnyPath, keys: Sequence[str], source: AnyPath | None)
 def _load_part(row: Row, root: str | None, load: Load) -> tuple[Srgb | None, str]:
     """Load the part of the source that a row's frames show; None and the reason if it is not available."""
     if root is None and row["source_bytes"] != 0:
-        return None, "the dataset does not record where its photographs are; give --source ROOT"
+        return None, "the dataset does not record where its photographs are; give source.root=ROOT"
     source = source_of(row)
     config = recorded_source(root, source, plan_from_row(row).source)
     try:
