@@ -122,7 +122,7 @@ def other_yardstick(path: str) -> Callable[[Srgb], object]:
 
 @functools.cache
 def config_of(settings: str) -> Config:
-    config = composed(*settings.split(), "effects.assumed=off")  # the goals are those of effects with published numbers
+    config = composed(*settings.split())
     validate_config(config)
     return config
 

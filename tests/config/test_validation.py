@@ -323,25 +323,6 @@ def test_config_yaml_contains_every_other_key(settings: Settings) -> None:
             assert field.name in loaded or field.name in NOT_DATA[""] or ("", field.name) in later
 
 
-def test_recorded_config_without_a_later_key_does_what_0_1_did(settings: Settings) -> None:
-    text = dataset_yaml(settings("noise=nikon_d850"))
-    assert yaml.safe_load(text)["effects"]["assumed"] == "use"
-    recorded = text.replace("  assumed: use\n", "")
-    config, _ = parse_dataset_yaml(recorded)
-    assert config.effects.assumed == "off"
-    assert dataset_yaml(config) == recorded
-
-
-def test_config_yaml_omits_a_later_key_at_the_value_of_0_1(settings: Settings) -> None:
-    text = dataset_yaml(settings("noise=nikon_d850", "effects.assumed=off"))
-    assert "assumed" not in yaml.safe_load(text)["effects"]
-
-
-@pytest.mark.parametrize("profile", [("noise=imx385_iso3200",), ("noise=nikon_d850", "noise.assumed=[]")])
-def test_config_yaml_omits_the_use_of_assumed_numbers_without_any(settings: Settings, profile: tuple[str, ...]) -> None:
-    assert dataset_yaml(settings(*profile)) == dataset_yaml(settings(*profile, "effects.assumed=off"))
-
-
 @pytest.mark.parametrize(
     ("overrides", "decided"),
     [
@@ -351,13 +332,12 @@ def test_config_yaml_omits_the_use_of_assumed_numbers_without_any(settings: Sett
         (("noise=nikon_d850", "output.dtype=float32", "sensor.clip=none", "noise.full_well_e=null"), "noisy"),
         (("noise=nikon_d850", "output.dtype=float32", "sensor.clip=none", "noise.full_well_e=60000"), "white"),
         (("noise=nikon_d850", "sensor.saturated=noisy"), "noisy"),
-        (("noise=imx385_iso3200", "sensor.saturated=pinned"), "pinned"),
     ],
 )
 def test_auto_pins_saturated_sites_of_limited_physical_profiles(
     overrides: tuple[str, ...], decided: str, settings: Settings
 ) -> None:
-    """Plans and recorded configs have the decision; 0.1 and 0.2 record noisy or pinned."""
+    """Plans and recorded configs have the decision."""
     config = settings(*overrides)
     validate_config(config)
     assert plan_image(config, "0" * 64, facts=Facts(64, 48, 256, 0, 255)).noise.saturated == decided

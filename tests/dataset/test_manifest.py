@@ -158,7 +158,7 @@ plans = st.builds(
         effects=st.lists(word, max_size=3).map(tuple),
         skipped=st.lists(word, max_size=3).map(tuple),
         sensor_clip=st.sampled_from(["sensor", "black"]),
-        saturated=st.sampled_from(["noisy", "pinned", "white"]),
+        saturated=st.sampled_from(["noisy", "white"]),
         physics=st.none() | physics,
         level=st.integers(0, 99),
         draw=st.integers(0, 99),
@@ -205,7 +205,7 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     failed = {condition for condition in conditions if "the source failed" in condition}
     passed = {"the status is ok"}
     same = "the clean array has the dtype of the noisy one, or the source failed"
-    unassumed, unsplit = "no effect uses one, or effects.assumed is off", "there are no splits, or the source failed"
+    unassumed, unsplit = "no effect uses one", "there are no splits, or the source failed"
     untargeted = "output.targets is empty, output.frames is false, or the source failed"
     absent = {unassumed, unsplit, untargeted, same, *BY_DEFAULT}
     measured = pair_row("0" * 8, SOURCE, SHA256, 1, 0, PHYSICAL, PAIR, ("1" * 32, "2" * 32), PATCH, 1.5)
@@ -436,7 +436,7 @@ def longest_reasons(settings: Callable[..., Any]) -> dict[str, str]:
     all_given = with_branch(all_given, column_std_dn=1.0, column_temporal_std_dn=1.0)
     numbers = {"noise.gain_by_colour": [0.9, 1.0, 1.1], "noise.lens_shading": [-0.1, 0.0, 0.0]}
     all_given = replaced(all_given, numbers | iso)
-    assumed = settings("noise=nikon_d850", "effects.assumed=off")
+    assumed = settings("noise=nikon_d850")
     assumed = replaced(assumed, {"noise.assumed": PHYSICAL_NUMBERS, **iso})
     found: dict[str, list[str]] = {effect: [] for effect in EFFECTS}
     for config in (lacking, half, all_given, assumed, settings("noise=nikon_d850", "effects.all=off")):
@@ -458,7 +458,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         scene=ScenePlan(LONGEST_NAME, LONGEST),
         weights=(LONGEST,) * 4, rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST,
         gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
-        saturated="pinned", a_dn=LONGEST, b_dn2=LONGEST,
+        saturated="white", a_dn=LONGEST, b_dn2=LONGEST,
         dtype="float32", layout="mosaic",
         accuracy="reference",
         effects=("heteroscedastic", "quantise"),

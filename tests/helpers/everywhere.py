@@ -193,7 +193,7 @@ def plans() -> list[Plan]:
     dark = selftest.GOLDEN_PLAN.replace(a_dn=0.01, b_dn2=-1.0)
     few = selftest.GOLDEN_PLAN.replace(law="poisson", a_dn=900.0)
     float32 = selftest.GOLDEN_PLANS["float32"].replace(highlight="gray_mean")
-    pinned = full.replace(saturated="pinned", exposure_ratio=9.0)
+    pinned = full.replace(saturated="white", exposure_ratio=9.0)
     return [*golden, averaged, averaged.replace(dtype="float32"), dark, few, float32, pinned]
 
 

@@ -25,8 +25,8 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, Plan, Srgb
-from unprocess_gen.planning.effect_selection import Prediction, effect_rules, facts_of, select_effects
-from unprocess_gen.planning.frame_model import SignalRange, signal_range
+from unprocess_gen.planning.effect_selection import Prediction, Selection, effect_rules, facts_of, omit_weakest
+from unprocess_gen.planning.frame_model import FrameModel, SignalRange, signal_range
 from unprocess_gen.planning.plan import plan_image, plan_levels
 from unprocess_gen.simulation.effects import BY_NAME, Physics
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
@@ -83,8 +83,8 @@ def pictures() -> dict[str, Srgb]:
 
 
 def configured(settings: Settings, *overrides: str) -> Config:
-    """Return a config that decides by image; if the profile lacks the ISO of the scene, at an ISO that it has."""
-    config = settings("effects.scope=image", *overrides)
+    """Return a config; if the profile lacks the ISO of the scene, at an ISO that it has."""
+    config = settings(*overrides)
     for iso in (None, 1600, 3200):
         config = replaced(config, {"noise.iso": config.noise.iso if iso is None else iso})
         try:
@@ -229,7 +229,12 @@ def automatic(config: Config, tolerance: float = TOLERANCE) -> Config:
 
 
 def all_predictions(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[Prediction, ...]:
-    return select_effects(effect_rules(config), physics, facts, light).predictions()
+    """Return the predictions for a body whose only frame is that of the facts."""
+    rules = effect_rules(config)
+    frame = FrameModel(physics, facts, light, rules.black_level_dn, rules.converter_dn)
+    free = [effect for effect, forced in rules.forced.items() if forced is None]
+    on = frozenset(effect for effect, forced in rules.forced.items() if forced is None or forced.on)
+    return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free)).predictions()
 
 
 def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[str, ...]:
@@ -241,7 +246,7 @@ def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, 
     overrides = ("scene=night", "noise=nikon_d850", "noise.assumed=[]", "clean.includes_fixed_pattern=true")
     fixed = ("prnu", "black_error")
     left_out = 0
-    for share in (1e-5, 1e-4, 1e-3, 1e-2):
+    for share in (1e-8, 1e-7, 1e-6, 1e-4):
         config = configured(settings, *overrides, f"noise.prnu_std={share}")
         branches = [replace(branch, black_error_dn=[10 * share] * 4) for branch in config.noise.branches]
         config = replaced(config, {"noise.branches": branches})
@@ -273,23 +278,10 @@ def test_a_body_has_its_patterns_in_all_images_or_in_none(
     settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
 ) -> None:
     """The pattern of ``sony_a7s2`` was in 17 of 37 images of ``video_night`` when every image decided."""
-    config = configured(settings, f"noise={noise}", f"scene={scene}", "sensor.units=1", "effects.scope=body")
+    config = configured(settings, f"noise={noise}", f"scene={scene}", "sensor.units=1")
     sizes = [srgb[: 2 * side, :side] for side in (8, 32) for srgb in pictures.values()]
     plans = [switched(config, "auto", srgb, number) for number, srgb in enumerate([*pictures.values(), *sizes])]
     assert len({tuple(name for name in plan.noise.effects if BY_NAME[name].is_fixed) for plan in plans}) == 1
-
-
-def test_omitted_effects_are_masked_if_bodies_decide(settings: Settings, pictures: dict[str, Srgb]) -> None:
-    """The patterns that a body omits count towards the tolerance of each image."""
-    held = 0
-    for scene in SCENES:
-        config = configured(
-            settings, "noise=nikon_d850", f"scene={scene}", "noise.assumed=[]", "noise.prnu_std=3e-4",
-            "effects.scope=body",
-        )  # fmt: skip
-        some = {name: pictures[name] for name in ("colour_chart-0", "dead_leaves-0", "gray 255", "cyan")}
-        held += hold(config, some, tuple(one for one in EFFECTS if one not in ("hot_pixels", "dead_pixels")))
-    assert held > 0
 
 
 @pytest.mark.parametrize(
@@ -310,9 +302,8 @@ def test_a_full_well_is_simulated_only_below_the_end_of_the_converter(
 ) -> None:
     """12 bits above black 256 end at 3839 DN; a gain of ¼ DN per electron reaches them with 15,356 electrons."""
     config = configured(
-        settings, "noise=nikon_d850", "scene=daylight", "sensor=generic_12bit", f"noise.full_well_e={electrons}",
-        "effects.scope=body",
-    )  # fmt: skip
+        settings, "noise=nikon_d850", "scene=daylight", "sensor=generic_12bit", f"noise.full_well_e={electrons}"
+    )
     plan = switched(config, "auto", flat(255, 255, 255), 0)
     physics = replace(plan.noise.physics, dn_per_e=0.25, read_std_dn=1.0)
     light = SignalRange(0.0, float(plan.sensor.span_dn))
@@ -612,14 +603,6 @@ def test_auto_by_name_lets_the_image_decide(settings: Settings) -> None:
     assert not predictions_of(settings, "effects.all=on", "effects.prnu=auto", "effects.tolerance=9")["prnu"].simulated
 
 
-def test_assumed_numbers_are_off_as_in_0_1_with_reason(settings: Settings) -> None:
-    predictions = predictions_of(settings, "effects.assumed=off")
-    for effect in ASSUMED:
-        assert not predictions[effect].simulated
-        assert "is assumed, no source gives it" in predictions[effect].reason
-        assert predictions_of(settings, f"effects.{effect}=on")[effect].simulated
-
-
 def planned(settings: Settings, scene: str, *overrides: str) -> Plan:
     config = configured(settings, "noise=nikon_d850", "sensor=generic_14bit", f"scene={scene}", *overrides)
     return plan_image(config, "0" * 64, 0, facts_of(cut("highlights-0", 256, 384)))
@@ -634,13 +617,6 @@ def test_assumed_numbers_are_used_where_the_scene_calls_for_them(settings: Setti
     assert "prnu_std" in daylight.noise.assumed
     assert {"dark_e_per_s", "hot_pixel_share"}.isdisjoint(daylight.noise.assumed)
     assert {"prnu_std", "dark_e_per_s", "hot_pixel_share"} <= set(long.noise.assumed)
-
-
-def test_column_assumed_is_empty_if_assumed_numbers_are_off(settings: Settings) -> None:
-    """Rows then have the JSON of version 0.1, even if an effect with an assumed number is switched on by name."""
-    plan = planned(settings, "daylight", "effects.assumed=off", "effects.prnu=on")
-    assert "prnu" in plan.noise.effects
-    assert plan.noise.assumed == ()
 
 
 def test_all_on_simulates_known_numbers_and_lists_missing_ones(settings: Settings) -> None:
@@ -742,7 +718,6 @@ def test_plan_prints_a_table_of_all_effects(run_main: RunMain, tmp_path: Path) -
         "noise=nikon_d850",
         "scene=video_night",
         "noise.assumed=[prnu_std]",
-        "effects.assumed=off",
     )
     assert (done.code, messages(done.err)) == (0, [])
     lines = done.out.splitlines()
@@ -758,8 +733,6 @@ def test_plan_prints_a_table_of_all_effects(run_main: RunMain, tmp_path: Path) -
     for effect in EFFECTS:
         assert " of 3 " in words[effect]
     assert "3 of 3" in words["shot"]
-    assert "0 of 3" in words["prnu"]
-    assert "prnu_std is assumed" in words["prnu"]
     assert "outliers" in words["hot_pixels"]
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-import yaml
 from helpers.configs import with_branch
 from helpers.datasets import Settings
 from hypothesis import given
@@ -22,14 +21,12 @@ from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.random_streams import parameter_uniforms
 from unprocess_gen.planning.draws import DRAW_COUNT, Draw
 from unprocess_gen.planning.noise_profile import PhysicalNoise, evaluate
 from unprocess_gen.simulation.effects import NUMBERS, Physics
 
 COUNTERS = {draw.name.lower(): int(draw) for draw in Draw}
-COUNTERS |= {name.removesuffix("_dn"): number.counter for name, number in NUMBERS.items() if number.counter >= 0}
-NAMES = sorted(COUNTERS, key=lambda name: COUNTERS[name])
+NAMES = [next((name for name, place in COUNTERS.items() if place == n), "") for n in range(DRAW_COUNT)]
 """Names of the draws by their counters."""
 
 SAME_SENSOR = {
@@ -45,9 +42,9 @@ SAME_SENSOR = {
 
 
 def on_its_own_sensor(settings: Settings, noise: str, iso: float, *overrides: str) -> Config:
-    """Return a config on the sensor of the calibration, whose scatter follows the uniforms of an image."""
+    """Return a config on the sensor of the calibration."""
     bits, black, white = SAME_SENSOR[noise]
-    config = settings(f"noise={noise}", f"noise.iso={iso}", "noise.scatter=image", *overrides)
+    config = settings(f"noise={noise}", f"noise.iso={iso}", *overrides)
     sensor = replace(config.sensor, bits=bits, black_level_dn=black, white_level_dn=white)
     config = replace(config, sensor=sensor)
     validate_config(config)
@@ -202,8 +199,7 @@ def scatter_of(settings: Settings, *overrides: str, bodies: int = 1) -> list[tup
     config = drawn_shapes(settings("noise=canon_70d", *overrides))
     numbers = []
     for image in range(40):
-        uniforms = own_uniforms(image) | {"sensor_unit": (image % bodies + 0.5) / bodies}
-        numbers.append(scattered(PhysicalNoise(config).draw([uniforms[name] for name in NAMES], image, config.seed)))
+        numbers.append(scattered(physics(config, image, sensor_unit=(image % bodies + 0.5) / bodies)))
     return numbers
 
 
@@ -213,53 +209,6 @@ SHAPES = ["choice", 0.1429, 0.1143, 0.0286, -0.1000, -0.0857, -0.1714, -0.1571]
 def drawn_shapes(config: Config) -> Config:
     """Return a config whose shapes are drawn, and whose line is that of a Tukey scale."""
     return with_branch(config, read_shape=SHAPES, read_std_dn=["scale_line", 0.486806, 1.46427, 0.382006])
-
-
-def own_uniforms(image: int) -> dict[str, float]:
-    return dict(zip(NAMES, parameter_uniforms(image, DRAW_COUNT), strict=True))
-
-
-def test_scatter_by_image_differs_between_images_of_one_body(settings: Settings) -> None:
-    numbers = scatter_of(settings, "noise.iso=3200", "noise.scatter=image", "sensor.units=1")
-    assert len({read for _, read, _ in numbers}) == len({row for _, _, row in numbers}) == 40
-
-
-@pytest.mark.parametrize("units", [1, 4])
-def test_a_body_has_one_value_per_iso(units: int, settings: Settings) -> None:
-    for iso in (400, 3200):
-        chosen = (f"noise.iso={iso}", f"sensor.units={units}", "noise.scatter=body")
-        numbers = scatter_of(settings, *chosen, bodies=units)
-        assert len(set(numbers)) == units
-        assert numbers == scatter_of(
-            settings, *chosen, "noise.draws=3", "scene=night", f"noise.iso={iso}", bodies=units
-        )
-
-
-def test_bodies_and_isos_scatter_independently(settings: Settings) -> None:
-    """The logarithms of read noise without its shape, and of row noise, have the spread that the profile states."""
-    line = ("noise.scatter=body", "sensor.units=40")
-    config = drawn_shapes(settings("noise=canon_70d", *line))
-    read, row = (getattr(config.noise.branches[0], name) for name in ("read_std_dn", "row_std_dn"))
-    deviates = []
-    for iso in (100, 200, 400, 800, 1600, 3200, 6400):
-        middle = physics(drawn_shapes(settings("noise=canon_70d", "noise.scatter=off", f"noise.iso={iso}")))
-        for shape, read_std_dn, row_std_dn in scatter_of(settings, *line, f"noise.iso={iso}", bodies=40):
-            ratio = read_std_dn / middle.read_std_dn * tukey_std(middle.read_shape) / tukey_std(shape)
-            deviates.append((math.log(ratio) / read[3], math.log(row_std_dn / middle.row_std_dn) / row[3]))
-    of_read, of_row = np.array(deviates).T
-    assert np.abs([of_read.mean(), of_row.mean()]).max() < 4 / math.sqrt(280)
-    assert np.abs([of_read.std() - 1, of_row.std() - 1]).max() < 4 / math.sqrt(560)
-    by_iso = of_read.reshape(7, 40)
-    for one, other in itertools.combinations([*by_iso, *of_row.reshape(7, 40)], 2):
-        assert abs(np.corrcoef(one, other)[0, 1]) < 5 / math.sqrt(40)
-
-
-def test_images_with_patterns_of_their_own_share_the_scatter_of_an_iso(settings: Settings) -> None:
-    first, other = (
-        set(scatter_of(settings, "noise.iso=3200", "noise.scatter=body", f"seed={seed}")) for seed in (0, 1)
-    )
-    assert len(first) == len(other) == 1
-    assert first != other
 
 
 @pytest.mark.parametrize(("units", "bodies"), [("1", 1), ("4", 4), ("image", 40)])
@@ -297,14 +246,6 @@ def test_without_scatter_lines_and_the_median_shape_remain(settings: Settings) -
     (numbers,) = set(scatter_of(settings, "noise.scatter=off", "noise.iso=3200"))
     assert numbers[0] == shape
     assert all(close(number, one, 1e-14) for number, one in zip(numbers[1:], expected, strict=True))
-
-
-def test_a_config_without_scatter_draws_by_image(settings: Settings) -> None:
-    """A config of 0.1 does not have the key."""
-    text = dataset_yaml(settings("noise=canon_70d", "noise.scatter=image"))
-    assert "scatter" not in yaml.safe_load(text)["noise"]
-    assert parse_dataset_yaml(text)[0].noise.scatter == "image"
-    assert yaml.safe_load(dataset_yaml(settings("noise=canon_70d")))["noise"]["scatter"] == "off"
 
 
 # Profiles in conf/ ----------------------------------------------------------------------------------------------------
@@ -365,7 +306,7 @@ def test_profile_is_converted_by_the_ratio_of_ranges(settings: Settings, noise: 
     iso = 1600
     _, black, white = SAME_SENSOR[noise]
     own = physics(on_its_own_sensor(settings, noise, iso))
-    here = physics(settings(f"noise={noise}", "noise.iso=1600", "noise.scatter=image"))
+    here = physics(settings(f"noise={noise}", "noise.iso=1600"))
     scale = (4095 - 240) / (white - black)
     for name in ("dn_per_e", "read_std_dn", "row_std_dn"):
         assert getattr(here, name) == getattr(own, name) * scale
@@ -377,22 +318,21 @@ def test_profile_is_converted_by_the_ratio_of_ranges(settings: Settings, noise: 
 # Draws ----------------------------------------------------------------------------------------------------------------
 
 
-def test_each_number_is_drawn_from_its_own_uniform(settings: Settings) -> None:
+def test_numbers_of_effects_are_drawn_from_counters_of_their_own() -> None:
+    counters = [number.counter for number in NUMBERS.values() if number.counter >= 0]
+    assert len(set(counters)) == len(counters)
+
+
+def test_each_number_of_the_scene_is_drawn_from_its_own_uniform(settings: Settings) -> None:
     config = on_its_own_sensor(settings, "canon_70d", 800)
-    line = ["scale_line", 0.486806, 1.46427, 0.382006]
-    config = with_branch(config, read_shape=["choice", -0.1, 0.0, 0.1], read_std_dn=line)
     config = replaced(
         config, {"scene.exposure_s": ["log_uniform", 0.01, 1.0], "scene.temperature_c": ["uniform", 10, 30]}
     )
     middle = physics(config)
     moves = {
-        "read_std": {"read_std_dn"},
-        "row_std": {"row_std_dn"},
-        "read_shape": {"read_shape", "read_std_dn"},
         "exposure_s": {"exposure_s", "dark_e", "hot_pixel_e"},
         "temperature_c": {"temperature_c", "dark_e", "hot_pixel_e"},
         "iso": set(),
-        "column_std": set(),
     }
     for uniform, moved in moves.items():
         other = physics(config, **{uniform: 0.9})

@@ -90,10 +90,6 @@ def test_effects_are_listed_with_reasons(settings: Settings, tmp_path: Path) -> 
             "noise=nikon_d850 scene=long_exposure",
             "prnu_std=0.005, dark_e_per_s=1.0, dark_reference_c=25.0, ",
         ),
-        (
-            "noise=nikon_d850 scene=long_exposure effects.assumed=off",
-            "prnu_std is assumed, no source gives it: on only where switched on",
-        ),
     ],
 )
 def test_effects_of_a_profile_are_explained(overrides: str, sentence: str, settings: Settings, tmp_path: Path) -> None:

@@ -194,7 +194,7 @@ VARIANTS = (
     *((), ("sensor=generic_10bit",), ("sensor=generic_14bit",), ("sensor=generic_16bit",), ("accuracy=fast",)),
     *(("output.dtype=float32", "sensor.clip=none"), ("output.layout=packed", "sensor.clip=black")),
     *(("effects.all=on",), ("effects.all=on", "output.dtype=float32"), ("scene.exposure_ratio=200",)),
-    *(("effects.all=on", "clean.includes_fixed_pattern=true"), ("isp=srgb", "sensor.saturated=pinned")),
+    *(("effects.all=on", "clean.includes_fixed_pattern=true"), ("isp=srgb", "sensor.saturated=white")),
     *(("effects.all=on", "sensor.dark_offset=kept", "scene.exposure_s=30", "scene.temperature_c=40"),),
     *(("camera=identity", "gains=unity"), ("source.dequantize=dither",), ("output.clean_dtype=float32",)),
     *(("effects.row=on", "noise.row_correlation=0.8"), (*GAINS, "accuracy=fast"), (*GAINS, "effects.all=on")),

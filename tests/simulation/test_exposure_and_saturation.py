@@ -76,7 +76,7 @@ def test_pinning_changes_saturated_sites_only(distribution: str) -> None:
     srgb = np.where(np.random.Generator(np.random.Philox(key=5)).random((200, 300, 1)) < 0.3, 65535, 65000)
     srgb = np.broadcast_to(srgb, (200, 300, 3)).astype(np.uint16)
     free, pinned = (
-        make_pair(srgb, WHITES[distribution].replace(saturated=saturated)) for saturated in ("noisy", "pinned")
+        make_pair(srgb, WHITES[distribution].replace(saturated=saturated)) for saturated in ("noisy", "white")
     )
     white = free.clean == WHITE
     assert 0 < white.mean() < 1

@@ -36,7 +36,7 @@ ORIGIN = 1, 57
 GOLDEN = selftest.GOLDEN_PLANS
 PLANS = {
     **{name: GOLDEN[name] for name in ("per_channel", "gray_mean", "plain", "physical")},
-    "pinned": GOLDEN["physical"].replace(saturated="pinned"),
+    "white": GOLDEN["physical"].replace(saturated="white"),
     "averaged": GOLDEN["physical"].replace(physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True)),
     "poisson": GOLDEN["per_channel"].replace(law="poisson"),
     "silent": GOLDEN["per_channel"].replace(effects=()),

@@ -214,7 +214,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-PHYSICAL = ("source.clips=true", "noise=nikon_d850", "noise.scatter=image", "noise.iso=3200", "effects.prnu=on")
+PHYSICAL = ("source.clips=true", "noise=nikon_d850", "noise.scatter=unit", "noise.iso=3200", "effects.prnu=on")
 
 
 @pytest.fixture(scope="module")

@@ -107,7 +107,7 @@ def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
     "options",
     [
         {"accuracy": FAST},
-        {"accuracy": FAST, "highlight": "gray_mean", "saturated": "pinned"},
+        {"accuracy": FAST, "highlight": "gray_mean", "saturated": "white"},
         {"law": "poisson", "b_dn2": 3.0},
         {"physics": GOLDEN_PHYSICS, "effects": EFFECTS},
         {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
@@ -243,7 +243,7 @@ def test_float32_is_within_its_error_on_all_colours(plan: Plan, camera: str, fig
     "options",
     [
         {},
-        {"saturated": "pinned"},
+        {"saturated": "white"},
         {"highlight": "gray_mean", "sensor_clip": "black"},
         {"exposure_ratio": 3.0},
         {"a_dn": 8.0034, "b_dn2": -122.69544},

@@ -129,7 +129,7 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
         black_level_dn=black,
         white_level_dn=white,
         sensor_clip=dice.pick(("sensor", "sensor", "black", "none" if dtype == FLOAT32 else "sensor")),
-        saturated=dice.pick(("noisy", "noisy", "pinned")),
+        saturated=dice.pick(("noisy", "noisy", "white")),
         level=dice.pick((0, 0, 1, 99, 4095)),
         draw=dice.pick((0, 0, 1, 99, 4095)),
         frame=dice.pick((0, 0, 1, 12345, 2**31)),
@@ -377,7 +377,7 @@ def with_other_noise(plan: Plan, kinds: Sequence[str], dice: Dice) -> Plan:
         level=int(dice.random() * 100),
         draw=int(dice.random() * 100),
         sensor_clip=dice.pick(("sensor", "black")),
-        saturated=dice.pick(("noisy", "noisy", "pinned")),
+        saturated=dice.pick(("noisy", "noisy", "white")),
     )
 
 

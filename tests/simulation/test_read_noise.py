@@ -161,7 +161,7 @@ def test_tukey_scale_is_multiplied_by_standard_deviation_of_shape(settings: Sett
 
 
 def test_scatter_about_line_is_normal_in_logarithm(settings: Settings) -> None:
-    config = settings("noise=oppo_reno10x", "noise.iso=800", "noise.scatter=image")
+    config = settings("noise=oppo_reno10x", "noise.iso=800", "noise.scatter=unit")
     config = with_branch(config, read_std_dn=["line", 0.5, 1.25, 0.25])
     validate_config(config)
     facts = facts_of(picture())

@@ -88,7 +88,7 @@ def assert_cut_outs(patched: Path, full: Path) -> int:
             ("noise.law=poisson", "source.dequantize=dither", "gains.highlight=gray_mean"), marks=pytest.mark.slow
         ),
         pytest.param(("noise=nikon_d850", "noise.iso=6400", "effects.prnu=on"), marks=pytest.mark.slow),
-        pytest.param((*EVERY_EFFECT, "noise.draws=2", "sensor.saturated=pinned"), marks=pytest.mark.slow),
+        pytest.param((*EVERY_EFFECT, "noise.draws=2", "sensor.saturated=white"), marks=pytest.mark.slow),
         (*EVERY_EFFECT, "clean.includes_fixed_pattern=true"),
         pytest.param(("scene.exposure_ratio=20", "sensor.clip=black"), marks=pytest.mark.slow),
     ],

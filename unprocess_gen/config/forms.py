@@ -40,7 +40,7 @@ ISO_FORMS: Mapping[str, Form] = {
     "line": Form(
         ("slope", "intercept", "scatter"),
         "the standard deviation σ with ln σ = slope · ln K + intercept + scatter · n, where K is `dn_per_e` and n a "
-        "standard normal deviate, drawn according to `noise.scatter`",
+        "standard normal deviate, drawn for each camera body with `noise.scatter=unit`",
     ),
     "scale_line": Form(
         ("slope", "intercept", "scatter"),

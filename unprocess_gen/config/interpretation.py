@@ -161,11 +161,6 @@ def without_dark_frames(config: Config) -> Config:
     return replaced(config, NO_DARK_FRAMES)
 
 
-def uses_assumed(config: Config) -> bool:
-    """True if effects with assumed numbers are simulated like others."""
-    return config.effects.assumed == "use" and is_physical(config.noise) and bool(config.noise.assumed)
-
-
 def assumed_numbers(noise: NoiseConfig, effect: str) -> tuple[str, ...]:
     """Return the keys of a physical profile that an effect depends on and that the profile marks as assumed."""
     keys = (*needed_numbers(effect), *(HEAT if BY_NAME[effect].heat else ()))
@@ -213,7 +208,7 @@ def saturated_as(config: Config) -> str:
     """Return the noisy value of sites whose clean frame is saturated.
 
     Without a full well, and without clipping of the noisy frame, nothing stops noise above white. Otherwise half of it
-    is cut off, and the mean of the noisy frame at white is below white. Settings of 0.2 record ``pinned`` for ``auto``.
+    is cut off, and the mean of the noisy frame at white is below white.
     """
     if config.sensor.saturated != "auto":
         return config.sensor.saturated

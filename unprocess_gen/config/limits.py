@@ -199,7 +199,7 @@ OUTPUT_PLACE = Limit(
 SWITCH = Switch("auto", "on", "off")
 """Values of each effect."""
 
-SCATTER = Switch("off", "unit", "body", "image")
+SCATTER = Switch("off", "unit")
 
 DEQUANTIZE = Switch("off", "dither", "dither_all")
 

@@ -261,7 +261,7 @@ class SensorConfig(Group):
         with float32
     saturated
         noisy value at sites where the clean frame is saturated: noisy is the clipped value plus noise, as in
-        the article; pinned is the level at which the clean frame saturates; white is the white level where the
+        the article; white is the white level where the
         converter ends, and sites at a full well keep the noise behind it; auto is white for physical profiles
         with a full well or a converter that ends, otherwise noisy
     dark_offset
@@ -276,7 +276,7 @@ class SensorConfig(Group):
     white_level_dn: int = key(4095, limits.WHITE_LEVEL, unit="DN")
     pattern: str = key("RGGB", Choice("RGGB", "BGGR", "GRBG", "GBRG", "MONO"))
     clip: str = key("sensor", Choice("sensor", "black", "none"))
-    saturated: str = key("noisy", Choice("noisy", "pinned", "white", "auto"))
+    saturated: str = key("noisy", Choice("noisy", "white", "auto"))
     dark_offset: str = key("removed", Choice("removed", "kept"))
     units: Any = key("image", NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"))
     levels: str = key("given", Choice("given", "source"), since="0.3")
@@ -429,8 +429,7 @@ class NoiseConfig(EffectGroup):
         ISO at which a physical profile is used, in place of scene.iso
     scatter
         how the scatter of a physical profile's lines and its read_shape are drawn: unit once for each camera
-        body, body once for each body and ISO (with sensor.units=image, once for each ISO), image for each image;
-        off is no scatter and the median shape
+        body, off is no scatter and the median shape
     levels
         noise levels of each clean frame
     draws
@@ -445,7 +444,7 @@ class NoiseConfig(EffectGroup):
     branches
         numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters
     assumed
-        keys whose numbers no source gives for this camera; effects.assumed controls their effects
+        keys whose numbers no source gives for this camera
     unsourced
         assumed keys whose numbers no source gives for any camera; their effects are simulated only if they are
         switched on
@@ -472,7 +471,7 @@ class NoiseConfig(EffectGroup):
     negative_variance: str = key("refuse", Choice("refuse", "clip"), TWO_NUMBERS)
     law: str = key("gaussian", Choice("gaussian", "poisson"), CHOSEN)
     iso: Any = key(None, limits.ISO, CHOSEN, null="the ISO of the scene")
-    scatter: str = key("image", limits.SCATTER, CHOSEN, since="0.2")
+    scatter: str = key("off", limits.SCATTER, CHOSEN)
     levels: Any = key(None, limits.LEVELS, CHOSEN, null="one level, as the profile has it")
     draws: int = key(1, Integers(1, limits.MAX_LEVELS), CHOSEN)
     dark_frames: Optional[str] = key(
@@ -554,22 +553,14 @@ class EffectsConfig(EffectGroup):
     Attributes
     ----------
     all
-        auto omits effects that together stay within tolerance, on simulates all effects, off none; the switch
-        of a named effect takes precedence
+        auto omits effects that together stay within tolerance, for each image, and fixed patterns for each body
+        and scene; on simulates all effects, off none; the switch of a named effect takes precedence
     tolerance
         largest ratio of the omitted effects to the masking noise, in each statistic
-    assumed
-        effects with an assumed number of a physical profile (noise.assumed): use treats them like other
-        effects, off simulates them only if they are switched on by name
-    scope
-        what auto decides about: image decides every effect for each image; body decides fixed patterns for each
-        body and scene, and simulates a full well only where the converter does not end first
     """
 
     all: str = key("auto", limits.SWITCH)
     tolerance: float = key(0.1, Numbers(0, 10, open_low=True))
-    assumed: str = key("off", Choice("use", "off"), since="0.2")
-    scope: str = key("image", Choice("image", "body"), since="0.3")
 
 
 @documented

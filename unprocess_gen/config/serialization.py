@@ -17,9 +17,7 @@ import yaml
 from unprocess_gen.config.interpretation import (
     canonical_patch,
     has_float_clean,
-    is_physical,
     saturated_as,
-    uses_assumed,
 )
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import (
@@ -89,10 +87,6 @@ def _canonical_settings(config: Config) -> dict[str, Any]:
     settings["source"]["patch"] = canonical_patch(config.source)
     if config.gains.light != "scene":
         settings["scene"].pop("light", None)  # decides nothing
-    if not uses_assumed(config):
-        settings["effects"].pop("assumed", None)  # decides nothing
-    if not is_physical(config.noise):
-        settings["effects"].pop("scope", None)  # decides nothing
     if not has_float_clean(config):
         settings["output"].pop("clean_dtype", None)
     for group, keys in NUMBER_KEYS.items():

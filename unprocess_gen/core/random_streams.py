@@ -360,21 +360,18 @@ def parameter_uniforms(key: int, count: int, level: int = 0, epoch: int = 0) -> 
     list of float
         (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
-    return _uniforms(key, count, 0, purpose("parameters", level), frame_word(0, epoch))
+    return _uniforms(key, count, purpose("parameters", level), frame_word(0, epoch))
 
 
-def scatter_uniforms(key: int, iso: float, count: int) -> list[float]:
-    """Return uniform deviates for the numbers of a camera body at an ISO.
+def scatter_uniforms(key: int, count: int) -> list[float]:
+    """Return uniform deviates for the numbers of a camera body.
 
-    Number n uses counter (low, n, high) of the stream ``scatter``, where low and high are the halves of the ISO's
-    float64: add new numbers at the end, never renumber.
+    Number n uses counter n of the stream ``scatter``: add new numbers at the end, never renumber.
 
     Parameters
     ----------
     key : int
         Key from `body_key`.
-    iso : float
-        The ISO.
     count : int
         Number of deviates.
 
@@ -383,8 +380,7 @@ def scatter_uniforms(key: int, iso: float, count: int) -> list[float]:
     list of float
         (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
-    low, high = struct.unpack("<II", struct.pack("<d", iso))
-    return _uniforms(key, count, low, purpose("scatter"), high)
+    return _uniforms(key, count, purpose("scatter"), 0)
 
 
 def _outputs(key: int, count: int, word_2: int, word_3: int) -> tuple[Words, Words, Words, Words]:
@@ -393,15 +389,15 @@ def _outputs(key: int, count: int, word_2: int, word_3: int) -> tuple[Words, Wor
     return philox4x32(tuple(np.asarray(word, dtype=np.uint64) for word in counter), key)
 
 
-def _uniforms(key: int, count: int, word_0: int, word_2: int, word_3: int) -> list[float]:
-    """Uniform deviates (k + ½)·2**-52 from the first 52 bits k of the counters with word 1 from 0 to ``count`` - 1.
+def _uniforms(key: int, count: int, word_2: int, word_3: int) -> list[float]:
+    """Uniform deviates (k + ½)·2**-52 from the first 52 bits k of the counters (0, 0 to ``count`` - 1, …).
 
     An integer holds one word of all counters, at intervals of 64 bits, so that no product reaches the next word. With
     `philox4x32` the planning of an image would take twice as long: 60 µs for the few counters of an image instead of 5.
     """
     ones, numbers = _packed(count)
     low = LOW * ones
-    c0, c1, c2, c3 = word_0 * ones, numbers, word_2 * ones, word_3 * ones
+    c0, c1, c2, c3 = 0, numbers, word_2 * ones, word_3 * ones
     k0, k1 = key & LOW, key >> 32
     for _ in range(ROUNDS):
         p0, p1 = MULTIPLIERS[0] * c0, MULTIPLIERS[1] * c2

@@ -407,7 +407,7 @@ class NoisePlan:
     sensor_clip : str
         Clipping of the noisy frame (`sensor.noisy_limits`).
     saturated : str
-        Noisy value at sites where the clean frame is saturated: ``"noisy"``, ``"pinned"`` to its value, or ``"white"``
+        Noisy value at sites where the clean frame is saturated: ``"noisy"``, or ``"white"``
         if the converter ends there; sites at a full well keep the noise behind it, and count as saturated.
     physics : Physics or None
         Numbers of a physical profile. None for two-parameter profiles, whose one effect is ``heteroscedastic``.
@@ -415,7 +415,7 @@ class NoisePlan:
         Numbers of the noise level, of the draw at this level, and of the frame in its clip. Each selects other random
         values.
     assumed : tuple of str
-        Assumed numbers of the noise profile that the simulated effects use; empty with ``effects.assumed=off``.
+        Assumed numbers of the noise profile that the simulated effects use.
     dark : DarkFramePlan
         Dark frame whose noise replaces that of the read-out.
     epoch : int
@@ -602,7 +602,7 @@ class Plan:
     @property
     def pins_saturated(self) -> bool:
         """True if noisy sites have the value of the clean frame where that saturates."""
-        return self.noise.saturated == "pinned" or (self.noise.saturated == "white" and self.brightest == 1)
+        return self.noise.saturated == "white" and self.brightest == 1
 
     @property
     def saturated_value(self) -> float:

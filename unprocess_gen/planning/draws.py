@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
-
-from unprocess_gen.simulation.effects import NUMBERS
+from enum import IntEnum, unique
 
 
+@unique
 class Draw(IntEnum):
     """Counters of the draws; all datasets depend on them: add new ones, never renumber.
 
-    Numbers of effects have counters of their own (`Number.counter`): 14 to 17, and 19.
+    The scatter of a camera body has a stream of its own (`Number.counter`).
     """
 
     WEIGHT_0, WEIGHT_1, WEIGHT_2, WEIGHT_3 = range(4)
@@ -22,10 +21,8 @@ class Draw(IntEnum):
     LIGHT, CCT, LIGHT_DISTANCE = range(20, 23)
 
 
-EFFECT_COUNTERS = tuple(number.counter for number in NUMBERS.values() if number.counter >= 0)
-
-DRAW_COUNT = max(*EFFECT_COUNTERS, *Draw) + 1
+DRAW_COUNT = max(Draw) + 1
 """Draws of an image."""
 
-NOISE_COUNTERS = (Draw.A, Draw.B, Draw.ISO, *EFFECT_COUNTERS)
+NOISE_COUNTERS = (Draw.A, Draw.B, Draw.ISO)
 """Counters that every noise level draws separately."""

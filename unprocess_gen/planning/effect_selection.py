@@ -8,27 +8,27 @@ thresholds in units of the noise.
 Hot and dead pixels above one standard deviation of the masking noise are too rare for a variance. They are counted
 instead, and simulated if at least `MIN_OUTLIERS` are expected per frame.
 
-With ``effects.scope=body``, fixed patterns are decided for a body in a scene: for a frame of `BODY_FRAME` that has all
-the light of the scene. So a body has its pattern in all images or in none.
+Fixed patterns are decided for a body in a scene: for a frame of `BODY_FRAME` that has all the light of the scene. So a
+body has its pattern in all images or in none.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from unprocess_gen.config.distributions import lowest, parse_drawn
 from unprocess_gen.config.interpretation import (
+    UNCLIPPED,
     assumed_numbers,
     effect_switch,
     is_normalised,
     is_physical,
     missing_number,
     needed_numbers,
-    uses_assumed,
     uses_dark_frames,
 )
 from unprocess_gen.config.limits import EXPOSURE_RATIO
@@ -138,11 +138,6 @@ def _forced_decision(config: Config, name: str) -> ForcedDecision | None:
         (missing is not None, False, f"noise={config.noise.name} gives no {missing}"),
         (switch == "on", True, "switched on"),
         (effect.in_both_frames, True, "part of the clean frame"),  # no noise hides it, and the levels share it
-        (
-            assumed is not None and not uses_assumed(config),
-            False,
-            f"{assumed} is assumed, no source gives it: on only where switched on",
-        ),
         (assumed in config.noise.unsourced, False, "no source gives its number: on if switched on"),
     )
     return next((ForcedDecision(on, reason) for holds, on, reason in rules if holds), None)
@@ -161,50 +156,41 @@ class EffectRules:
     black_level_dn : float
         Black level of the sensor, DN.
     assumed : mapping of str to tuple of str
-        Assumed numbers that each effect uses; empty with ``effects.assumed=off``.
+        Assumed numbers that each effect uses.
     unnamed : frozenset of str
         Effects of later versions whose numbers the profile lacks; rows do not name them as skipped.
     dark_frames : bool
         Whether ``dark_frame`` takes the place of ``read``. Its variance is then the read variance of `Physics`.
     converter_dn : float
-        Highest value of the converter, DN above black; infinity with ``effects.scope=image``, or without clipping.
-    body_light_dn : float or None
-        Most light of the scene, DN above black, for which fixed patterns are decided; None with
-        ``effects.scope=image``.
+        Highest value of the converter, DN above black; infinity without clipping.
+    body_light_dn : float
+        Most light of the scene, DN above black, for which fixed patterns are decided.
     """
 
     forced: Mapping[str, ForcedDecision | None]
     tolerance: float
     black_level_dn: float
-    assumed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    unnamed: frozenset[str] = frozenset()
-    dark_frames: bool = False
-    converter_dn: float = math.inf
-    body_light_dn: float | None = None
+    assumed: Mapping[str, tuple[str, ...]]
+    unnamed: frozenset[str]
+    dark_frames: bool
+    converter_dn: float
+    body_light_dn: float
 
 
 def effect_rules(config: Config) -> EffectRules:
     """Return the decisions of a configuration about the effects of its physical noise profile."""
-    noise, effects = config.noise, PHYSICAL_EFFECTS
+    noise, sensor, effects = config.noise, config.sensor, PHYSICAL_EFFECTS
+    ratio = lowest(parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO))
     return EffectRules(
         {effect: _forced_decision(config, effect) for effect in effects},
         config.effects.tolerance,
         float(config.sensor.black_level_dn),
-        {effect: assumed_numbers(noise, effect) for effect in effects} if uses_assumed(config) else {},
+        {effect: assumed_numbers(noise, effect) for effect in effects},
         frozenset(effect for effect in effects if BY_NAME[effect].since and missing_number(noise, effect) is not None),
         uses_dark_frames(noise),
-        *_rules_of_body(config),
+        math.inf if sensor.clip == UNCLIPPED else 2.0**sensor.bits - 1 - sensor.black_level_dn,
+        min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn),
     )
-
-
-def _rules_of_body(config: Config) -> tuple[float, float | None]:
-    """Return ``converter_dn`` and ``body_light_dn`` of the rules."""
-    sensor = config.sensor
-    if config.effects.scope == "image":
-        return math.inf, None
-    ends = math.inf if sensor.clip == "none" else 2.0**sensor.bits - 1 - sensor.black_level_dn
-    ratio = lowest(parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO))
-    return ends, min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +214,7 @@ class Selection:
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """Return the assumed numbers that the simulated effects use; none with ``effects.assumed=off``, as in 0.1."""
+        """Return the assumed numbers that the simulated effects use."""
         used = (key for effect in self.effects for key in self.rules.assumed.get(effect, ()))
         return tuple(dict.fromkeys(used))
 
@@ -263,7 +249,7 @@ def select_effects(rules: EffectRules, physics: Physics, facts: Facts, signals: 
     free = [effect for effect, decision in rules.forced.items() if decision is None]
     on = frozenset(effect for effect, decision in rules.forced.items() if decision is None or decision.on)
     patterns = [effect for effect in free if BY_NAME[effect].is_fixed]
-    if rules.body_light_dn is None or not patterns:
+    if not patterns:
         return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free))
     height, width = BODY_FRAME
     largest = replace(facts, width=width, height=height, frames=BODY_CLIP if facts.frames > 1 else 1)

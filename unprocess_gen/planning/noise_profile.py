@@ -28,8 +28,6 @@ from unprocess_gen.simulation.reference import cfa
 
 MIDDLE = 0.5
 """Uniform at which a line has no scatter."""
-ANY_ISO = 0.0
-"""ISO that keys the scatter of a body at all its ISOs."""
 
 
 class PhysicalNoise:
@@ -61,6 +59,7 @@ class PhysicalNoise:
         assert branch is not None
         units = sensor.units
         unit = f"{stream_key:016x}" if units == "image" else str(int(uniforms[Draw.SENSOR_UNIT] * units))
+        body = body_key(seed, noise.name, unit)
         exposure = seconds, _doublings(celsius, noise.dark_reference_c, noise.dark_doubling_c)
         return Physics(
             iso=iso,
@@ -68,9 +67,9 @@ class PhysicalNoise:
             temperature_c=celsius,
             dark_offset=sensor.dark_offset,
             sensor_unit=unit,
-            body_key=body_key(seed, noise.name, unit),
+            body_key=body,
             fixed_pattern_in_clean=self.fixed_pattern_in_clean,
-            **self._numbers(branch, iso, exposure, self._scatter(uniforms, iso, seed, unit)),
+            **self._numbers(branch, iso, exposure, self._scatter(body)),
         )
 
     def _numbers(
@@ -96,21 +95,12 @@ class PhysicalNoise:
             values[name] = value
         return values
 
-    def _scatter(self, uniforms: Sequence[float], iso: float, seed: int, unit: str) -> Callable[[Number], float]:
-        """Return the uniform at which a number is drawn.
-
-        With ``body``, images that have fixed patterns of their own share the draw of an ISO.
-        """
-        if self.scatter == "image":
-            return lambda declared: uniforms[declared.counter]
+    def _scatter(self, body: int) -> Callable[[Number], float]:
+        """Return the uniform at which each number of a body is drawn."""
         if self.scatter == "off":
             return lambda declared: MIDDLE
-        if self.scatter == "unit":
-            scatter = _scatter_of_body(body_key(seed, self.noise.name, unit), ANY_ISO)
-        else:
-            body = body_key(seed, self.noise.name, "" if self.sensor.units == "image" else unit)
-            scatter = _scatter_of_body(body, iso)
-        return lambda declared: scatter[declared.scatter]
+        scatter = _scatter_of_body(body)
+        return lambda declared: scatter[declared.counter]
 
     def _shape(self, branch: BranchConfig, iso: float, uniform: float) -> float:
         """Return the shape of the read noise; without scatter, the median of a distribution."""
@@ -173,9 +163,9 @@ def _number_of_line(
 
 
 @functools.lru_cache(maxsize=256)
-def _scatter_of_body(body: int, iso: float) -> list[float]:
-    """Return the uniforms at which the numbers of a body are drawn at an ISO, by `Number.scatter`."""
-    return scatter_uniforms(body, iso, max(declared.scatter for declared in NUMBERS.values()) + 1)
+def _scatter_of_body(body: int) -> list[float]:
+    """Return the uniforms at which the numbers of a body are drawn, by `Number.counter`."""
+    return scatter_uniforms(body, max(declared.counter for declared in NUMBERS.values()) + 1)
 
 
 @functools.lru_cache(maxsize=256)

@@ -41,14 +41,14 @@ def test_kernels_equal_reference_for_every_profile_and_scene(settings: Settings,
     for forced, fixed in itertools.product([False, True], ["false", "true"]):
         plan = planned(settings, picture(), *group, f"clean.includes_fixed_pattern={fixed}", forced=forced)
         assert set(EFFECTS) == set(plan.noise.effects) or not forced
-        for saturated in ("noisy", "pinned", "white"):
+        for saturated in ("noisy", "white"):
             assert_same(picture(), plan.replace(saturated=saturated))
 
 
 @pytest.mark.parametrize("noise", TWO_NUMBERS)
 def test_kernels_equal_reference_for_poisson_form_of_every_profile(settings: Settings, noise: str) -> None:
     plan = planned(settings, picture(), f"noise={noise}", *TWO_NUMBERS[noise], "noise.law=poisson")
-    for saturated, clip in itertools.product(["noisy", "pinned", "white"], ["sensor", "black"]):
+    for saturated, clip in itertools.product(["noisy", "white"], ["sensor", "black"]):
         assert_same(picture(), plan.replace(saturated=saturated, sensor_clip=clip))
 
 
@@ -74,6 +74,6 @@ def test_correlated_rows_use_the_machine_code_of_other_noise(everything: Plan) -
 def test_pairs_equal_reference_with_and_without_every_effect(everything: Plan, effect: str | None) -> None:
     plan = everything.replace(level=3, draw=2, frame=1)
     for on in ([one for one in EFFECTS if one != effect], [effect] if effect else []):
-        for saturated, clip in itertools.product(["noisy", "pinned", "white"], ["sensor", "black"]):
+        for saturated, clip in itertools.product(["noisy", "white"], ["sensor", "black"]):
             one = plan.replace(effects=tuple(on), saturated=saturated, sensor_clip=clip)
             assert_same(picture(), one, (3, 7))

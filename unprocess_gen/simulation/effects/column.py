@@ -17,7 +17,7 @@ class ColumnNumbers(EffectNumbers):
     """Standard deviation of column offsets, DN."""
 
     column_std_dn: float = number_in_dn(
-        "standard deviation of column offsets", forms=("root", "line", "by_iso"), counter=17, scatter=3
+        "standard deviation of column offsets", forms=("root", "line", "by_iso"), counter=3
     )
 
 

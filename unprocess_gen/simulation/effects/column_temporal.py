@@ -19,8 +19,7 @@ class ColumnTemporalNumbers(EffectNumbers):
     column_temporal_std_dn: float = number_in_dn(
         "standard deviation of the part of column offsets that is new in every frame",
         forms=("root", "line"),
-        counter=19,
-        scatter=4,
+        counter=4,
         since="0.2",
     )
 

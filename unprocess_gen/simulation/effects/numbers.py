@@ -50,8 +50,8 @@ class Number:
         Forms of `config.forms`, and words, that the key allows; a key with any belongs to the branches of a profile.
     count : int
         Numbers in the value; a list if more than 1.
-    counter, scatter : int
-        Counters of the draw in the streams ``parameters`` and ``scatter``; -1 without a draw. Datasets depend on them.
+    counter : int
+        Counter of the draw in the stream ``scatter``; -1 without a draw. Datasets depend on it.
     columns : mapping of str to str
         Name and meaning of each column; empty for one column with the name and meaning of the field.
     lowest, highest : float
@@ -77,7 +77,6 @@ class Number:
     words: tuple[str, ...] = ()
     count: int = 1
     counter: int = -1
-    scatter: int = -1
     columns: Mapping[str, str] = field(default_factory=dict)
     lowest: float = 0.0
     highest: float = LARGEST

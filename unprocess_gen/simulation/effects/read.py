@@ -27,8 +27,7 @@ class ReadNumbers(EffectNumbers):
         kind=SHAPE,
         forms=("choice", "by_stop", "by_iso"),
         key_default=0.0,
-        counter=14,
-        scatter=0,
+        counter=0,
         lowest=-0.5,
         highest=10.0,
     )
@@ -36,8 +35,7 @@ class ReadNumbers(EffectNumbers):
         "standard deviation of the read noise",
         forms=("root", "line", "scale_line", "by_iso"),
         required=True,
-        counter=15,
-        scatter=1,
+        counter=1,
     )
 
 
