@@ -73,7 +73,7 @@ def test_side_is_that_after_downscaling_and_before_patches(tmp_path: Path, make:
 def test_filtered_rows_are_verified_replayed_regenerated_and_repaired(
     photos: Path, run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
-    make(photos, tmp_path / "ds", "source.min_side=20", "output.pairs_per_shard=2", "output.parquet=true")
+    make(photos, tmp_path / "ds", "source.min_side=20", "output.pairs_per_shard=2")
     assert run_main("verify", "ds").out == "ds is intact\n"
     assert run_main("replay", "ds").out == "2 pairs are the same, bit for bit; 0 are not\n"
     assert run_main("replay", "ds", "--keys", "0-4").out == "2 pairs are the same, bit for bit; 0 are not\n"
@@ -107,13 +107,6 @@ def test_plan_report_and_sweep_show_filtered_images(photos: Path, run_main: RunM
     page = Path("page.html").read_text(encoding="utf-8")
     assert "failed rows: 0; filtered rows (source.min_side): 3.</p>" in page
     assert "No source failed." in page
-
-
-def test_estimated_bytes_are_those_of_the_run(photos: Path, run_main: RunMain) -> None:
-    planned = run_main("plan", f"source.root={photos}", *ARGUMENTS, "out=ds").out
-    run_main(f"source.root={photos}", *ARGUMENTS, "out=ds")
-    size = sum(path.stat().st_size for path in Path("ds/shards").iterdir())
-    assert f"bytes     {size:,} in shards" in planned
 
 
 def test_filtered_image_has_no_frames(photos: Path, make: Make, run_main: RunMain, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Raw sources have the uses of photographs: clips, levels, parts, clusters, stores, pictures and exports."""
+"""Raw sources have the uses of photographs: clips, levels, parts, clusters, stores and pictures."""
 
 from __future__ import annotations
 
@@ -57,7 +57,6 @@ USES = {
     "replay": (("replay", "ds", "source.root=clips"), "0 are not"),
     "preview": (("preview", "ds", "--keys", "0", "--to", "pictures"), "pictures"),
     "dng": (("dng", "ds", "--keys", "0", "--to", "dngs"), "16 DNG files written"),
-    "export": (("export", "ds", "--format", "npy", "--to", "arrays"), "48 pairs written"),
     "report": (("report", "ds"), "report.html"),
     "noise": (("verify", "ds", "--noise"), "0 wrong"),
     "again": (("again", "ds", "out=copy"), "the same as ds, bit for bit"),
@@ -65,7 +64,7 @@ USES = {
 }
 
 
-@pytest.mark.parametrize("use", slow_except(("regenerate", "preview", "dng", "export", "plan"), USES))
+@pytest.mark.parametrize("use", slow_except(("regenerate", "preview", "dng", "plan"), USES))
 def test_commands_accept_datasets_of_raw_frames(use: str, made: Path, run_main: RunMain, tmp_path: Path) -> None:
     for name in ("ds", "clips"):
         shutil.copytree(made / name, tmp_path / name)

@@ -150,27 +150,14 @@ def preview(call: Call) -> int:
 
 def _check_not_among_photographs(to: Path, root: str | None) -> None:
     """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
-    for source_root in root if isinstance(root, tuple) else [root] if root is not None else []:
-        place = any_path(source_root).resolve()
-        if not isinstance(place, Path) or not place.is_dir():
-            continue
-        if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
-            raise ConfigError(
-                f"--to {to}: is inside the folder of the photographs, {source_root}; expected a folder outside of it, "
-                "because runs would read the pictures; choose another folder"
-            )
-
-
-def export(call: Call) -> int:
-    """Write a dataset, or those of a sweep, in another format."""
-    from unprocess_gen.dataset.export import export as export_pairs
-    from unprocess_gen.pipeline.progress import with_bar
-
-    folder, form = dataset_folder(call, sweeps=True), call.values["format"]
-    for place, done in export_pairs(folder, form, Path(call.values["to"]), partial(with_bar, unit="shard")):
-        before = f", {done.present} written before" if done.present else ""
-        print_result(f"{place}: {counted(done.written, 'pair')} written as {form}{before}; rows in manifest.csv")
-    return 0
+    place = None if root is None else any_path(root).resolve()
+    if not isinstance(place, Path) or not place.is_dir():
+        return
+    if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
+        raise ConfigError(
+            f"--to {to}: is inside the folder of the photographs, {root}; expected a folder outside of it, "
+            "because runs would read the pictures; choose another folder"
+        )
 
 
 def dng(call: Call) -> int:

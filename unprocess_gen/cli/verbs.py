@@ -173,19 +173,6 @@ _VERBS = (
         DATASET,
     ),
     Verb(
-        "export",
-        "write a dataset or sweep in another format; a killed export is continued",
-        "reports.export",
-        (
-            _folder("--to", "write to FOLDER", required=True),
-            choice(
-                ("--format",), "files of NumPy or TIFF, HDF5, or LMDB", "npy", "tiff", "hdf5", "lmdb", required=True
-            ),
-        ),
-        PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
-        resumes=True,
-    ),
-    Verb(
         "again",
         "regenerate a dataset from its config.yaml in another folder, and compare",
         "runs.again",

@@ -595,8 +595,6 @@ class OutputConfig(Group):
         rows, B
     pairs_per_shard
         sources per shard, the unit of work and of a retry
-    parquet
-        write manifest.parquet too: the manifest as typed columns, compressed with zstd; needs pyarrow
     targets
         more arrays for a training: linear_rgb is the scene before the mosaic, srgb the photograph, variance that
         of the noise at each site, noise_std its standard deviation as estimated from the noisy frame
@@ -608,7 +606,6 @@ class OutputConfig(Group):
     clean_dtype: Optional[str] = key(None, Choice("uint16", "float32"), null="the type of dtype", since="0.2")
     layout: str = key("mosaic", Choice("mosaic", "packed"))
     pairs_per_shard: int = key(8, Integers(1, 10**6))
-    parquet: bool = key(False, limits.BOOLEAN, since="0.2")
     targets: tuple[str, ...] = key((), limits.TARGET_NAMES, since="0.3")
     frames: bool = key(True, limits.BOOLEAN, since="0.3")
 

@@ -35,7 +35,6 @@ from unprocess_gen.config.schema import (
     Config,
     EffectsConfig,
     NoiseConfig,
-    OutputConfig,
     SourceConfig,
     all_settings,
 )
@@ -73,7 +72,6 @@ def validate_config(config: Config) -> None:
     """Check a configuration before a run: its values, and whether they fit this machine."""
     check_values(config)
     _check_environment(config)
-    check_parquet(config.output)
     _check_dark_folder(config.noise)
 
 
@@ -102,12 +100,6 @@ def _check_values(config: Config) -> None:
     if executor.address is not None and executor.kind != "dask":
         problem = f"executor={executor.kind} connects to no scheduler; set executor=dask"
         raise refusal("executor.address", executor.address, problem)
-
-
-def check_parquet(output: OutputConfig) -> None:
-    """Check that pyarrow is installed if ``manifest.parquet`` is wanted."""
-    if output.parquet:
-        require("pyarrow", "output.parquet=true: needs pyarrow", "parquet", ", or set output.parquet=false")
 
 
 def _check_settings(config: Config) -> None:

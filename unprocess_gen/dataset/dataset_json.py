@@ -9,9 +9,6 @@ import msgspec
 from unprocess_gen.core.records import Amount, Count, Digest, check_record
 from unprocess_gen.dataset.shards import shard_name
 
-PARQUET_SHA256 = "parquet_sha256"
-"""Key of the digest of ``manifest.parquet``; missing if the dataset has no such file."""
-
 
 class SourceFacts(msgspec.Struct, frozen=True):
     """Hold kind and place of the sources, and the file that lists them."""
@@ -72,7 +69,6 @@ class DatasetFacts(msgspec.Struct, frozen=True):
     run: RunFacts | None = None
     versions: dict[str, str] | None = None
     dark_frames: DarkFrameFacts | None = None
-    parquet_sha256: Digest | None = None
 
 
 def check_dataset_json(facts: Any) -> DatasetFacts:

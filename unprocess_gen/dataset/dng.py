@@ -140,7 +140,7 @@ def _writable(row: Row) -> Row:
         )
     if row["pattern"] == MONO:
         problem = "has no colour filters, and raw converters differ in what they open as such a DNG"
-        raise ConfigError(f"--keys {key}: pattern=MONO: {problem}; expected a Bayer pattern; use gen-dataset export")
+        raise ConfigError(f"--keys {key}: pattern=MONO: {problem}; expected a Bayer pattern; use RawPairs")
     if min(width, height) < LEAST_SIDE_PX:
         raise ConfigError(
             f"--keys {key}: is {width} x {height}; LibRaw, which most raw converters read with, opens no DNG with a "

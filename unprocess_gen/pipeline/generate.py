@@ -262,7 +262,6 @@ def _finish(workspace: Workspace, run: Run, made: Made, started: float) -> dict[
     return workspace.finish(
         len(run.tasks()),
         lambda tally: dataset_json_facts(run.settings, listing.not_matched, listing.skipped_links, tally, facts),
-        run.config.output.parquet,
     )
 
 

@@ -188,7 +188,6 @@ def merge(out: str) -> tuple[Summary, int]:
         facts = workspace.finish(
             plan.shards,
             lambda tally: dataset_json_facts(settings, plan.not_matched, plan.skipped_links, tally, {"parts": parts}),
-            run.config.output.parquet,
         )
     summary = Summary.of(out, facts, started)
     return replace(summary, made=summary.rows), plan.max_failed

@@ -22,8 +22,6 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.types import Row, Value
-from unprocess_gen.dataset import parquet
-from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import has_frames, read_columns, read_rows, row_json
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
@@ -152,10 +150,7 @@ def _without_path(error: DamageError) -> str:
 
 
 def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
-    files = [("config.yaml", "config_sha256"), ("manifest.csv", "manifest_sha256")]
-    if PARQUET_SHA256 in facts:
-        files.append((parquet.PARQUET_NAME, PARQUET_SHA256))
-    for name, field in files:
+    for name, field in (("config.yaml", "config_sha256"), ("manifest.csv", "manifest_sha256")):
         try:
             digest = file_sha256(folder / name)
         except FileNotFoundError:

@@ -7,7 +7,6 @@
     out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists (`run_records`)
     out/shards/                  complete shards
     out/manifest.csv             written once every shard is committed or provisional
-    out/manifest.parquet         the manifest as typed columns, if output.parquet is true
     out/dataset.json             written last; then .work is deleted, unless a shard is provisional
     out/report.html              the page of the verb ``report``; not part of the dataset
 
@@ -34,12 +33,11 @@ from yaml import YAMLError
 from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
-from unprocess_gen.core.files import file_sha256, machine_errors
+from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import MAX_BYTES, parse_json
 from unprocess_gen.core.types import Source
-from unprocess_gen.dataset import parquet
-from unprocess_gen.dataset.dataset_json import PARQUET_SHA256, check_dataset_json
+from unprocess_gen.dataset.dataset_json import check_dataset_json
 from unprocess_gen.dataset.manifest import header_text, read_rows
 from unprocess_gen.pipeline.run_records import INDEX, ShardRecords, recorded_sources, write_listing
 from unprocess_gen.pipeline.storage import WORK, Storage, cannot_write
@@ -215,9 +213,7 @@ class Workspace:
                 f"out={self.out}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
             )
 
-    def finish(
-        self, shards: int, facts_of: Callable[[Tally], dict[str, Any]], with_parquet: bool = False
-    ) -> dict[str, Any]:
+    def finish(self, shards: int, facts_of: Callable[[Tally], dict[str, Any]]) -> dict[str, Any]:
         """Write ``manifest.csv``, then ``dataset.json``, and return the latter's contents.
 
         If a shard is provisional, ``.work`` is kept, so that the next run retries it. Raises MachineError or
@@ -233,9 +229,8 @@ class Workspace:
                     digest.update(text)
                     stream.write(text)
             manifest_sha256 = digest.hexdigest()
-            derived = add_parquet(self.storage, manifest) if with_parquet else {}
             (self.storage / "manifest.csv").commit(manifest)
-            dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, derived | facts_of(tally))
+            dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, facts_of(tally))
             self.storage.write("dataset.json", dataset_text(dataset))
             self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
         return dataset
@@ -247,15 +242,6 @@ class Workspace:
             entries.append(record.entry)
             tally.add(record.tally)
             yield record.csv
-
-
-def add_parquet(storage: Storage, manifest: Path) -> dict[str, Any]:
-    """Write ``manifest.parquet``; return what ``dataset.json`` holds about it."""
-    path = storage.scratch / parquet.PARQUET_NAME
-    parquet.write_parquet(manifest, path)
-    sha256 = file_sha256(path)
-    (storage / parquet.PARQUET_NAME).commit(path)
-    return {PARQUET_SHA256: sha256}
 
 
 def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:
