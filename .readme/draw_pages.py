@@ -68,7 +68,8 @@ def main() -> None:
         gen_dataset(f"out={folder}/ds", "noise=imx385_iso12800", "gains=fixed")
         gen_dataset("report", f"{folder}/ds")
         gen_dataset("dng", f"{folder}/ds", "--keys", CHART, "--to", f"{folder}/dng")
-        gen_dataset("figures", f"out={folder}/figures")
+        figures = HERE.parent / "docs" / "figures" / "draw.py"
+        subprocess.run([sys.executable, str(figures), f"out={folder}/figures", "source.limit=1"], check=True)
         save(screenshot(folder / "ds" / "report.html", 1220, 2100, 0.5), "page.png")
         frames = [developed(folder / "dng" / f"{CHART}.{frame}.dng") for frame in ("clean", "noisy")]
         save(cv2.resize(np.hstack(frames), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), "dng.png")

@@ -484,7 +484,7 @@ HINTS = [
         ("plan", "./moved"),
         "plan: ./moved: expected a setting key=value; ./moved is a file or folder: write source",
     ),
-    (("figures", "ds"), "figures: ds: expected a setting key=value; ds is a dataset: write gen-dataset verify ds"),
+    (("accuracy", "ds"), "accuracy: ds: expected a setting key=value; ds is a dataset: write gen-dataset verify ds"),
     (("again", "ds", "out=ds"), "again: out=ds: is the dataset itself; expected another folder"),
 ]
 
@@ -517,7 +517,6 @@ OUTPUTS = [
     ("dng", "DS", "--keys", "2", "--to", "DS/new"),
     ("report", "DS", "--to", "DS/page.html"),
     ("verify", "DS", "--log-file", "DS/manifest.csv"),
-    ("figures", "out=DS/figures"),
     ("accuracy", "out=DS/accuracy"),
 ]
 

@@ -1,9 +1,8 @@
-"""Run the verbs that report on settings or on a dataset: plan, accuracy, figures, report, preview and dng."""
+"""Run the verbs that report on settings or on a dataset: plan, accuracy, report, preview and dng."""
 
 from __future__ import annotations
 
 import os
-import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -56,27 +55,6 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
     report = measure_accuracy(config, command)
     write_accuracy(report, out)
     return 0, None, [report_text(report), f"{out}: {', '.join(REPORT_FILES)}"]
-
-
-FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")
-"""Settings that ``figures`` accepts; the article determines the others."""
-
-
-def figures(call: Call) -> int:
-    """Draw the article's figures for one photograph."""
-    for override in call.overrides:
-        if re.split(r"[.=]", override)[0] not in FIGURE_KEYS:
-            raise ConfigError(f"figures: {override}: the article sets it; expected {', '.join(FIGURE_KEYS)}")
-    return _compose_report(call, _figures)
-
-
-def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
-    from unprocess_gen.reports.paper import figures as paper_figures
-
-    require_photographs(config.source, "figures")
-    out = _report_folder(config, "figures")
-    files = paper_figures.write_figures(paper_figures.draw_figures(config), out, command)
-    return 0, None, [f"{out}: {', '.join(files)}"]
 
 
 def _compose_report(call: Call, task: Callable[..., tuple[int, None, list[str]]]) -> int:

@@ -99,9 +99,6 @@ _VERBS = (
     _composing(
         "accuracy", "measure time and error of each tier, stage by stage; default out: accuracy", "reports.accuracy"
     ),
-    _composing(
-        "figures", "draw the article's figures for the first photograph; default out: figures", "reports.figures"
-    ),
     Verb(
         "verify",
         "check every byte of a dataset or sweep; repair, regenerate, check noise",

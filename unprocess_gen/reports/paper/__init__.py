@@ -1,1 +1,0 @@
-"""Draw the figures of the article for a photograph."""
