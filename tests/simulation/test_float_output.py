@@ -283,7 +283,7 @@ def test_every_byte_is_verified_and_every_pair_regenerated(packed: Path, photos:
 def test_plan_reports_the_loss_of_odd_sides(photos: Path, run_main: RunMain) -> None:
     done = run_main("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
     assert done.code == 0
-    assert "packed    8 of 12 images have an odd side, whose last row or column is omitted: " in done.out
+    assert "patches   complete images without the last row or column of an odd side: " in done.out
     assert "one.png: too_small\n          1 x 1 pixels contain no 2 x 2 tile" in done.out
 
 

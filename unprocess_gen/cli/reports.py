@@ -28,17 +28,18 @@ if TYPE_CHECKING:
 
 def plan(call: Call) -> int:
     """Estimate pairs, bytes and time of a run, and explain which effects it simulates."""
-    return compose(call, partial(_plan, read_all="all" in call.values), totals=plan_totals)
+    task = partial(_plan, read_all="all" in call.values, with_numbers="numbers" in call.values)
+    return compose(call, task, totals=plan_totals)
 
 
-def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate, list[str]]:
+def _plan(config: Config, label: str = "", *, read_all: bool, with_numbers: bool) -> tuple[int, RunEstimate, list[str]]:
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run
     from unprocess_gen.reports.plan_text import format_estimate
 
     estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all)
     blank = [""] if label and not label.startswith("1/") else []
-    return 0, estimate, [*blank, f"out       {config.out}", format_estimate(estimate)]
+    return 0, estimate, [*blank, f"out       {config.out}", format_estimate(estimate, with_numbers)]
 
 
 def accuracy(call: Call) -> int:

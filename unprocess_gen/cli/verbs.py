@@ -94,7 +94,8 @@ _VERBS = (
         "plan",
         "estimate pairs, bytes and time, and explain the effects; write nothing",
         "reports.plan",
-        Argument(("--all",), "read every photograph, for exact sizes"),
+        Argument(("--all",), "read every photograph, and name those that fail"),
+        Argument(("--numbers",), "state the source of each number of the noise profile"),
     ),
     _composing(
         "accuracy", "measure time and error of each tier, stage by stage; default out: accuracy", "reports.accuracy"

@@ -5,6 +5,7 @@ The pairs of up to `SAMPLE` evenly spaced sources are made, or of all sources on
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import os
@@ -31,7 +32,7 @@ from unprocess_gen.pipeline.targets import noise_law, targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
 from unprocess_gen.planning.source_noise import noise_ratio
-from unprocess_gen.reports.empty_bands import NO_BANDS, EmptyBands, empty_bands
+from unprocess_gen.reports.highlights import coarse_share
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.loader import load_source
@@ -41,13 +42,6 @@ LOGGER = logging.getLogger("unprocess_gen")
 
 SAMPLE = 8
 """Number of sources of which pairs are made, unless all are asked for."""
-
-
-COMMIT_SECONDS = 0.045
-"""Time to sync and rename a shard (``docs/performance.md``)."""
-
-IMPORT_SECONDS = min(time.process_time(), 3.0)
-"""Time that a process needs for its imports and settings: what this one took so far, unless it did something else."""
 
 TRIAL_BYTES = 2**24
 """Bytes written to measure the disk."""
@@ -59,8 +53,8 @@ class SourceEstimate:
 
     ``bytes`` is the size of its pairs in a shard, ``seconds`` the time it took to make them. ``levels`` and
     ``predictions`` have an item for each noise level. ``unused_pixels`` are in no patch. ``clean_levels`` counts the
-    distinct DN of the first clean frame, 0 if it is not rounded. ``noise_ratio`` compares the noise of the source with
-    the simulated noise; None if it is not known.
+    distinct DN of the first clean frame, 0 if it is not rounded. ``coarse_share`` is that of `highlights.coarse_share`.
+    ``noise_ratio`` compares the noise of the source with the simulated noise; None if it is not known.
     """
 
     source: Source
@@ -76,7 +70,7 @@ class SourceEstimate:
     pixels: int = 0
     unused_pixels: int = 0
     clean_levels: int = 0
-    bands: EmptyBands = NO_BANDS
+    coarse_share: float = 0.0
     noise_ratio: float | None = None
 
 
@@ -118,40 +112,48 @@ class RunEstimate:
 def estimate_run(config: Config, n_jobs: int, read_all: bool) -> RunEstimate:
     """Estimate a run by making the pairs of a sample of its sources, or of all; the time is divided by ``n_jobs``."""
     run = resolve(config)
-    config, sources, tasks = run.config, run.sources, run.tasks()
-    n_jobs = min(n_jobs, len(tasks))
-    start_seconds = IMPORT_SECONDS * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
+    config, sources, shards = run.config, run.sources, len(run.tasks())
+    n_jobs = min(n_jobs, shards)
+    start_seconds = _import_seconds() * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
     start_seconds += _compile_kernels(without_dark_frames(config))
     sample = sources if read_all else evenly_spaced(sources, SAMPLE)
     estimates = tuple(estimate_source(run.settings, source) for source in with_bar(sample, "photograph"))
     growth = len(sources) / len(sample)
     size = round(sum(source.bytes for source in estimates) * growth)
     folder = any_path(config.out).scratch_place("")[0]
+    commit_s = _write_seconds(folder, 1)
+    byte_s = max(_write_seconds(folder, TRIAL_BYTES) - commit_s, 0.0) / TRIAL_BYTES
     return RunEstimate(
         run,
         n_jobs,
         estimates,
-        len(tasks),
+        shards,
         size,
         free_bytes=free_bytes(folder),
         start_seconds=start_seconds,
         pair_seconds=sum(source.seconds for source in estimates) * growth / n_jobs,
-        disk_seconds=len(tasks) * COMMIT_SECONDS + size * _seconds_per_byte(folder),
+        disk_seconds=shards * commit_s + size * byte_s,
     )
 
 
-def _seconds_per_byte(out: Path) -> float:
-    """Measure the time to write and sync a byte on the disk of ``out``; 0 if the folder cannot be written."""
+@functools.cache
+def _import_seconds() -> float:
+    """Processor time of this process before its first estimate: of a command, its imports and settings."""
+    return time.process_time()
+
+
+def _write_seconds(out: Path, size: int) -> float:
+    """Measure the time to write and sync a file on the disk of ``out``; 0 if the folder cannot be written."""
     folder = next(path for path in (out.absolute(), *out.absolute().parents) if path.is_dir())
+    started = time.perf_counter()
     try:
         with tempfile.TemporaryFile(dir=folder) as trial:
-            started = time.perf_counter()
-            trial.write(bytes(TRIAL_BYTES))
+            trial.write(bytes(size))
             trial.flush()
             os.fsync(trial.fileno())
-            return (time.perf_counter() - started) / TRIAL_BYTES
     except OSError:
         return 0.0
+    return time.perf_counter() - started
 
 
 def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
@@ -186,7 +188,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         pixels=width * height,
         unused_pixels=pixels_in_none(image.patches, height, width),
         clean_levels=clean_levels,
-        bands=empty_bands(photograph.srgb, levels[0]),
+        coarse_share=coarse_share(photograph.srgb, levels[0]),
         noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, levels[0]),
     )
 

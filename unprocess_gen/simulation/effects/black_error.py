@@ -33,7 +33,6 @@ class BlackError(Effect):
 
     name = "black_error"
     meaning = "difference between black and the black level, by CFA site; fixed pattern"
-    cost_ns = 0.1
     numbers = BlackErrorNumbers
     is_fixed = is_in_dark_frames = True
 

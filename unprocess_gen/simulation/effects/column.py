@@ -26,7 +26,6 @@ class ColumnNoise(Effect):
 
     name = "column"
     meaning = "an offset of each column; fixed pattern"
-    cost_ns = 0.1
     numbers = ColumnNumbers
     is_fixed = is_in_dark_frames = True
 

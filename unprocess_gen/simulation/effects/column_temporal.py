@@ -29,7 +29,6 @@ class ColumnTemporal(Effect):
 
     name = "column_temporal"
     meaning = "an offset of each column, new in every frame"
-    cost_ns = 0.6
     numbers = ColumnTemporalNumbers
     since = "0.2"
     is_in_dark_frames = True

@@ -46,7 +46,6 @@ class DarkCurrent(Effect):
 
     name = "dark_current"
     meaning = "Poisson counts of thermal electrons"
-    cost_ns = 15.5
     numbers = DarkCurrentNumbers
     keys = HEAT
     heat = is_before_well = is_in_dark_frames = masks = True

@@ -91,7 +91,6 @@ class DarkFrameNoise(Effect):
 
     name = "dark_frame"
     meaning = "noise of the read-out, sampled from dark frames"
-    cost_ns = 4.0
     has_switch = False
 
     def noise_dn(self, crop: Crop) -> Float:

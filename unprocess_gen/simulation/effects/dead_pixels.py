@@ -41,7 +41,6 @@ class DeadPixels(Effect):
 
     name = "dead_pixels"
     meaning = "few pixels that record no light; fixed pattern"
-    cost_ns = 1.1
     numbers = DeadPixelNumbers
     is_fixed = has_outliers = True
 

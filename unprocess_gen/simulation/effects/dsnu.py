@@ -31,7 +31,6 @@ class Dsnu(Effect):
 
     name = "dsnu"
     meaning = "unequal offsets of pixels; fixed pattern"
-    cost_ns = 0.3
     numbers = DsnuNumbers
     since = "0.3"
     is_fixed = is_in_dark_frames = True

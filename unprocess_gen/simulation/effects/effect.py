@@ -86,9 +86,6 @@ class Effect:
         Name in settings and rows, and of its random stream in `random_streams.STREAMS`.
     meaning : str
         One phrase for users.
-    cost_ns : float
-        Cost in nanoseconds per pixel, which ``plan`` prints (``tests/benchmarks/bench_scenes.py``; AVX2, one thread).
-        It decides nothing. Conditions: ``docs/design/effect_selection.md``.
     numbers : type
         Dataclass of the numbers.
     keys : mapping of str to Number
@@ -116,7 +113,6 @@ class Effect:
 
     name: ClassVar[str]
     meaning: ClassVar[str]
-    cost_ns: ClassVar[float]
     numbers: ClassVar[type[EffectNumbers]] = EffectNumbers
     keys: ClassVar[Mapping[str, Number]] = {}
     heat: ClassVar[bool] = False

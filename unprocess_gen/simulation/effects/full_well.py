@@ -27,7 +27,6 @@ class FullWell(Effect):
 
     name = "full_well"
     meaning = "saturation capacity, at which the clean and the noisy frame are clipped"
-    cost_ns = 0.1
     numbers = FullWellNumbers
 
     def electrons(self, electrons: Float, crop: Crop) -> Float:

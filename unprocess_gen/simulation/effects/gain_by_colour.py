@@ -35,7 +35,6 @@ class GainByColour(Effect):
 
     name = "gain_by_colour"
     meaning = "a system gain of its own for each colour"
-    cost_ns = 0.3
     numbers = GainByColourNumbers
     since = "0.2"
 

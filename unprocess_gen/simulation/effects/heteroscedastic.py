@@ -19,7 +19,6 @@ class Heteroscedastic(Effect):
 
     name = "heteroscedastic"
     meaning = "noise of a two-parameter profile, its only effect"
-    cost_ns = 1.8
 
     def expected(self, site: Site) -> EffectNoise:
         """Variance a·signal + b; normal, or Poisson counts with the gain a and normal read noise."""

@@ -35,7 +35,6 @@ class HotPixels(Effect):
 
     name = "hot_pixels"
     meaning = "few pixels with a far larger dark current; fixed pattern"
-    cost_ns = 1.0
     numbers = HotPixelNumbers
     heat = is_fixed = is_before_well = is_in_dark_frames = has_outliers = True
 

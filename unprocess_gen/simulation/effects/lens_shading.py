@@ -94,7 +94,6 @@ class LensShading(Effect):
 
     name = "lens_shading"
     meaning = "less light towards the corners, in the clean and the noisy frame"
-    cost_ns = 15.1
     numbers = LensShadingNumbers
     since = "0.2"
     in_both_frames = True

@@ -26,7 +26,6 @@ class Prnu(Effect):
 
     name = "prnu"
     meaning = "unequal response of pixels; fixed pattern"
-    cost_ns = 3.3
     numbers = PrnuNumbers
     is_fixed = is_before_well = True
 

@@ -15,7 +15,6 @@ class Quantise(Effect):
 
     name = "quantise"
     meaning = "rounding and clipping; on for uint16, off for float32"
-    cost_ns = 0.3
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the variance of rounding."""

@@ -44,7 +44,6 @@ class ReadNoise(Effect):
 
     name = "read"
     meaning = "noise of the amplifier and the converter"
-    cost_ns = 1.8
     numbers = ReadNumbers
     masks = True
 

@@ -39,7 +39,6 @@ class RowNoise(Effect):
 
     name = "row"
     meaning = "an offset of each row, new in every frame"
-    cost_ns = 0.1
     numbers = RowNumbers
     is_in_dark_frames = True
 

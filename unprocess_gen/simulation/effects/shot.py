@@ -34,7 +34,6 @@ class Shot(Effect):
 
     name = "shot"
     meaning = "Poisson counts of electrons"
-    cost_ns = 9.5
     numbers = ShotNumbers
     is_before_well = masks = True
 
