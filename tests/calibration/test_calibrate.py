@@ -84,18 +84,17 @@ def test_profile_is_used_as_it_was_written(calibrated: Any, run_main: RunMain, t
 
 @pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.7, 1.0, 0.4)], ids=["neutral", "coloured"])
 def test_numbers_of_the_body_are_measured(light: tuple[float, float, float], calibrated: Any, tmp_path: Path) -> None:
-    """Gains by colour, full well, dark current and its doubling agree with the true values in their errors."""
+    """Gains by colour, full well and dark current agree with the true values in their errors."""
     gains, full_e = (1.1, 1.0, 0.9), 2000.0
     numbers = Numbers(4.0, 5.0, 0.0, gains=gains, full_well_e=full_e, dark_e_per_s=20.0, prnu_std=0.01, light=light)
     numbers = replace(numbers, hot_share=0.004, hot_e_per_s=50.0)
-    darks = [Shot(0.0, seconds, celsius) for celsius in (20.0, 32.0) for seconds in (0.01, 1.0, 4.0) for _ in range(3)]
+    darks = [Shot(0.0, seconds, 32.0) for seconds in (0.01, 1.0, 4.0) for _ in range(3)]
     lights = (0.03, 0.08, 0.13, 0.18, 0.23, 0.28, 0.4, 0.7)
     shots = [*darks, *(Shot(light) for light in lights for _ in range(2))]
     profile = calibrated(with_levels(draw(tmp_path / "captures", numbers, 0, shots=shots)))
     found, written = estimates(profile), yaml.safe_load(profile.read_text(encoding="utf-8"))
     for name, true in (
-        *(("full_well_e", full_e), ("dark_e_per_s", 80.0), ("dark_doubling_c", 6.0)),
-        *(("prnu_std", 0.01), ("dead_pixel_share", 0.0)),
+        *(("full_well_e", full_e), ("dark_e_per_s", 80.0), ("prnu_std", 0.01)),
         *(("hot_pixel_share", 0.004), ("hot_pixel_e_per_s", 200.0)),
     ):
         row = found[name, None, None]
@@ -140,9 +139,7 @@ def test_page_shows_estimates_with_intervals_and_figures(calibrated: Any, tmp_pa
     profile = calibrated(two_isos(tmp_path), "--report", str(page))
     text, gain = page.read_text(encoding="utf-8"), estimates(profile)["dn_per_e", 800, None]
     assert all(short_number(gain[end], 4) in text for end in ("value", "low", "high"))
-    for part in ("Against ISO", "photon transfer, residuals, histogram", "spectra", "Next to known sensors"):
-        assert part in text
-    assert "8 to 14 times too small" in " ".join(text.split())
+    assert "Against ISO" in text and "photon transfer, residuals, histogram" in text
 
 
 def test_folder_without_list_is_read_by_metadata(calibrated: Any, tmp_path: Path) -> None:

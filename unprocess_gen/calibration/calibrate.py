@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from unprocess_gen.calibration.body import measure_body, without_dark_current
-from unprocess_gen.calibration.captures import CaptureSet, read_captures
+from unprocess_gen.calibration.captures import CaptureSet, common, read_captures
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.measure import Watch, measure_iso
 from unprocess_gen.calibration.profile import (
@@ -48,8 +48,9 @@ def measure_all(captures: CaptureSet, watch: Watch, gains: Mapping[float, Estima
     """Measure each ISO, and what all ISOs show together; of ISOs whose gain is given, darks alone are measured."""
     results = [measure_iso(captures, iso, watch, (gains or {}).get(iso)) for iso in captures.isos]
     body = measure_body(results, captures.sensor)
-    results = [without_dark_current(result, body) for result in results]
-    calibration = Calibration(captures, results, body, [])
+    results = [without_dark_current(result, body["dark_e_per_s"]) for result in results]
+    darks = {capture.path: capture for capture in captures.captures if capture.kind == "dark"}
+    calibration = Calibration(captures, results, body, common(darks, "temperature_c"), [])
     notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(calibration)]
     return replace(calibration, notes=_merged(notes))
 

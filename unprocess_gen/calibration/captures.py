@@ -10,9 +10,9 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -31,6 +31,7 @@ from unprocess_gen.sources.raw.metadata import read_metadata
 TABLE, EMVA = "captures.csv", "EMVA1288_Data.txt"
 REQUIRED = ("file", "kind", "iso")
 OPTIONAL = ("exposure_s", "level", "temperature_c", "black_level_dn", "white_level_dn", "bits", "pattern")
+SENSOR_FACTS = ("bits", "black_level_dn", "white_level_dn", "pattern")
 KIND_NAMES = {"dark": ("dark", "bias"), "flat": ("flat",)}
 """Kinds of frames, and the words by which names state them."""
 EMVA_ISO = 100.0
@@ -63,10 +64,9 @@ class Capture:
     temperature_c: Annotated[float, Meta(gt=-273, le=1e9)] | None = None
 
     @property
-    def group(self) -> tuple[float, str, float, str, float]:
-        """Key that the frames of one measurement share."""
-        seconds = -1.0 if self.exposure_s is None else self.exposure_s
-        return self.iso, self.kind, seconds, self.level, self.temperature_c or 0.0
+    def group(self) -> tuple[float, str]:
+        """Key that the frames of one ISO and measurement share."""
+        return -1.0 if self.exposure_s is None else self.exposure_s, self.level
 
     def pixels(self) -> NDArray[np.uint16]:
         """Decode the mosaic, uint16 [H, W] with even sides.
@@ -108,11 +108,13 @@ class CaptureSet(NamedTuple):
 
     def groups(self, kind: str, iso: float) -> Iterator[list[Capture]]:
         """Yield the frames of each exposure and level of one ISO; levels that are not stated follow from the light."""
-        frames = [frame for frame in self.captures if (frame.kind, frame.iso) == (kind, iso)]
-        for _, group in groupby(sorted(frames, key=lambda frame: frame.group), key=lambda frame: frame.group):
-            together = list(group)
-            has_level = kind == "dark" or together[0].level or len(together) <= 2
-            yield from [together] if has_level else _by_light(together, self.sensor.black_dn)
+        groups = defaultdict(list)
+        for frame in self.captures:
+            if (frame.kind, frame.iso) == (kind, iso):
+                groups[frame.group].append(frame)
+        for (_, level), frames in sorted(groups.items()):
+            has_level = kind == "dark" or level or len(frames) <= 2
+            yield from [frames] if has_level else _by_light(frames, self.sensor.black_dn)
 
     @property
     def isos(self) -> list[float]:
@@ -166,14 +168,12 @@ def _from_list(folder: Path) -> Iterator[Capture]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
-            missing = [name for name in REQUIRED if name not in (reader.fieldnames or ())]
             names = list(reader.fieldnames or ())
-            unknown = [name for name in names if name not in (*REQUIRED, *OPTIONAL) or names.count(name) > 1]
-            if missing or unknown:
-                problem = (
-                    f"the column {missing[0]} is missing" if missing else f"{unknown[0]!r} is unknown or occurs twice"
-                )
-                raise ConfigError(f"{path}: {problem}; expected {','.join(REQUIRED)} and any of {','.join(OPTIONAL)}")
+            wrong = [name for name in REQUIRED if name not in names]
+            wrong += [name for name in names if name not in (*REQUIRED, *OPTIONAL) or names.count(name) > 1]
+            if wrong:
+                expected = f"expected {','.join(REQUIRED)} and any of {','.join(OPTIONAL)}"
+                raise ConfigError(f"{path}: column {wrong[0]!r} is missing, is unknown, or occurs twice; {expected}")
             rows = [(number, row) for number, row in enumerate(reader, start=2) if any(row.values())]
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not text in UTF-8 ({error.reason}); save it as UTF-8") from error
@@ -221,19 +221,16 @@ def _metadata(file: Path) -> dict[str, Any]:
 def _from_names(folder: Path, default: str | None = None) -> Iterator[Capture]:
     """Yield the raw files of a folder; their names, or the names of their folders, state the kind."""
     for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
-        if file.suffix.lower() not in RAW_FILES:
-            raise ConfigError(
-                f"calibrate: {file}: states no ISO; expected raw files, or {TABLE} in {folder} with the columns "
-                f"{','.join((*REQUIRED, 'exposure_s', 'level'))}"
-            )
-        name = str(file.relative_to(folder)).lower()
+        name, facts = str(file.relative_to(folder)).lower(), dict[str, Any]()
         kinds = [kind for kind, words in KIND_NAMES.items() if any(word in name for word in words)]
-        kinds = [default] if default and not kinds else kinds
-        facts = _metadata(file)
+        if not kinds and default:
+            kinds = [default]
+        if file.suffix.lower() in RAW_FILES:
+            facts = _metadata(file)
         if len(kinds) != 1 or "iso" not in facts:
-            problem = "its name has neither dark nor flat" if not kinds else "its name has dark and flat"
-            problem = "it states no ISO" if len(kinds) == 1 else problem
-            raise ConfigError(f"calibrate: {file}: {problem}; expected {TABLE} in {folder}, with a line for each frame")
+            problem = "its name has not one of the words dark and flat" if "iso" in facts else "it states no ISO"
+            expected = f"expected {TABLE} in {folder} with the columns {','.join((*REQUIRED, 'exposure_s', 'level'))}"
+            raise ConfigError(f"calibrate: {file}: {problem}; {expected}")
         yield Capture(file, kinds[0], **facts)
 
 
@@ -271,14 +268,11 @@ def _from_emva(folder: Path) -> Iterator[Capture]:
 def _sensor(captures: list[Capture], notes: list[str], default: Sensor | None) -> Sensor:
     """Return the sensor of all frames; levels that no file states are measured, with a note."""
     files = {capture.path: capture for capture in captures}
-    stated = {name: common(files, name) for name in ("bits", "black_level_dn", "white_level_dn", "pattern")}
+    bits, black, white, pattern = (common(files, name) for name in SENSOR_FACTS)
     if default is not None:
-        own = zip(stated, (default.bits, default.black_dn, default.white_dn, default.pattern), strict=True)
-        stated = {name: value if stated[name] is None else stated[name] for name, value in own}
+        bits, pattern = bits or default.bits, pattern or default.pattern
+        black, white = default.black_dn if black is None else black, white or default.white_dn
     height, width = captures[0].pixels().shape
-    shape = height, width
-    darks = [capture for capture in captures if capture.kind == "dark"]
-    black, white, bits = stated["black_level_dn"], stated["white_level_dn"], stated["bits"]
     if bits is None:
         brightest = max(int(capture.pixels().max()) for capture in captures) if white is None else int(white)
         bits = next(number for number in (8, 10, 12, 14, 16) if brightest < 2**number)
@@ -286,18 +280,19 @@ def _sensor(captures: list[Capture], notes: list[str], default: Sensor | None) -
     if white is None:
         white = 2.0**bits - 1
         notes.append(f"white_level_dn={white:g}: not stated, the largest value of {bits} bits is assumed")
+    darks = [capture for capture in captures if capture.kind == "dark"]
     if black is None and darks:
         shortest = min(darks, key=lambda capture: capture.exposure_s or 0.0)
         black = float(np.rint(shortest.pixels().mean()))
         notes.append(f"black_level_dn={black:g}: not stated, rounded mean of {shortest.path.name}")
-    if stated["pattern"] is None:
+    if pattern is None:
         notes.append("pattern=RGGB: not stated, and assumed; only the names of the sites depend on it")
     if not (black or 0.0) < white < 2**bits:
         raise ConfigError(
             f"calibrate: black_level_dn={black:g}, white_level_dn={white:g}, bits={bits}: expected black below white "
             "within the bits; correct them in captures.csv"
         )
-    return Sensor(bits, float(round(black or 0.0)), float(round(white)), stated["pattern"] or "RGGB", shape)
+    return Sensor(bits, float(round(black or 0.0)), float(round(white)), pattern or "RGGB", (height, width))
 
 
 def common(files: Mapping[Path, Any], name: str) -> Any:

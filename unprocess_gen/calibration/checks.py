@@ -15,7 +15,6 @@ import numpy as np
 from unprocess_gen.calibration.captures import Capture, Sensor
 from unprocess_gen.calibration.frame_sums import Measured
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Float
 from unprocess_gen.statistics.scores import UNFORESEEN, Score, alarm_limit
 
 
@@ -155,20 +154,13 @@ def check_dark_noise(frames: Sequence[Capture], sensor: Sensor, std_dn: float) -
 def check_flat(frames: Sequence[Capture], sensor: Sensor, flat: Measured, dark: Measured, notes: list[str]) -> None:
     """Refuse flats whose light changes in time or over the frame; warn of doubtful ones."""
     signal = max(float(flat.mean_dn.mean() - dark.mean_dn.mean()), 1.0)
-    noise = float(flat.total.mean()) / flat.sites / signal**2  # of the mean of a plane
+    noise = float(flat.variance.mean()) / flat.sites / signal**2  # of the mean of a plane
     drift = float(dark.frame_means.mean(axis=1).var(ddof=1)) / signal**2
     rows = max(flat.row[0] - dark.row[0], 0.0) / signal**2
-    bands = math.sqrt(rows)
+    bands, blocks = math.sqrt(rows), flat.shading - sensor.black_dn
     scores = {
         "flicker": Score(float(np.ptp(flat.frame_means.mean(axis=1))) / signal, 1.0, 2 * max(drift, noise / 4)),
         "bands": Score(bands, 1.0, (flat.row[1] / signal**2 / 2 / bands) ** 2 if rows else 0.0),
-        "vignetting": Score(_vignetting(flat.shading - sensor.black_dn), 1.0, 8 * noise / flat.count),
+        "vignetting": Score(1 - float(blocks.min() / max(blocks.max(), 1.0)), 1.0, 8 * noise / flat.count),
     }
     _check(frames, scores | _pixel_scores(flat), notes)
-
-
-def _vignetting(shading: Float) -> float:
-    """Return how much darker the darkest sixteenth of a frame is than the brightest."""
-    side = len(shading) // 4
-    blocks = shading.reshape(4, side, 4, side).mean(axis=(1, 3))
-    return 1 - float(blocks.min() / blocks.max()) if blocks.max() > 0 else 0.0

@@ -34,8 +34,6 @@ ROBUST = 1.4826
 """Standard deviation of normal values over their median absolute deviation."""
 LARGEST_Z = 5.0
 """Bound of the normalised differences whose correlation is measured."""
-BLOCKS = 16
-"""Blocks of a frame across and down whose means are compared; a multiple of it in large frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +50,6 @@ class Measured:
         mean of the planes without defects
     variance, error
         temporal variance of a site without offsets of rows, and its standard error
-    total
-        temporal variance of a site with them
     row, column, fixed_column
         variance of offsets of rows, of columns in one frame, of columns in all frames; each with its standard error
     row_correlation
@@ -65,9 +61,9 @@ class Measured:
     correlation
         correlation of pairs of neighbours in a difference of two frames, the largest of all distances
     shading
-        means of blocks of the frame
-    row_offsets, column_offsets
-        means of the rows of the first frame and of the columns of all frames, minus the means of the planes
+        means of sixteenths of the mean frame, [4, 4] DN
+    column_offsets
+        means of the columns of all frames minus the means of the planes, [4, W] DN
     """
 
     count: int
@@ -77,7 +73,6 @@ class Measured:
     mean_dn: Float
     variance: Float
     error: Float
-    total: Float
     row: tuple[float, float]
     column: tuple[float, float]
     fixed_column: tuple[float, float]
@@ -87,7 +82,6 @@ class Measured:
     codes: NDArray[np.int64]
     correlation: Score
     shading: Float
-    row_offsets: Float
     column_offsets: Float
 
     @property
@@ -158,7 +152,6 @@ class FrameSums:
             mean_dn=mean_dn,
             variance=variance,
             error=np.hypot(total_error, row_variance * math.sqrt(2 / (height * (count - 1)))),
-            total=total - means.var(axis=0, ddof=1),
             row=row,
             column=column,
             fixed_column=_fixed_offsets(offsets, still, max(column[0], 0.0) / count),
@@ -168,7 +161,6 @@ class FrameSums:
             codes=self._codes,
             correlation=_correlation(self._pair),
             shading=_block_means(mean_frame),
-            row_offsets=own_rows[0],
             column_offsets=offsets,
         )
 
@@ -253,7 +245,6 @@ def _correlation(difference: NDArray[np.int32]) -> Score:
 
 
 def _block_means(frame: Float) -> Float:
-    """Return the means of blocks of a frame of even sides."""
-    blocks = BLOCKS * min(max(min(frame.shape) // (8 * BLOCKS), 1), 4)
-    height, width = (length // (2 * blocks) * 2 for length in frame.shape)
-    return np.asarray(frame[: blocks * height, : blocks * width].reshape(blocks, height, blocks, width).mean((1, 3)))
+    """Return the means of the sixteenths of a frame of even sides."""
+    height, width = (length // 8 * 2 for length in frame.shape)
+    return np.asarray(frame[: 4 * height, : 4 * width].reshape(4, height, 4, width).mean((1, 3)))

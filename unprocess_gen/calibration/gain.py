@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,10 +20,10 @@ from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 RANGES = (0.1, 0.3)
 """Largest signals of the fits, as fractions of white above black; the second range has `LEAST_LEVELS` or more."""
-SIGNIFICANT = 3.0
-"""Standard errors from which a difference is systematic."""
 LEAST_LEVELS = 4
 """Fewest levels of flats of a fit."""
+SIGNIFICANT = 3.0
+"""Standard errors from which a difference is systematic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +49,6 @@ class Estimate:
         below, above = (math.hypot(own / self.value - 1, end / other.value - 1) * value for own, end in ends)
         return Estimate(value, value - below, value + above)
 
-    def over(self, other: Estimate) -> Estimate:
-        """Return the ratio to an independent number."""
-        return self.times(estimate(1 / other.value, other.error / other.value**2))
-
 
 def estimate(value: float, error: float, least: float = -math.inf) -> Estimate:
     """Return a number with a normal standard error; ``least`` limits the interval."""
@@ -65,13 +61,18 @@ def root_estimate(variance: float, error: float) -> Estimate:
     return Estimate(value, math.sqrt(max(positive - NORMAL_95 * error, 0.0)), math.sqrt(positive + NORMAL_95 * error))
 
 
+def weighted_mean(values: Any, errors: Any) -> tuple[float, float]:
+    """Return the mean of independent values with standard errors, and its standard error."""
+    weights = 1 / np.square(np.maximum(errors, 1e-300))
+    return float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
+
+
 def combined(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the mean of independent estimates, weighted by their errors."""
-    weights = np.array([1 / max(number.error, 1e-300) ** 2 for number in estimates])
-    values = np.array([number.value for number in estimates])
-    mean = float(weights @ values / weights.sum())
-    excess = float(weights @ (values - mean) ** 2) / max(len(values) - 1, 1)
-    return estimate(mean, math.sqrt(max(excess, 1.0) if excess > 4 else 1.0) / math.sqrt(float(weights.sum())))
+    """Return the mean of independent estimates; the interval is wider if they differ by more than their errors."""
+    values, errors = (np.array([getattr(one, name) for one in estimates]) for name in ("value", "error"))
+    mean, error = weighted_mean(values, errors)
+    excess = float(np.square((values - mean) / np.maximum(errors, 1e-300)).sum()) / max(len(values) - 1, 1)
+    return estimate(mean, error * math.sqrt(excess if excess > 4 else 1.0))
 
 
 def weighted_slope(x: Float, y: Float, errors: Float) -> Estimate:
@@ -112,33 +113,23 @@ class Transfer:
         return np.asarray(np.diag(self.error**2) + same * np.outer(self.dark_error, self.dark_error))
 
 
-class Fit(NamedTuple):
-    """Gain of a plane by one range, with or without q: value, standard error, χ² and its degrees of freedom."""
-
-    gain: float
-    error: float
-    chi2: float
-    degrees: int
-
-
-def fit_curve(points: Transfer, with_q: bool) -> Fit | None:
-    """Fit K, and q if wanted, by generalised least squares; None for too few points."""
+def _fit_plane(points: Transfer, with_q: bool) -> tuple[float, float, float, int] | None:
+    """Fit K, and q if wanted, by generalised least squares; return K, its error, χ² and its degrees of freedom."""
     design = np.stack([points.signal, points.signal**2])[: 1 + with_q]
     degrees = len(points.signal) - len(design)
-    if degrees < (1 if with_q else 0) or not len(points.signal):
+    if degrees < with_q:
         return None
     covariance, precision = points.covariance, np.linalg.inv(points.covariance)
     by_point = influence(design, precision)
-    numbers = by_point @ points.variance
-    residual = points.variance - numbers @ design
+    residual = points.variance - by_point @ points.variance @ design
     error = math.sqrt(float(by_point[0] @ covariance @ by_point[0]))
-    return Fit(float(numbers[0]), error, float(residual @ precision @ residual), degrees)
+    return float(by_point[0] @ points.variance), error, float(residual @ precision @ residual), degrees
 
 
 class JointFit(NamedTuple):
-    """Fits of all planes by one rule: their mean, its error, and χ² over its degrees of freedom."""
+    """Fit of all planes by one rule: their gains with standard errors, the mean and its error, χ² and its degrees."""
 
-    planes: list[Fit]
+    planes: list[Estimate]
     gain: float
     error: float
     chi2: float
@@ -147,21 +138,19 @@ class JointFit(NamedTuple):
     @property
     def interval(self) -> Estimate:
         """Mean with an interval that residuals beyond the noise widen."""
-        return estimate(self.gain, self.error * math.sqrt(max(self.chi2, 1.0)))
+        return estimate(self.gain, self.error * math.sqrt(max(self.chi2 / max(self.degrees, 1), 1.0)))
 
 
 def _joint_fit(curves: Sequence[Transfer], limit_dn: float, with_q: bool) -> JointFit | None:
-    fits = [fit for curve in curves if (fit := fit_curve(curve.upto(limit_dn), with_q)) is not None]
+    fits = [fit for curve in curves if (fit := _fit_plane(curve.upto(limit_dn), with_q)) is not None]
     if len(fits) < len(curves):
         return None
     gains, errors, chi2, degrees = np.array(fits).T
-    weights, freedom = errors**-2, int(degrees.sum())
-    mean, error = float(weights @ gains / weights.sum()), float(weights.sum() ** -0.5)
-    return JointFit(fits, mean, error, float(chi2.sum()) / max(freedom, 1), freedom)
+    return JointFit([estimate(*fit[:2]) for fit in fits], *weighted_mean(gains, errors), chi2.sum(), int(degrees.sum()))
 
 
-def fit_gain(curves: Sequence[Transfer], span_dn: float) -> tuple[list[Estimate], bool]:
-    """Fit the gain of the sensor, then of each plane; True if the gains of the planes differ."""
+def fit_gain(curves: Sequence[Transfer], span_dn: float) -> list[Estimate]:
+    """Fit the gain of the sensor, then of each plane."""
     first, least = (share * span_dn for share in RANGES)
     largest = max(least, *(float(np.sort(curve.signal)[LEAST_LEVELS - 1]) for curve in curves))
     fits = {
@@ -169,21 +158,13 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> tuple[list[Estimate]
         for limit_dn, with_q in itertools.product((first, largest), (False, True))
         if (joint := _joint_fit(curves, limit_dn, with_q)) is not None
     }
-    chosen = base = fits[largest, False]
-    low, high = base.gain - NORMAL_95 * base.error, base.gain + NORMAL_95 * base.error
-    is_systematic = base.chi2 > 1 + SIGNIFICANT * math.sqrt(2 / max(base.degrees, 1))
+    base = fits[largest, False]
+    is_systematic = base.chi2 > base.degrees + SIGNIFICANT * math.sqrt(2 * base.degrees)
     for other in fits.values():
         own = math.sqrt(max(other.error**2 - base.error**2, 0.0))  # the fits share the points of the smaller range
         is_systematic |= other.error > base.error and abs(other.gain - base.gain) > SIGNIFICANT * own
-    if is_systematic:
-        chosen = fits[largest, True]
-        low, high = min(fit.interval.low for fit in fits.values()), max(fit.interval.high for fit in fits.values())
-    sensor, planes = Estimate(chosen.gain, low, high), [estimate(fit.gain, fit.error) for fit in chosen.planes]
-    if is_systematic:
-        planes = [plane.times(sensor.scaled(1 / chosen.gain)) for plane in planes]
-    return [sensor, *planes], _have_colours(chosen)
-
-
-def _have_colours(chosen: JointFit) -> bool:
-    """True if the gains of planes differ by more than their errors, and by more than 0.3 %."""
-    return any(abs(fit.gain - chosen.gain) > max(4 * fit.error, 0.003 * chosen.gain) for fit in chosen.planes)
+    if not is_systematic:
+        return [estimate(base.gain, base.error), *base.planes]
+    chosen, intervals = fits[largest, True], [fit.interval for fit in fits.values()]
+    sensor = Estimate(chosen.gain, min(one.low for one in intervals), max(one.high for one in intervals))
+    return [sensor, *(plane.times(sensor.scaled(1 / chosen.gain)) for plane in chosen.planes)]

@@ -20,7 +20,15 @@ from unprocess_gen.calibration.frame_sums import (
     high_passed,
     robust_std,
 )
-from unprocess_gen.calibration.gain import LEAST_LEVELS, Estimate, Transfer, combined, estimate, fit_gain, root_estimate
+from unprocess_gen.calibration.gain import (
+    LEAST_LEVELS,
+    Estimate,
+    Transfer,
+    estimate,
+    fit_gain,
+    root_estimate,
+    weighted_mean,
+)
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fit_shape, histograms, joined_histogram
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
@@ -42,8 +50,6 @@ LARGEST_WELL = 0.97
 """Signal, as a fraction of white, from which the converter may end first."""
 LEAST_FITTED_DN2 = 0.04
 """Variance without rounding below which nearly all values are equal, so that no distribution is fitted."""
-DEAD_RESPONSE, DEAD_SIGNAL = 0.2, 0.05
-"""Largest response of dead pixels, and least signal at which they are counted, as a fraction of white."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +72,6 @@ class Flat:
     """Flats of one level: frames, noise, the darks of the nearest exposure, and True if values reach white.
 
     ``signals_dn`` are the means of the planes minus the means of the darks; light is rarely neutral in raw values.
-    ``dead_dn`` are the values of dead pixels; None if the light is too weak to show them.
     """
 
     frames: list[Capture]
@@ -74,7 +79,6 @@ class Flat:
     dark: Dark
     is_full: bool
     signals_dn: Float
-    dead_dn: Float | None
 
     @property
     def signal_dn(self) -> float:
@@ -87,19 +91,19 @@ class IsoResult:
     """Measured noise of one ISO.
 
     ``numbers`` are the estimates by name: of the sensor, then of each plane of `TILE` if planes may differ. ``shapes``
-    are in the same order. ``dark`` are the darks from which read noise and offsets are measured.
+    are in the same order. ``dark`` are the darks from which read noise and offsets are measured. ``prnu_square`` is the
+    square of the PRNU, and its standard error.
     """
 
     iso: float
     numbers: dict[str, list[Estimate]]
-    has_colours: bool
     curves: list[Transfer]
     darks: list[Dark]
     dark: Dark
     flats: list[Flat]
     shapes: list[ReadShape]
     histogram: Histogram
-    prnu_squares: list[tuple[float, float]]
+    prnu_square: tuple[float, float] | None
     full_well_dn: Estimate | None
     notes: list[str]
 
@@ -123,19 +127,18 @@ def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate |
     spread = _variances(dark.measured, shapes[0])[0] + np.maximum(dark.measured.dsnu, 0.0)  # both are dither
     checks.check_dark_noise(dark.frames, sensor, math.sqrt(float(spread.mean())))
     curves = _curves(usable(flats), shapes[0]) if flats else []
-    gains, has_colours = ([gain], False) if gain else fit_gain(curves, sensor.span_dn)
+    gains = [gain] if gain else fit_gain(curves, sensor.span_dn)
     return IsoResult(
         iso=iso,
         numbers={"dn_per_e": gains} | _dark_numbers(dark.measured, sensor, shapes),
-        has_colours=has_colours,
         curves=curves,
         darks=darks,
         dark=dark,
         flats=flats,
         shapes=shapes,
         histogram=histogram,
-        prnu_squares=_prnu_squares(usable(flats), watch) if flats else [],
-        full_well_dn=_full_well(flats, sensor, gains, has_colours),
+        prnu_square=_prnu_square(usable(flats), watch) if flats else None,
+        full_well_dn=_full_well(flats, sensor),
         notes=notes,
     )
 
@@ -199,16 +202,12 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
         seconds = frames[0].exposure_s or 0.0
         dark = min(darks, key=lambda dark: abs(dark.exposure_s - seconds))
         signals = measured.mean_dn - dark.measured.mean_dn
-        full_share, dead = float(measured.codes[:, int(sensor.white_dn) :].sum() / measured.codes.sum()), None
+        full_share = float(measured.codes[:, int(sensor.white_dn) :].sum() / measured.codes.sum())
         if full_share > FULL_SHARE:
             notes.append(f"{checks.place(frames)}: {full_share:.2%} of the values are at white; left out of fits")
         else:
             checks.check_flat(frames, sensor, measured, dark.measured, notes)
-        if signals.min() > DEAD_SIGNAL * sensor.span_dn:
-            limits = dark.measured.mean_dn + DEAD_RESPONSE * signals
-            planes = zip(planes_of(sums.mean_frame()), limits, strict=True)
-            dead = np.concatenate([plane[plane < limit] for plane, limit in planes])
-        flats.append(Flat(frames, measured, dark, full_share > FULL_SHARE, signals, dead))
+        flats.append(Flat(frames, measured, dark, full_share > FULL_SHARE, signals))
     return sorted(flats, key=lambda flat: flat.signal_dn)
 
 
@@ -311,8 +310,8 @@ def usable(flats: Sequence[Flat]) -> list[Flat]:
     return [flat for flat, is_below in zip(below, is_rising.all(axis=1), strict=True) if is_below]
 
 
-def _prnu_squares(flats: Sequence[Flat], watch: Watch) -> list[tuple[float, float]]:
-    """Return the square of the PRNU of each plane, and its standard error, from the mean of all frames of all levels.
+def _prnu_square(flats: Sequence[Flat], watch: Watch) -> tuple[float, float]:
+    """Return the square of the PRNU, and its standard error, from the mean of all frames of all levels.
 
     Frames have the weight signal/variance, which gives the mean of frame/signal the least noise. The variance of its
     fixed pattern contains the variance of the darks' pattern, c² times, and the temporal noise.
@@ -336,14 +335,13 @@ def _prnu_squares(flats: Sequence[Flat], watch: Watch) -> list[tuple[float, floa
         square = (float(pattern.var()) - rows) / SMOOTH - noise - dark_factor * dark.fixed[plane]
         error = math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt((counts - 1).sum()))
         squares.append((square, math.hypot(error, dark_factor * dark.fixed_error[plane])))
-    return squares
+    return weighted_mean(*np.transpose(squares))
 
 
-def _full_well(flats: Sequence[Flat], sensor: Sensor, gains: Sequence[Estimate], has_colours: bool) -> Estimate | None:
+def _full_well(flats: Sequence[Flat], sensor: Sensor) -> Estimate | None:
     """Return the signal of full pixels, DN: the largest mean of the planes whose variance has fallen.
 
-    None if the converter ends first, or no level is that bright. If only some planes are full, the signal is scaled
-    from their gain to the gain of the sensor.
+    None if the converter ends first, or no level is that bright.
     """
     chosen = usable(flats)
     beyond = [flat for flat in flats if flat not in chosen and not flat.is_full]
@@ -355,9 +353,5 @@ def _full_well(flats: Sequence[Flat], sensor: Sensor, gains: Sequence[Estimate],
     level, below = (float(flat.signals_dn[planes].mean()) for flat in (beyond[-1], chosen[-1]))
     if level > LARGEST_WELL * sensor.span_dn:
         return None
-    is_flat = bool((variances[-1] < variances[len(chosen) - 1] / 4)[planes].all())  # all their pixels are full
-    full = Estimate(level, level * 0.995, level * 1.005) if is_flat else Estimate(level, below, level * 1.1)
-    if not has_colours or planes.all():
-        return full
-    own = combined([gain for gain, is_in in zip(gains[1:], planes, strict=True) if is_in])
-    return full.over(own).scaled(gains[0].value)
+    has_plateau = bool((variances[-1] < variances[len(chosen) - 1] / 4)[planes].all())  # all their pixels are full
+    return Estimate(level, 0.995 * level, 1.005 * level) if has_plateau else Estimate(level, below, 1.1 * level)

@@ -10,19 +10,9 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from unprocess_gen.calibration.body import Body
 from unprocess_gen.calibration.captures import CaptureSet, Sensor
-from unprocess_gen.calibration.gain import Estimate, estimate
-from unprocess_gen.calibration.iso_laws import (
-    DIGITS,
-    black_law,
-    gain_law,
-    joined_branches,
-    modes,
-    rounded,
-    shape_law,
-    std_law,
-)
+from unprocess_gen.calibration.gain import Estimate, combined, estimate
+from unprocess_gen.calibration.iso_laws import DIGITS, black_law, modes, rounded, table
 from unprocess_gen.calibration.measure import IsoResult
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 from unprocess_gen.simulation.reference.cfa import MONO
@@ -30,14 +20,11 @@ from unprocess_gen.statistics.mosaics import plane_names
 
 MARK = "by gen-dataset calibrate"
 """Part of the first line of a profile, by which a later run recognises it."""
-
-
 UNITS = {
     "dn_per_e": "DN/e",
     "b_dn2": "DN²",
     "dark_e_per_s": "e/s",
     "hot_pixel_e_per_s": "e/s",
-    "dark_doubling_c": "degrees Celsius",
 }
 """Units of numbers; others are in DN or in electrons as their names end, or without a unit."""
 
@@ -58,11 +45,12 @@ class NamedNumber(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Everything measured on a folder of captures."""
+    """Everything measured on a folder of captures; ``celsius`` is the temperature of the darks, if it is stated."""
 
     captures: CaptureSet
     isos: list[IsoResult]
-    body: Body
+    body: dict[str, Estimate | None]
+    celsius: float | None
     notes: list[str]
 
     @property
@@ -79,15 +67,13 @@ def site_names(sensor: Sensor) -> list[str]:
 def estimates(calibration: Calibration) -> list[NamedNumber]:
     """Return the list of all estimates: those of the body, then those of each ISO."""
     sites = site_names(calibration.sensor)
-    listed = list(_named(calibration.body.numbers, None, sites))
+    listed = [NamedNumber(name, None, None, number) for name, number in calibration.body.items()]
     for result in calibration.isos:
         listed += _named(result.numbers, result.iso, sites)
     return listed
 
 
-def _named(
-    numbers: Mapping[str, Sequence[Estimate | None]], iso: float | None, sites: Sequence[str]
-) -> Iterator[NamedNumber]:
+def _named(numbers: Mapping[str, Sequence[Estimate]], iso: float, sites: Sequence[str]) -> Iterator[NamedNumber]:
     """Yield estimates of the sensor, then of its sites."""
     for name, (sensor, *planes) in numbers.items():
         yield NamedNumber(name, iso, None, sensor)
@@ -97,22 +83,26 @@ def _named(
 def estimates_json(named: Sequence[NamedNumber], digits: int = DIGITS) -> str:
     """Return the list of estimates as JSON, an object a line; null where the captures do not show a number."""
     lines = []
-    for entry in named:
-        ends = {end: None if entry.number is None else rounded(getattr(entry.number, end), digits) for end in ENDS}
-        ends = {end: value if value is None or math.isfinite(value) else None for end, value in ends.items()}
-        lines.append(json.dumps({"name": entry.name, "iso": entry.iso, "site": entry.site, **ends, "unit": entry.unit}))
-    return "[\n" + ",\n".join(lines) + "\n]\n"
+    for one in named:
+        values = {end: getattr(one.number, end, math.inf) for end in ENDS}
+        ends = {end: rounded(value, digits) if math.isfinite(value) else None for end, value in values.items()}
+        lines.append({"name": one.name, "iso": one.iso, "site": one.site, **ends, "unit": one.unit})
+    return "[\n" + ",\n".join(map(json.dumps, lines)) + "\n]\n"
 
 
 ENDS = ("value", "low", "high")
 ASSUMED_C = 25.0
 """Temperature of darks that do not state it."""
+SAME_GAIN = 0.003
+"""Largest difference of the gains of colours that are not written."""
+LEAST_CORRELATION = 0.02
+"""Least correlation of neighbouring rows that is written."""
+SHAPE_DIGITS = 4
 
 UNKNOWN_REASONS = {
     "prnu_std": "more flats of each level show it",
     "dark_e_per_s": "darks of several exposures, up to some seconds, show it",
     "hot_pixel_share": "darks of 0.2 s or more show it",
-    "dead_pixel_share": "flats above 5 % of white show it",
     "full_well_e": "a series of flats up to saturation, at the lowest ISO, shows it",
 }
 """What shows a number that the captures do not."""
@@ -156,21 +146,14 @@ def provenance(numbers: Sequence[str], isos: Sequence[float], source: str, uncer
 
 def measured_yaml(calibration: Calibration, name: str) -> str:
     """Return the noise profile of measured frames."""
-    profile, isos = profile_head(name, calibration.sensor), [result.iso for result in calibration.isos]
-    branches = [[calibration.isos[place] for place in places] for places in iso_branches(calibration.isos)]
-    profile["branches"] = [_branch(results, calibration.sensor) for results in branches]
-    profile |= _common_keys(calibration)
-    written = {*profile, *(key for branch in profile["branches"] for key in branch)}
+    isos = [result.iso for result in calibration.isos]
+    places = modes(isos, [result["read_std_dn"] for result in calibration.isos])
+    branches = [_branch([calibration.isos[place] for place in mode], calibration.sensor) for mode in places]
+    profile = profile_head(name, calibration.sensor) | {"branches": branches} | _common_keys(calibration)
+    written = {*profile, *(key for branch in branches for key in branch)}
     profile["provenance"] = [_provenance(calibration, written)]
     frames = f"{len(calibration.captures.captures)} raw frames, ISO {', '.join(f'{iso:g}' for iso in isos)}"
     return profile_yaml(f"Measured {MARK} on {frames}", calibration.captures.sha256, calibration.notes, profile)
-
-
-def iso_branches(results: Sequence[IsoResult]) -> list[list[int]]:
-    """Return the places of the ISOs of each branch."""
-    isos = [result.iso for result in results]
-    gains, reads = ([result[name] for result in results] for name in ("dn_per_e", "read_std_dn"))
-    return joined_branches(isos, gains, modes(isos, reads))
 
 
 def dark_variance(result: IsoResult) -> Estimate:
@@ -183,14 +166,13 @@ def dark_variance(result: IsoResult) -> Estimate:
 
 def _branch(results: Sequence[IsoResult], sensor: Sensor) -> dict[str, Any]:
     """Return a branch of neighbouring ISOs: gain, and noise without light."""
-    isos, gains = [result.iso for result in results], [result["dn_per_e"] for result in results]
-    branch = {"iso": [isos[0], isos[-1]], "dn_per_e": gain_law(isos, gains), "read_law": "gaussian"}
-    shapes = [result.shapes[0] for result in results]
+    isos, shapes = [result.iso for result in results], [result.shapes[0] for result in results]
+    branch: dict[str, Any] = {"iso": [isos[0], isos[-1]], "read_law": "gaussian"}
     if any(shape.is_tukey for shape in shapes):
-        values = [shape.shape if shape.is_tukey else NORMAL_SHAPE for shape in shapes]
-        branch |= {"read_law": "tukey_lambda", "read_shape": shape_law(isos, values)}
-    for name in ("read_std_dn", "row_std_dn", "column_std_dn"):
-        branch[name] = std_law(isos, [result[name] for result in results])
+        values = [shape.interval.value if shape.is_tukey else NORMAL_SHAPE for shape in shapes]
+        branch |= {"read_law": "tukey_lambda", "read_shape": table(isos, values, SHAPE_DIGITS)}
+    for name in ("dn_per_e", "read_std_dn", "row_std_dn", "column_std_dn"):
+        branch[name] = table(isos, [result[name].value for result in results])
     if (temporal := max(result["column_temporal_std_dn"].value for result in results)) > 0:  # the key takes no table
         branch["column_temporal_std_dn"] = rounded(temporal)
     names = site_names(sensor)
@@ -200,34 +182,34 @@ def _branch(results: Sequence[IsoResult], sensor: Sensor) -> dict[str, Any]:
     return branch | {"black_error_dn": black_law(isos, blacks, bool(names))}
 
 
-WITH_DEFAULTS = ("dark_doubling_c", "dead_pixel_level", "dsnu_std_e", "hot_pixel_e_per_s")
-"""Keys that are left out if the captures do not show them: null is no value of theirs."""
-
-
 def _common_keys(calibration: Calibration) -> dict[str, Any]:
     """Return the keys that do not depend on ISO; null for numbers that the captures do not show."""
     keys: dict[str, Any] = {} if (gains := _gains_by_colour(calibration)) is None else {"gain_by_colour": gains}
-    correlations = [result["row_correlation"] for result in calibration.isos]
-    row = max(correlations, key=lambda number: abs(number.value) / max(number.error, 1e-9))
-    if abs(row.value) > 4 * row.error and abs(row.value) > 0.02:
+    rows = [result["row_correlation"] for result in calibration.isos]
+    row = max(rows, key=lambda number: abs(number.value) / max(number.error, 1e-9))
+    if abs(row.value) > max(4 * row.error, LEAST_CORRELATION):
         keys["row_correlation"] = rounded(max(min(row.value, 0.95), -0.95))
-    for name, (number, *_) in calibration.body.numbers.items():
-        if number is not None or name not in WITH_DEFAULTS:
+    for name, number in calibration.body.items():
+        if number is not None or name in UNKNOWN_REASONS:  # null is no value of the others
             keys[name] = None if number is None else rounded(number.value)
     if calibration.body["dark_e_per_s"] is not None:
-        keys["dark_reference_c"] = calibration.body.reference_c or ASSUMED_C
+        keys["dark_reference_c"] = ASSUMED_C if calibration.celsius is None else calibration.celsius
     return keys
 
 
 def _gains_by_colour(calibration: Calibration) -> list[float] | None:
-    """Return the gains of red, green and blue relative to the sensor's, if they differ at most ISOs."""
-    names = site_names(calibration.sensor)
-    differing = [result.numbers["dn_per_e"] for result in calibration.isos if result.has_colours]
-    if not names or 2 * len(differing) <= len(calibration.isos):
-        return None
-    relative = [[plane.value / sensor.value for plane in planes] for sensor, *planes in differing]
-    means = dict(zip(names, (sum(values) / len(values) for values in zip(*relative, strict=True)), strict=True))
-    return [rounded(means["R"]), rounded((means["Gr"] + means["Gb"]) / 2), rounded(means["B"])]
+    """Return the gains of red, green and blue relative to the sensor's, if they differ by more than their errors."""
+    sites, colours = site_names(calibration.sensor), list[Estimate]()
+    for colour in ("R", "G", "B") if sites else ():
+        places = [1 + place for place, site in enumerate(sites) if site[0] == colour]
+        relative = [
+            result.numbers["dn_per_e"][place].scaled(1 / result["dn_per_e"].value)
+            for result in calibration.isos
+            for place in places
+        ]
+        colours.append(combined(relative))
+    differ = any(abs(gain.value - 1) > max(4 * gain.error, SAME_GAIN) for gain in colours)
+    return [rounded(gain.value) for gain in colours] if differ else None
 
 
 ABSOLUTE = ("black_error_dn", "read_shape", "row_correlation")

@@ -2,7 +2,7 @@
 
 With W - B = white - black, the tag's S and O of a colour give a = S·(W - B) DN and b = O·(W - B)² DN² (DNG
 Specification 1.4). The profile has a and b of green; red and blue follow by their relative gains. Between two ISOs of
-one gain mode a is interpolated; nothing is extrapolated.
+one gain mode both are interpolated; nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from unprocess_gen.calibration.captures import Sensor, common, joined_sha256
 from unprocess_gen.calibration.gain import Estimate
-from unprocess_gen.calibration.iso_laws import Precision, gain_law, joined_branches, rounded, std_law
+from unprocess_gen.calibration.iso_laws import rounded, table
 from unprocess_gen.calibration.profile import MARK, NamedNumber, estimates_json, profile_head, profile_yaml, provenance
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
@@ -23,8 +23,8 @@ from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.sources.raw.metadata import RawMetadata, read_tags
 
 FORM = "calibrate --from noise_profile"
-TAG_PRECISION = Precision(close=3e-8, digits=12)
-"""Laws give the values of the tags within half the precision of float32."""
+DIGITS = 12
+"""Digits of numbers, which keep the precision of tags."""
 COLOUR_NAMES = ("R", "G", "B")
 SAME = 1e-6
 """Relative difference up to which two tags are equal."""
@@ -42,10 +42,10 @@ class StatedIso(NamedTuple):
 
 
 class StatedNoise(NamedTuple):
-    """Variances that the files of a folder state, in ascending order of ISO; places of the ISOs of each gain mode."""
+    """Variances that the files of a folder state, in ascending order of ISO; the ISOs of each gain mode."""
 
     isos: list[StatedIso]
-    modes: list[list[int]]
+    modes: list[list[StatedIso]]
     sensor: Sensor
     camera: str
     sha256: str
@@ -58,8 +58,9 @@ def read_stated_noise(folder: Path) -> StatedNoise:
 
     Raises ConfigError or MachineError.
     """
-    files = [folder] if folder.is_file() else sorted(path for path in folder.rglob("*") if is_raw(path))
     with machine_errors(folder):
+        is_raw = [path for path in folder.rglob("*") if path.suffix.lower() in RAW_FILES]
+        files = [folder] if folder.is_file() else sorted(is_raw)
         facts = {path: read_tags(path, "calibrate") for path in files}
         stated = {path: tags for path, tags in facts.items() if tags.noise_profile is not None}
         sha256 = joined_sha256(map(file_sha256, stated))
@@ -69,11 +70,10 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     notes = []
     if without := [path for path in files if path not in stated]:
         notes.append(f"{without[0]}: has no NoiseProfile tag; left out ({len(without)} of {len(files)} raw files)")
-    model, *_ = [common(stated, name) for name in ("model", "black_dn", "white_dn")]
+    model, blacks, white = (common(stated, name) for name in ("model", "black_dn", "white_dn"))
     isos = _by_iso([_stated_iso(path, tags) for path, tags in stated.items()])
-    first, tags = next(iter(stated.items()))
-    black, white = _levels(first, tags)
-    sensor = Sensor(int(white).bit_length(), round(black), round(white), tags.pattern or "RGGB", (0, 0))
+    pattern = next(iter(stated.values())).pattern
+    sensor = Sensor(int(white).bit_length(), round(sum(blacks) / 4), round(white), pattern or "RGGB", (0, 0))
     if (spread := max(_spreads(isos).values())) > SAME:
         notes.append(
             f"NoiseProfile: the planes differ by up to {spread:.1%}; the profile has the variance of green, and the "
@@ -82,38 +82,26 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     return StatedNoise(isos, _modes(isos), sensor, model or "an unknown camera", sha256, len(stated), notes)
 
 
-def is_raw(path: Path) -> bool:
-    """True if a file has the name of a raw file."""
-    return path.suffix.lower() in RAW_FILES
-
-
-def _levels(path: Path, facts: RawMetadata) -> tuple[float, float]:
-    """Return the black and the white level of a file."""
-    if facts.black_dn is None or facts.white_dn is None or not sum(facts.black_dn) / 4 < facts.white_dn:
-        raise ConfigError(f"calibrate: {path}: BlackLevel={facts.black_dn}, WhiteLevel={facts.white_dn}; expected both")
-    return sum(facts.black_dn) / 4, facts.white_dn
-
-
-def stated_variance(path: Path, facts: RawMetadata) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return a and b of red, green and blue from the NoiseProfile tag of a file; ConfigError if no sensor has them."""
-    black, white = _levels(path, facts)
-    numbers, span = facts.noise_profile or (), white - black
+def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
+    """Return ISO, a and b of red, green and blue of a file; ConfigError if no sensor has them."""
+    black, white, numbers = facts.black_dn, facts.white_dn, facts.noise_profile or ()
+    if black is None or white is None or not sum(black) / 4 < white:
+        raise ConfigError(f"calibrate: {path}: BlackLevel={black}, WhiteLevel={white}; expected both")
+    if facts.iso is None:
+        raise ConfigError(f"calibrate: {path}: states no ISO; expected a DNG with its EXIF tags")
     if len(numbers) not in (2, 6):
         raise ConfigError(f"calibrate: {path}: NoiseProfile has {len(numbers)} values; expected 2, or 6 for 3 colours")
-    for name, scale, offset in zip(COLOUR_NAMES, numbers[::2] * 3, numbers[1::2] * 3, strict=False):
+    scales, offsets = (numbers[start::2] * (6 // len(numbers)) for start in (0, 1))
+    for name, scale, offset in zip(COLOUR_NAMES, scales, offsets, strict=True):
         if not 0 < scale < 1 or not 0 <= offset < 1:
             raise ConfigError(
                 f"calibrate: {path}: NoiseProfile of {name}: variance = {scale:g}·x + {offset:g}; expected a slope "
                 "above 0 and a variance at black of 0 or more, both below 1; remove the file"
             )
-    scales, offsets = (numbers[start::2] * (3 if len(numbers) == 2 else 1) for start in (0, 1))
-    return tuple(scale * span for scale in scales), tuple(offset * span**2 for offset in offsets)
-
-
-def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
-    if facts.iso is None:
-        raise ConfigError(f"calibrate: {path}: states no ISO; expected a DNG with its EXIF tags")
-    return StatedIso(facts.iso, *stated_variance(path, facts), path)
+    span = white - sum(black) / 4
+    return StatedIso(
+        facts.iso, tuple(scale * span for scale in scales), tuple(offset * span**2 for offset in offsets), path
+    )
 
 
 def _by_iso(stated: Sequence[StatedIso]) -> list[StatedIso]:
@@ -130,34 +118,25 @@ def _by_iso(stated: Sequence[StatedIso]) -> list[StatedIso]:
     return list(result.values())
 
 
-def _modes(isos: Sequence[StatedIso]) -> list[list[int]]:
-    """Return the places of the ISOs of each gain mode, which begins where the variance without light falls.
+def _modes(isos: Sequence[StatedIso]) -> list[list[StatedIso]]:
+    """Return the ISOs of each gain mode, which begins where the variance without light falls, or is no longer 0.
 
     ConfigError for variances that no sensor has: all others rise with ISO.
     """
-    modes, falls = [[0]], list[int]()
-    for place, (low, high) in enumerate(pairwise(isos), start=1):
+    modes, falls = [[isos[0]]], [False]
+    for low, high in pairwise(isos):
         where = f"calibrate: {high.path}: NoiseProfile at ISO {high.iso:g}"
         expected = f"than at ISO {low.iso:g} ({low.path.name}); expected a rise with ISO; remove the wrong file"
         for name, before, after in zip(COLOUR_NAMES, low.a, high.a, strict=True):
             if after <= before * (1 + SAME):
                 raise ConfigError(f"{where}: the variance of {name} has no larger slope {expected}")
-        falls += [place] * (high.b[1] < low.b[1] * (1 - SAME))
-        if len(falls) > MOST_SWITCHES or falls[-2:] == [place - 1, place]:
+        falls.append(high.b[1] < low.b[1] * (1 - SAME))
+        if sum(falls) > MOST_SWITCHES or all(falls[-2:]):
             raise ConfigError(f"{where}: again less variance without light {expected}")
-        if place in falls or (high.b[1] > 0) != (low.b[1] > 0):
+        if falls[-1] or (high.b[1] > 0) != (low.b[1] > 0):
             modes.append([])
-        modes[-1].append(place)
+        modes[-1].append(high)
     return modes
-
-
-def _exact(value: float) -> Estimate:
-    return Estimate(value, value, value)
-
-
-def unknown(value: float) -> Estimate:
-    """Return a number of which no error is known."""
-    return Estimate(value, -math.inf, math.inf)
 
 
 def _spreads(isos: Sequence[StatedIso]) -> dict[str, float]:
@@ -173,27 +152,26 @@ def stated_json(stated: StatedNoise) -> str:
     named = []
     for iso, a, b, _ in stated.isos:
         for site, plane in ((None, 1), ("R", 0), ("Gr", 1), ("Gb", 1), ("B", 2)):
-            named += [NamedNumber("dn_per_e", iso, site, unknown(a[plane]))]
-            named += [NamedNumber("b_dn2", iso, site, unknown(b[plane]))]
-        named.append(NamedNumber("read_std_dn", iso, None, unknown(math.sqrt(b[1]))))
-    return estimates_json(named, TAG_PRECISION.digits)
+            numbers = {"dn_per_e": a[plane], "b_dn2": b[plane], "read_std_dn": math.sqrt(b[plane])}
+            estimates = {name: Estimate(value, -math.inf, math.inf) for name, value in numbers.items()}
+            named += [NamedNumber(name, iso, site, number) for name, number in estimates.items()]
+    return estimates_json(named, DIGITS)
 
 
 def stated_yaml(stated: StatedNoise, name: str) -> str:
     """Return the noise profile of NoiseProfile tags."""
     isos, profile = [record.iso for record in stated.isos], profile_head(name, stated.sensor)
-    gains = [_exact(record.a[1]) for record in stated.isos]
     profile["branches"] = []
-    for places in joined_branches(isos, gains, stated.modes, TAG_PRECISION):
-        own = [isos[place] for place in places]
-        gain = gain_law(own, [gains[place] for place in places], TAG_PRECISION)
-        read = std_law(own, [_exact(math.sqrt(stated.isos[place].b[1])) for place in places], TAG_PRECISION)
+    for mode in stated.modes:
+        own = [record.iso for record in mode]
+        gain = table(own, [record.a[1] for record in mode], DIGITS)
+        read = table(own, [math.sqrt(record.b[1]) for record in mode], DIGITS)
         branch = {"iso": [own[0], own[-1]], "dn_per_e": gain, "read_law": "gaussian", "read_std_dn": read}
         profile["branches"].append(branch)
     spreads = _spreads(stated.isos)
     if spreads["a"] > SAME:
         middle = stated.isos[len(isos) // 2]
-        profile["gain_by_colour"] = [rounded(value / middle.a[1], TAG_PRECISION.digits) for value in middle.a]
+        profile["gain_by_colour"] = [rounded(value / middle.a[1], DIGITS) for value in middle.a]
     differ = ", ".join(f"{number} by {spread:.1%}" for number, spread in spreads.items())
     source = f"{FORM}, tags of {stated.camera}, {stated.files} files, SHA-256 {stated.sha256[:16]}"
     uncertainty = f"the tags state none; planes differ from green, {differ}"

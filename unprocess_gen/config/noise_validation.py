@@ -152,6 +152,8 @@ def well_ends_first(noise: NoiseConfig, scene: SceneConfig) -> bool:
 def _gain_at(branch: BranchConfig, iso: float) -> float:
     """Return the system gain at an ISO, DN per electron."""
     match branch.dn_per_e:
+        case ["by_iso", *pairs]:
+            return math.exp(np.interp(math.log(iso), np.log(pairs[::2]), np.log(pairs[1::2])))
         case [_, slope, *intercept]:
             return float(slope * iso + sum(intercept))
     return float(branch.dn_per_e)

@@ -117,7 +117,7 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
 
 def _compared(calibration: Calibration, profile: Profile, known: dict[float, Estimate]) -> Iterator[Comparison]:
     """Yield the comparison of each estimate."""
-    celsius, isos = calibration.body.reference_c, calibration.captures.isos
+    celsius, isos = calibration.celsius, calibration.captures.isos
     variances = [NamedNumber("b_dn2", result.iso, None, dark_variance(result)) for result in calibration.isos]
     listed = [estimate for estimate in [*estimates(calibration), *variances] if estimate.name in EFFECT_OF_NUMBER]
     limit, sites = alarm_limit(len(listed)), site_names(calibration.sensor)

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unprocess_gen.calibration.iso_laws import gain_law, std_law
 from unprocess_gen.calibration.measure import IsoResult, usable
-from unprocess_gen.calibration.profile import ENDS, Calibration, NamedNumber, estimates, iso_branches, site_names
+from unprocess_gen.calibration.profile import ENDS, Calibration, NamedNumber, estimates, site_names
 from unprocess_gen.calibration.shape import probabilities
-from unprocess_gen.config.option_files import conf_dir, group_options
-from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.output_paths import check_output_file
-from unprocess_gen.core.types import Float
-from unprocess_gen.planning.noise_profile import evaluate
 from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
@@ -55,7 +47,6 @@ def write_page(calibration: Calibration, name: str, command: str, page: Path) ->
         figures=figures,
         against_iso=data_uri(_against_iso(calibration)) if len(calibration.isos) > 1 else "",
         table=_table(estimates(calibration)),
-        sensors=_sensors(calibration, name),
     )
     with machine_errors(page):
         page.write_text(text, encoding="utf-8")
@@ -70,57 +61,18 @@ def _table(named: list[NamedNumber]) -> PageTable:
     return PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4))
 
 
-def _sensors(calibration: Calibration, name: str) -> PageTable:
-    """Return gain and read noise of this sensor and of the built-in profiles, in electrons."""
-    span_dn, lines = calibration.sensor.span_dn, []
-    for result in calibration.isos:
-        gain, *stds = (result[key].value for key in ("dn_per_e", "read_std_dn", "row_std_dn"))
-        lines.append(_sensor_line(f"{name}, measured", result.iso, gain, (*stds, span_dn)))
-    for option in group_options("noise"):
-        if "branches:" not in (conf_dir() / "noise" / f"{option}.yaml").read_text(encoding="utf-8"):
-            continue  # two numbers, which may depend on the sensor
-        noise = read_option("noise", option)
-        span_dn = noise.white_level_dn - noise.black_level_dn
-        for branch, iso in itertools.product(noise.branches, calibration.captures.isos):
-            if branch.iso[0] <= iso <= branch.iso[1]:
-                gain = evaluate(branch.dn_per_e, iso=iso)
-                laws = (branch.read_std_dn, branch.row_std_dn)
-                stds = [evaluate(law, iso=iso, gain=gain) for law in laws]
-                lines.append(_sensor_line(option, iso, gain, (*stds, span_dn)))
-    headings = ("sensor", "ISO", "DN per electron", "read noise (e)", "row noise (e)", "electrons at white")
-    return PageTable(headings, lines, numeric=(1, 2, 3, 4, 5))
-
-
-def _sensor_line(name: str, iso: float, gain: float, numbers_dn: Iterable[float]) -> tuple[str, ...]:
-    electrons = (short_number(number / gain, 3) for number in numbers_dn)
-    return name, f"{iso:g}", short_number(gain, 3), *electrons
-
-
 # ------------------------------------------------------------------------------------------------------------- figures
 
 
 def _drawn(result: IsoResult, sites: list[str]) -> bytes:
-    """Draw the photon transfer curve with residuals, the histogram, spectra, and the map of the darks, of one ISO."""
+    """Draw the photon transfer curve with residuals, and the histogram of the darks, of one ISO."""
     from matplotlib.figure import Figure
 
-    figure, measured = Figure(figsize=(14, 8), layout="constrained"), result.dark.measured
-    axes = figure.subplots(2, 3)
-    _draw_transfer(axes[0, 0], axes[1, 0], result, sites)
-    _draw_histogram(axes[0, 1], result)
-    _draw_spectrum(axes[1, 1], "rows of a dark", measured.row_offsets.reshape(2, 2, -1).mean(axis=1))
-    _draw_spectrum(axes[1, 2], "columns of the mean dark", measured.column_offsets.reshape(2, 2, -1).mean(axis=0))
-    image = axes[0, 2].imshow(measured.shading - np.median(measured.shading), cmap="RdBu_r", aspect="auto")
-    axes[0, 2].set(title="fixed pattern of the darks, block means (DN)", xticks=[], yticks=[])
-    figure.colorbar(image, ax=axes[0, 2])
+    figure = Figure(figsize=(14, 4), layout="constrained")
+    transfer, residuals, histogram = figure.subplots(1, 3)
+    _draw_transfer(transfer, residuals, result, sites)
+    _draw_histogram(histogram, result)
     return figure_png(figure, DPI)
-
-
-def _draw_spectrum(axes: Axes, name: str, lines: Float) -> None:
-    """Draw the power of offsets of even and odd lines, [2, N]."""
-    offsets = lines.T.ravel()
-    power = np.abs(np.fft.rfft(offsets - offsets.mean()))[1:-1] ** 2 / len(offsets)
-    axes.loglog(np.arange(1, len(power) + 1) / len(offsets), power, linewidth=0.6, color=COLOURS[""])
-    axes.set(title=f"spectrum of the {name}", xlabel="periods per line", ylabel="power (DN²)")
 
 
 def _draw_transfer(curve_axes: Axes, residual_axes: Axes, result: IsoResult, sites: list[str]) -> None:
@@ -160,30 +112,19 @@ def _draw_histogram(axes: Axes, result: IsoResult) -> None:
     axes.legend()
 
 
-AGAINST_ISO = (
-    ("dn_per_e", "DN per electron", 0, gain_law),
-    ("read_std_dn", "read noise (DN)", 1, std_law),
-    ("row_std_dn", "row noise (DN)", 1, std_law),
-)
-"""Numbers that are drawn against ISO: name, label, place of the axes, and function that fits a law."""
+AGAINST_ISO = {"dn_per_e": "DN per electron", "read_std_dn": "read noise (DN)", "row_std_dn": "row noise (DN)"}
+"""Numbers that are drawn against ISO, and their labels."""
 
 
 def _against_iso(calibration: Calibration) -> bytes:
-    """Draw gain, read noise and row noise against ISO, with intervals and the laws of the profile."""
+    """Draw gain, read noise and row noise against ISO, with intervals."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4), layout="constrained")
-    both, isos = figure.subplots(1, 2), calibration.captures.isos
-    for place, (name, label, side, law) in enumerate(AGAINST_ISO):
-        axes, numbers = both[side], [result[name] for result in calibration.isos]
-        values = [number.value or math.nan for number in numbers]
-        errors = [[number.value - number.low for number in numbers], [number.high - number.value for number in numbers]]
-        axes.errorbar(isos, values, np.maximum(errors, 0), fmt="o", markersize=3, label=label, color=f"C{place}")
-        for branch in iso_branches(calibration.isos):
-            form = law([isos[index] for index in branch], [numbers[index] for index in branch])
-            grid = np.geomspace(isos[branch[0]], isos[branch[-1]], 50)
-            laws = [evaluate(form, iso=iso) or math.nan for iso in grid.tolist()]
-            axes.plot(grid, laws, linewidth=0.8, color=f"C{place}")
-        axes.set(xscale="log", yscale="log", xlabel="ISO")
-        axes.legend()
+    axes = figure.subplots(1, len(AGAINST_ISO))
+    for place, (name, label) in zip(axes, AGAINST_ISO.items(), strict=True):
+        values, lows, highs = (np.array([getattr(result[name], end) for result in calibration.isos]) for end in ENDS)
+        errors = np.maximum([values - lows, highs - values], 0)
+        place.errorbar(calibration.captures.isos, values, errors, fmt="o-", markersize=3)
+        place.set(xscale="log", yscale="log", xlabel="ISO", title=label)
     return figure_png(figure, DPI)
