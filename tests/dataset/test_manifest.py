@@ -215,7 +215,7 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
         "pair": (row_of(PHYSICAL), passed | absent),
         "measured": (measured, passed | absent - {UNMEASURED}),
         "split": (row_of(PHYSICAL.replace(split="val")), passed | absent - {unsplit}),
-        "targets": ({**row_of(PHYSICAL), "targets": "srgb:uint8:" + "1" * 32}, passed | absent - {untargeted}),
+        "targets": ({**row_of(PHYSICAL), "targets": "linear_rgb:float32:" + "1" * 32}, passed | absent - {untargeted}),
         "light": (row_of(PHYSICAL.replace(light="a", cct_k=2856.0)), passed | absent - {NO_LIGHT}),
         "dark frame": (row_of(DARK), passed | absent - OF_DARK_FRAMES),
         "raw": (row_of(RAW), passed | absent - OF_RAW),

@@ -38,7 +38,7 @@ KINDS = {
     "fast": ("noise=imx385_iso3200", "accuracy=fast"),
     "gray mean, no noise": ("noise=none", "gains.highlight=gray_mean", "isp=srgb"),
     "downscaled, dithered": ("noise=imx385_iso3200", "source.downscale=2", "source.dequantize=dither"),
-    "targets": ("noise=sony_a7s2", "output.targets=[linear_rgb,variance,noise_std,srgb]"),
+    "targets": ("noise=sony_a7s2", "output.targets=[linear_rgb]"),
     "split": ("noise=imx385_iso3200", "split={train: 0.5, test: 0.5}"),
 }
 Items = list[tuple[str, str, dict[str, Any], dict[str, str]]]

@@ -202,7 +202,6 @@ REFUSED = {
     "source.dequantize=dither": "is for photographs",
     "source.shrink=3": "1, 2 or 4",
     "output.targets=[linear_rgb]": "set source.shrink=2",
-    "output.targets=[srgb]": "no photograph",
     "source.raw.a_dn=1": "source.raw.b_dn2",
     "source.raw.black_dn=[1,2,3]": "four by colour",
 }

@@ -13,7 +13,7 @@ from typing import Any
 
 from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
 from unprocess_gen.core.object_store import is_url
-from unprocess_gen.core.targets import TARGETS
+from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.simulation.reference.light import LIGHTS
 
 Test = Callable[[Any], bool]
@@ -280,10 +280,7 @@ SPLIT = Limit(
     lambda value: value_text(value)[:80],
 )
 
-TARGET_NAMES = Limit(
-    f"a list without repetitions of {', '.join(TARGETS)}",
-    lambda value: set(value) <= set(TARGETS) and len(set(value)) == len(value),
-)
+TARGET_NAMES = Limit(f"[] or [{LINEAR_RGB}]", lambda value: tuple(value) in ((), (LINEAR_RGB,)))
 
 BLACK_LEVEL = LevelRange("0 to 2^bits - 2", lambda group: (0, 2**group.bits - 2))
 WHITE_LEVEL = LevelRange(

@@ -72,11 +72,6 @@ def _check_own_noise(config: Config) -> None:
 
 
 def _check_targets(config: Config) -> None:
-    targets = config.output.targets
-    if "srgb" in targets:
-        raise refusal(
-            "output.targets", targets, "a raw source has no photograph; remove srgb; ug.develop draws pictures"
-        )
-    if "linear_rgb" in targets and config.source.shrink == 1:
+    if config.output.targets and config.source.shrink == 1:
         problem = "linear_rgb needs all colours at each site; set source.shrink=2, or remove it"
-        raise refusal("output.targets", targets, problem)
+        raise refusal("output.targets", config.output.targets, problem)

@@ -596,8 +596,7 @@ class OutputConfig(Group):
     pairs_per_shard
         sources per shard, the unit of work and of a retry
     targets
-        more arrays for a training: linear_rgb is the scene before the mosaic, srgb the photograph, variance that
-        of the noise at each site, noise_std its standard deviation as estimated from the noisy frame
+        more arrays for a training: linear_rgb is the scene before the mosaic
     frames
         store frames; false writes a manifest only, as the verb manifest does: ug.LivePairs makes the pairs of it
     """

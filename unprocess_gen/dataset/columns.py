@@ -17,9 +17,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from unprocess_gen.core.targets import TARGETS
+from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.core.types import (
-    DESCRIPTIONS,
     FLOAT32,
     MOSAIC,
     PACKED,
@@ -173,8 +172,6 @@ HEX_256 = Text(re.compile(r"([0-9a-f]{64})?"), "64 hexadecimal digits")
 
 _LEVEL = r"\d{1,5}(\.\d{1,17})?(e-\d\d)?"
 LEVELS_TEXT = Text(re.compile(rf"({_LEVEL}(;{_LEVEL}){{3}})?"), "four numbers, separated by ;")
-
-_TARGET = f"({'|'.join(TARGETS)}):({'|'.join(DESCRIPTIONS)}):[0-9a-f]{{32}}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,8 +416,8 @@ COLUMNS = (
     Column("split", "part of the dataset that the image belongs to",
            Text(re.compile(r"[\w-]{1,32}", re.ASCII), "up to 32 letters, digits, _ and -"), Plan, since="0.3",
            empty_if="there are no splits, or the source failed"),
-    Column("targets", "stored targets, each with dtype and XXH3-128 (srgb:uint8:…), separated by ;",
-           Text(re.compile(f"({_TARGET}(;{_TARGET})*)?"), "targets as name:dtype:digest, separated by ;"), since="0.3",
+    Column("targets", f"the stored target with dtype and XXH3-128: {LINEAR_RGB}:float32:…",
+           Text(re.compile(f"({LINEAR_RGB}:float32:[0-9a-f]{{32}})?"), "name:dtype:digest of a target"), since="0.3",
            empty_if="output.targets is empty, output.frames is false, or the source failed"),
     Column("light", "light from which the white-balance gains follow", ANY_TEXT, CameraPlan, since="0.3", in_json=False,
            empty_if="the gains follow from no light (gains.light=null), or the source failed"),

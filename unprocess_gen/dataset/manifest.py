@@ -665,8 +665,7 @@ def row_json(rows: Sequence[Row]) -> bytes:
     first, *others = (without_empty(row, _JSON_COLUMNS) for row in rows)
     content = {**first, OTHERS: others} if others else first
     text = json.dumps(content, separators=(",", ":")).encode("ascii")
-    targets = str(rows[0]["targets"])
-    is_raw, stored = bool(rows[0]["raw_pattern"]), targets.count(";") + 1 if targets else 0
+    is_raw, stored = bool(rows[0]["raw_pattern"]), int(bool(rows[0]["targets"]))
     size = json_size(str(first["source"]), len(rows), stored, is_raw)
     if len(text) >= size:
         raise ValueError(f"row {first['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")

@@ -26,7 +26,6 @@ from unprocess_gen.dataset.shards import (
     map_array,
     read_index,
     shard_name,
-    target_names,
 )
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
@@ -237,7 +236,7 @@ class _Dataset:
                 f"{self.path}: has a manifest without frames (output.frames=false); expected stored frames; read it "
                 f"with ug.LivePairs, or store them: gen-dataset again {self.path} out=FOLDER output.frames=true"
             )
-        clean, targets = row["clean_dtype"] or row["dtype"], ", ".join(target_names(row)) or "no"
+        clean, targets = row["clean_dtype"] or row["dtype"], str(row["targets"]).partition(":")[0] or "no"
         self.formats.add((row["dtype"], clean, row["layout"], targets))
         self.splits.add(str(row["split"]))
         return split in (None, row["split"])
@@ -250,8 +249,7 @@ class _Dataset:
             name: self._array(shard, f"{sample_key(row)}.{stored.member}", stored.array)
             for name, stored in arrays_of(row).items()
         }
-        targets = {name: arrays[name] for name in target_names(row)}
-        return Sample(arrays["clean"], arrays["noisy"], row, self.name, targets)
+        return Sample(arrays.pop("clean"), arrays.pop("noisy"), row, self.name, arrays)
 
     def _array(self, shard: int, name: str, form: ArrayFormat) -> Frame:
         path = self.path / "shards" / shard_name(shard)

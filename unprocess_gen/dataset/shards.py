@@ -1,9 +1,9 @@
 """Write, read and check shards: uncompressed tar archives in the WebDataset layout.
 
-The members of one sample (an image, or a patch of it) are consecutive: ``KEY.clean.npy``, ``KEY.noisy.npy``, the noisy
-frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Each stored target follows the frame that it
-belongs to. Frames are uint16 or float32, mosaics [H, W] or packed planes [4, H / 2, W / 2]. Headers are USTAR with
-fixed time, owner and mode, so the bytes depend only on the members.
+The members of one sample (an image, or a patch of it) are consecutive: ``KEY.clean.npy``, ``KEY.linear_rgb.npy`` if it
+is stored, ``KEY.noisy.npy``, noisy frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Frames
+are uint16 or float32, mosaics [H, W] or packed planes [4, H / 2, W / 2]. Headers are USTAR with fixed time, owner and
+mode, so the bytes depend only on the members.
 
 Arrays are written without a copy, and SHA-256 is computed on the way. Reading maps one array into memory; its offset
 comes from the tar headers. Timings: ``docs/performance.md``.
@@ -29,15 +29,12 @@ import xxhash
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3, little_endian
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.core.targets import FRAME_TARGETS
+from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.core.types import DESCRIPTIONS, FLOAT32, PACKED, UINT16, Array, Frame, Row
 
 RECORD_BYTES = 512
 END = b"\0" * (2 * RECORD_BYTES)
 ROW = "json"
-
-PER_PAIR = ("noisy", *FRAME_TARGETS)
-"""Arrays of which each noisy frame has its own; the others are those of the sample."""
 
 MAX_JSON_BYTES = 2**27
 """Largest JSON member that is read: the rows of 99 levels with 99 draws take half of it."""
@@ -45,17 +42,12 @@ MAX_JSON_BYTES = 2**27
 
 def member_of(name: str, level: int, draw: int) -> str:
     """Return the member, without the key, of a frame or target of a pair."""
-    return f"{name}.l{level:02d}d{draw:02d}.npy" if name in PER_PAIR and (level or draw) else f"{name}.npy"
+    return f"{name}.l{level:02d}d{draw:02d}.npy" if name == "noisy" and (level or draw) else f"{name}.npy"
 
 
 def targets_cell(targets: Mapping[str, Array]) -> str:
-    """Return the cell of a row that names and identifies its targets."""
-    return ";".join(f"{name}:{array.dtype.name}:{array_xxh3(array)}" for name, array in targets.items())
-
-
-def target_names(row: Row) -> list[str]:
-    """Return the names of a row's stored targets, in the order of ``output.targets``."""
-    return [entry.partition(":")[0] for entry in str(row["targets"]).split(";") if entry]
+    """Return the cell of a row that names and identifies its target."""
+    return "".join(f"{name}:{FLOAT32}:{array_xxh3(array)}" for name, array in targets.items())
 
 
 def shard_name(number: int) -> str:
@@ -96,13 +88,6 @@ def array_format(dtype: str, layout: str, height: int, width: int) -> ArrayForma
     """Return the format of a frame."""
     shape = (4, height // 2, width // 2) if layout == PACKED else (height, width)
     return ArrayFormat(dtype, shape)
-
-
-def target_format(name: str, layout: str, height: int, width: int, dtype: str = FLOAT32) -> ArrayFormat:
-    """Return the format of a target."""
-    if name in FRAME_TARGETS:
-        return array_format(dtype, layout, height, width)
-    return ArrayFormat(dtype, (height, width, 3))
 
 
 def _tar_header(name: str, size: int) -> bytes:
@@ -265,16 +250,13 @@ class ExpectedFrame(NamedTuple):
 
 
 def arrays_of(row: Row) -> dict[str, ExpectedFrame]:
-    """Return the frames and targets of a row by name, in the order of their members."""
+    """Return the frames and the target of a row by name, in the order of their members."""
     layout, height, width = str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0)
-    stored = (entry.split(":") for entry in str(row["targets"]).split(";") if entry)
-    targets = {name: (digest, target_format(name, layout, height, width, dtype)) for name, dtype, digest in stored}
-    clean, noisy = (
-        (str(row[f"{name}_xxh3"]), array_format(str(dtype), layout, height, width))
-        for name, dtype in (("clean", row["clean_dtype"] or row["dtype"]), ("noisy", row["dtype"]))
-    )
-    arrays = {"clean": clean, **targets, "noisy": noisy}
-    arrays |= {name: arrays.pop(name) for name in FRAME_TARGETS if name in targets}  # after the noisy frame
+    dtype, clean_dtype = str(row["dtype"]), str(row["clean_dtype"] or row["dtype"])
+    arrays = {"clean": (str(row["clean_xxh3"]), array_format(clean_dtype, layout, height, width))}
+    if row["targets"]:
+        arrays[LINEAR_RGB] = str(row["targets"]).rpartition(":")[2], ArrayFormat(FLOAT32, (height, width, 3))
+    arrays["noisy"] = str(row["noisy_xxh3"]), array_format(dtype, layout, height, width)
     place = int(row["level"] or 0), int(row["draw"] or 0)
     return {name: ExpectedFrame(member_of(name, *place), *array) for name, array in arrays.items()}
 

@@ -28,7 +28,7 @@ from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_fol
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
 from unprocess_gen.pipeline.pairs import PairSettings
-from unprocess_gen.pipeline.targets import kernels_for, levels_of, noise_law, targets_of
+from unprocess_gen.pipeline.targets import kernels_for, levels_of, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of
@@ -176,8 +176,8 @@ class LivePairs:
         clean, noisy, counts = make(crop_patch(srgb, patch), patch.origin, epoch)
         targets, frames = {}, (clean, noisy)
         if self._targets:
-            pair, law = Pair(clean, noisy, counts()), noise_law(plan)
-            targets = targets_of(self._targets, srgb, plan, patch, pair, law, as_float=self._as_float)
+            pair = Pair(clean, noisy, counts())
+            targets = targets_of(self._targets, srgb, plan, patch, pair, as_float=self._as_float)
         if self._as_float:
             frames = self._frame(clean, plan), self._frame(noisy, plan)
         if self._arrays_only:

@@ -23,6 +23,7 @@ from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source, SourcePlan
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
@@ -34,7 +35,7 @@ from unprocess_gen.dataset.manifest import (
     read_rows,
     rows_with_offsets,
 )
-from unprocess_gen.dataset.shards import arrays_of, target_names
+from unprocess_gen.dataset.shards import arrays_of
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
@@ -215,7 +216,7 @@ class PairRegenerator:
         Raises SourceChangedError if the source was changed or deleted, DamageError if the row has no valid plan,
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
         """
-        plan, names = plan_from_row(row), target_names(row)
+        plan, names = plan_from_row(row), [LINEAR_RGB] if row["targets"] else []
         for kernels in kernels_for(names, plan):
             self_test.check(kernels)
         photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source)
@@ -228,7 +229,7 @@ class PairRegenerator:
             )
         image = PlannedImage(photograph.srgb, (plan,), (patch,), dark_folder=self._dark_pixels(plan))
         _, _, pair = next(image.pairs())
-        targets = targets_of(names, photograph.srgb, plan, patch, pair, row)
+        targets = targets_of(names, photograph.srgb, plan, patch, pair)
         return {"clean": pair.clean, "noisy": pair.noisy, **targets}
 
     def photograph(self, source: Source, recorded: str, prepared: SourcePlan) -> Photograph:

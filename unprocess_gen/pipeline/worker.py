@@ -25,11 +25,11 @@ from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, has_frames, pair_row, row_json
-from unprocess_gen.dataset.shards import PER_PAIR, ShardWriter, arrays_of, shard_name, targets_cell
+from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels
 from unprocess_gen.pipeline.run_records import MAX_DEATHS, Deaths, commit_shard
 from unprocess_gen.pipeline.storage import Storage
-from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
+from unprocess_gen.pipeline.targets import kernels_for, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
@@ -141,20 +141,20 @@ def make_image(
     log.failures.update(dict.fromkeys(_self_test(context, image.plans)))
     rows: list[Row] = []
     sample: list[Row] = []
-    targets: Targets = {}
     for patch, plan, pair in log.times.each_simulated(image.pairs()):
         key = patch_key(source.index, patch, several=config.source.patch is not None)
         if plan is image.plans[0]:
-            sample, targets, clean_xxh3 = [], {}, array_xxh3(pair.clean)
+            sample, clean_xxh3 = [], array_xxh3(pair.clean)
+            with log.times.adding("simulate_s"):
+                targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
+            stored_targets = targets_cell(targets)
         digests = clean_xxh3, array_xxh3(pair.noisy)
         row_key = pair_key(key, plan, several=len(image.plans) > 1)
         row = pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn)
-        with log.times.adding("simulate_s"):
-            targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair, row, known=targets)
-        row = {**row, "targets": targets_cell(targets)}
+        row = {**row, "targets": stored_targets}
         arrays = {"clean": pair.clean, "noisy": pair.noisy, **targets}
         for name, stored in arrays_of(row).items():
-            if not sample or name in PER_PAIR:
+            if not sample or name == "noisy":
                 writer.add_frame(key, stored.member, arrays[name])
         sample.append(row)
         if plan is image.plans[-1]:

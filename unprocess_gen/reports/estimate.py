@@ -22,13 +22,12 @@ from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.targets import FRAME_TARGETS
 from unprocess_gen.core.types import Frame, Plan, Source
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import source_bytes
-from unprocess_gen.pipeline.targets import noise_law, targets_of
+from unprocess_gen.pipeline.targets import targets_of
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
 from unprocess_gen.planning.source_noise import noise_ratio
@@ -172,9 +171,8 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     clean_levels, planned_s = 0, time.perf_counter() - started
     for patch, plan, pair in image.pairs():
         clean_levels = clean_levels or count_levels(pair.clean)
-        names = [name for name in config.output.targets if plan is image.plans[0] or name in FRAME_TARGETS]
-        targets = targets_of(names, photograph.srgb, plan, patch, pair, noise_law(plan)).values()
-        for frame in (*([pair.clean] if plan is image.plans[0] else []), pair.noisy, *targets):
+        targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair).values()
+        for frame in (*((pair.clean, *targets) if plan is image.plans[0] else ()), pair.noisy):
             array_xxh3(frame)
             hashlib.sha256(frame.data)
     return SourceEstimate(
