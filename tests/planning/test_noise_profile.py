@@ -466,8 +466,8 @@ def test_inconsistent_physical_profiles_are_refused(
         ({"read_std_dn": ["by_iso", 400, 1.0, 6400, 0]}, "expected numbers above 0, up to 1e+09"),
         ({"row_std_dn": ["by_iso", 800, 1.0, 6400, 2.0]}, "has ISO 800 to 6400; expected values for the ISOs of the"),
         (
-            {"dn_per_e": ["by_iso", 400, 1.0, 6400, 2.0]},
-            "expected a number of 0 or more, up to 1e+09, or a form: per_iso",
+            {"dn_per_e": ["root", 1.0]},
+            "expected a number of 0 or more, up to 1e+09, or a form: per_iso, by_iso",
         ),
         ({"iso": [50, 6400]}, "has 16 rows from ISO 100; the branch, ISO 50 to 6400, needs 13"),
         ({"read_law": "tukey_lambda", "read_shape": -0.46}, "read_shape=-0.46: draws of 32 bits lack more than 12 %"),
