@@ -34,7 +34,6 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from unprocess_gen.cli import main as entry_point
-from unprocess_gen.config import composition
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, replaced
 from unprocess_gen.config.settings import settings_of
@@ -133,7 +132,7 @@ def _composed_once() -> Iterator[None]:
     def composed_once(name: str, overrides: list[str], **options: bool) -> Any:
         folders = [one.path for one in GlobalHydra.instance().config_loader().get_search_path().get_path()]
         added = any("searchpath" in one for one in overrides)
-        if added or composition._own_folder or str(conf_dir()) not in folders or not options:
+        if added or str(conf_dir()) not in folders or not options:
             return compose(name, overrides, **options)
         values = [one for one in overrides if KEY.match(one)]
         choices = [one for one in overrides if one not in values]

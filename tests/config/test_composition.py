@@ -16,8 +16,10 @@ from helpers.processes import WAIT_S, processes_per_core
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 
+from unprocess_gen.config import composition
 from unprocess_gen.config.composition import OptionFolders, compose_node, load_config
 from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.recomposition import Recomposition
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
 
@@ -139,6 +141,21 @@ def test_options_that_a_built_in_option_hides_are_refused(own: Path) -> None:
     assert load_config(["noise=own", "noise.bits=null"], own).noise.name == "own"
 
 
+@pytest.mark.parametrize("place", ["typed_config", "validate_config", "source_overrides", "_check_own_options"])
+def test_bugs_are_neither_hidden_nor_tried_twice(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def fail(*arguments: object) -> None:
+        calls.append(arguments)
+        raise AttributeError("a bug")
+
+    monkeypatch.setattr(composition, place, fail)
+    for compose in (load_config, Recomposition().config):
+        with pytest.raises(AttributeError, match="a bug"):
+            compose(["seed=3"])
+    assert len(calls) == 2
+
+
 def test_long_keys_are_refused_in_one_sentence() -> None:
     with pytest.raises(ConfigError, match="no such key; see gen-dataset --help"):
         load_config([f"{'a' * 300}=1"])
@@ -211,13 +228,6 @@ def test_hostile_option_files_are_refused_in_one_line(case: str, place: str, tmp
 def test_hostile_option_files_that_are_not_used_do_no_harm(own: Path) -> None:
     (own / "noise/empty.yaml").write_text("")
     assert load_config(["noise=own", "noise.bits=null"], own).noise.name == "own"
-
-
-def test_files_of_searchpath_are_checked_too(own: Path) -> None:
-    (own / "noise/empty.yaml").write_text("")
-    with pytest.raises(ConfigError, match="the file contains no keys"):
-        load_config([f"hydra.searchpath=[file://{own}]", "noise=empty"])
-    assert load_config([f"hydra.searchpath=[{own}]", "noise=own", "noise.bits=null"]).noise.name == "own"
 
 
 def test_option_files_that_cannot_be_read_are_refused(own: Path) -> None:

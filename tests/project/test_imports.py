@@ -12,7 +12,7 @@ from helpers.modules import MODULES, PACKAGE, tree
 
 ONLY_IN = {
     "hydra": {
-        *("config.composition", "config.composition_errors", "config.sweep_expansion", "config.recomposition"),
+        *("config.composition", "config.composition_errors", "config.sweep_expansion"),
     },
     "omegaconf": {
         *(

@@ -18,15 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -101,14 +97,24 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
     """
     if isinstance(overrides, str):
         raise ConfigError(f"overrides={overrides!r}: one string; expected a list of strings; write [{overrides!r}]")
+    config, _ = composed_config(overrides, OptionFolders(own=None if config_dir is None else Path(config_dir)))
+    return config
+
+
+def composed_config(overrides: Sequence[str], folders: OptionFolders) -> tuple[Config, dict[str, str | None]]:
+    """Compose and validate the config of one dataset; return it with the chosen option of each group.
+
+    ConfigError if the overrides or option files describe a sweep.
+    """
     for override in overrides:
         check_override(override)
-        if re.match(r"\+*hydra\b", override) and not override.startswith("hydra.searchpath="):
+        if override.lstrip("+").startswith(("hydra.", "hydra/")):
             raise ConfigError(f"{override}: settings of Hydra belong to the command line; expected keys of a dataset")
-    node = compose_node(overrides, OptionFolders(own=None if config_dir is None else Path(config_dir)))
+    node = compose_node(overrides, folders)
     if is_multirun(node) or OmegaConf.select(node, "hydra.sweeper.params"):
         raise ConfigError("hydra.sweeper.params: the overrides describe a sweep; expected one config; run gen-dataset")
-    return validated_config(node, overrides)
+    choices = dict(node.hydra.runtime.choices)
+    return validated_config(node, overrides), choices
 
 
 def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None) -> DictConfig:
@@ -119,16 +125,25 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     folders = folders or OptionFolders()
     if folders.own is not None and not folders.own.is_dir():
         raise ConfigError(f"--config-dir {folders.own}: no such folder; expected a folder of option files")
+    given = [*map(hydra_override, overrides)]
+    if folders.own is not None:
+        given.append(quoted("hydra.searchpath", f"file://{folders.own.absolute()}", "[{}]"))
+    _check_own_options(overrides, folders)
     try:
-        _check_own_options(overrides, folders)
-        with _hydra_for(folders):
-            given, name = [*map(hydra_override, overrides)], folders.name or "config"
-            node = hydra.compose(name, given, return_hydra_config=True)
-            if added := source_overrides(node, overrides):
-                node = hydra.compose(name, [*given, *added], return_hydra_config=True)
-            return node
-    except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
+        node = _compose(folders, given)
+        added = source_overrides(node, overrides)
+        return _compose(folders, [*given, *added]) if added else node
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(explain(error, overrides)) from error
+
+
+def _compose(folders: OptionFolders, overrides: list[str]) -> DictConfig:
+    """Compose overrides that Hydra can parse; HydraException for whatever Hydra raises about them."""
+    with _hydra_in((folders.main or conf_dir()).absolute()):
+        try:
+            return hydra.compose(folders.name or "config", overrides, return_hydra_config=True)
+        except PLAIN_ERRORS as error:
+            raise HydraException(str(error)) from error
 
 
 def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
@@ -178,18 +193,23 @@ def hydra_override(override: str) -> str:
 
 
 def quoted_path(override: str) -> str:
-    r"""Quote the value of a path for Hydra's grammar, and expand ``~``.
+    """Quote the value of a path, and expand ``~``, unless it is empty, null or quoted."""
+    key, _, path = override.partition("=")
+    if key not in PATH_KEYS or path in ("", "null") or path[0] in "'\"":
+        return override
+    return quoted(key, os.path.expanduser(path))
+
+
+def quoted(key: str, path: str, form: str = "{}") -> str:
+    r"""Return an override whose value is quoted for Hydra's grammar.
 
     An unquoted path with an umlaut, an apostrophe or a bracket is not a word of that grammar. Interpolations stay
     active; ``\${`` is a literal ``${``.
     """
-    key, _, path = override.partition("=")
-    if key not in PATH_KEYS or path in ("", "null") or path[0] in "'\"":
-        return override
-    path = os.path.expanduser(path)
     path = re.sub(r"(\\*)'", r"\1\1\\'", path)
     path = re.sub(r"(\\+)$", r"\1\1", path)
-    return f"{key}='{path}'"
+    value = form.format(f"'{path}'")
+    return f"{key}={value}"
 
 
 def _check_own_options(overrides: Sequence[str], folders: OptionFolders) -> None:
@@ -200,24 +220,14 @@ def _check_own_options(overrides: Sequence[str], folders: OptionFolders) -> None
     chosen = {override: override.lstrip("+").replace("=", "/", 1) for override in overrides}
     if folders.name is not None:
         chosen[f"--config-name {folders.name}"] = folders.name
-    for folder in [folders.own, *_searchpath(overrides)]:
-        for text, name in chosen.items():
-            file = Path(folder or "", f"{name}.yaml")
-            if folder is None or not file.is_file():
-                continue
-            if folder == folders.own and (folders.main or conf_dir()).joinpath(f"{name}.yaml").is_file():
-                problem = "has the name of a built-in file, which would be used instead"
-                raise ConfigError(f"{text}: {file} {problem}; rename the file")
-            read_yaml_mapping(file)
-
-
-def _searchpath(overrides: Sequence[str]) -> Iterator[Path]:
-    """Yield the local folders of an override of ``hydra.searchpath``."""
-    for override in overrides:
-        if override.startswith("hydra.searchpath="):
-            paths = OverridesParser.create().parse_override(override).value()
-            for path in paths if isinstance(paths, list) else []:
-                yield Path(str(path).removeprefix("file://"))
+    for text, name in chosen.items() if folders.own is not None else ():
+        file = Path(folders.own or "", f"{name}.yaml")
+        if not file.is_file():
+            continue
+        if (folders.main or conf_dir()).joinpath(f"{name}.yaml").is_file():
+            problem = "has the name of a built-in file, which would be used instead"
+            raise ConfigError(f"{text}: {file} {problem}; rename the file")
+        read_yaml_mapping(file)
 
 
 def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> Iterator[str]:
@@ -230,37 +240,20 @@ def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> Iterator[str]:
             yield from _unknown_keys(node[key], value, f"{prefix}{key}.")
 
 
-# --------------------------------------------------------------------------------------- Hydra's process-wide state
-
 _LOCK = threading.RLock()
-_own_folder: Path | None = None
-
-
-class OwnOptions(SearchPathPlugin):
-    """Append the user's folder of option files to Hydra's search path, at the place of ``--config-dir``."""
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append the folder of the composition in progress, if it has one."""
-        if _own_folder is not None:
-            search_path.append("command-line", f"file://{_own_folder.absolute()}")
 
 
 @contextmanager
-def _hydra_for(folders: OptionFolders) -> Iterator[None]:
+def _hydra_in(main: Path) -> Iterator[None]:
     """Initialise Hydra's Compose API; afterwards restore the state of the application that runs, if any."""
-    global _own_folder
     with _LOCK:
-        Plugins.instance().register(OwnOptions)
         application, version = GlobalHydra.instance(), VersionBase.instance()
         state, base = application.hydra, version.version_base
         job_name = JobRuntime.instance().get("name")
         application.clear()
-        _own_folder = folders.own
         try:
-            main = (folders.main or conf_dir()).absolute()
             with hydra.initialize_config_dir(str(main), job_name=job_name, version_base=VERSION_BASE):
                 yield
         finally:
-            _own_folder = None
             application.hydra, version.version_base = state, base
             GlobalHydra.set_instance(application)

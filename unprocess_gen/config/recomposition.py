@@ -1,37 +1,21 @@
-"""Compose many configs that differ in a few settings, and write a config as overrides.
-
-Hydra needs a quarter of a second for a config. If only values change, merging them into an earlier node takes a tenth.
-"""
+"""Compose configs one after the other, and write a config as overrides."""
 
 from __future__ import annotations
 
-import copy
 import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import open_dict
 
-from unprocess_gen.config.composition import (
-    OptionFolders,
-    compose_node,
-    hydra_override,
-    is_multirun,
-    load_config,
-    typed_config,
-    validated_config,
-)
+from unprocess_gen.config.composition import OptionFolders, compose_node, composed_config, load_config, typed_config
 from unprocess_gen.config.defaults import default_options
-from unprocess_gen.config.option_files import check_override, conf_dir
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.serialization import recorded
 from unprocess_gen.config.values import is_number
 from unprocess_gen.core.errors import ConfigError
-
-NODES_KEPT = 16
-"""Composed nodes that are kept, 1 MB each."""
 
 
 class Recomposition:
@@ -42,7 +26,6 @@ class Recomposition:
 
     def __init__(self, folders: OptionFolders | None = None) -> None:
         self._folders = folders or OptionFolders()
-        self._nodes: dict[tuple[str, ...], DictConfig] = {}
         self.choices: dict[str, str | None] = {}
 
     @property
@@ -52,40 +35,8 @@ class Recomposition:
 
     def config(self, overrides: Sequence[str]) -> Config:
         """Return the config that `load_config` returns; ConfigError with the sentence of `load_config`."""
-        values = [override for override in overrides if _is_value(override)]
-        try:
-            return self._merged(overrides, values)
-        except Exception:  # what is wrong is explained by a complete composition
-            return self._merged(overrides, [])
-
-    def _merged(self, overrides: Sequence[str], values: Sequence[str]) -> Config:
-        """Compose the other overrides, unless their node is kept, and merge values into it."""
-        node = copy.deepcopy(self._node(tuple(override for override in overrides if override not in values)))
-        for value in map(OverridesParser.create().parse_override, map(hydra_override, values)):
-            OmegaConf.update(node, value.key_or_group, value.value(), merge=True)
-        choices = dict(node.hydra.runtime.choices)
-        config = validated_config(node, overrides)
-        self.choices = choices
+        config, self.choices = composed_config(overrides, self._folders)
         return config
-
-    def _node(self, options: tuple[str, ...]) -> DictConfig:
-        if options not in self._nodes:
-            for override in options:
-                check_override(override)
-            node = compose_node(options, self._folders)
-            if is_multirun(node) or OmegaConf.select(node, "hydra.sweeper.params"):
-                raise ConfigError("hydra.sweeper.params: the settings describe a sweep; expected one config")
-            if len(self._nodes) >= NODES_KEPT:
-                del self._nodes[next(iter(self._nodes))]
-            self._nodes[options] = node
-        return self._nodes[options]
-
-
-def _is_value(override: str) -> bool:
-    """True if an override sets one value of a config, and chooses no option."""
-    key, equals, _ = override.partition("=")
-    group, dot, _ = key.partition(".")
-    return bool(equals) and (group in GROUPS if dot else key in Config.__dataclass_fields__ and key not in GROUPS)
 
 
 NAMED_GROUPS = ("camera", "noise", "scene")
