@@ -112,7 +112,7 @@ class SourceConfig(Group):
         number of failed sources up to which a run exits with code 0; with more it exits with code 3
     icc
         colour profiles of photographs: ignore reads pixels as sRGB; with refuse, images with another profile
-        fail (extra icc)
+        fail
     clips
         treat each folder as a clip: its frames share camera, gains, noise level and fixed patterns
     downscale

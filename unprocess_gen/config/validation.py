@@ -131,8 +131,6 @@ def _check_environment(config: Config) -> None:
             raise refusal("source.kind", "raw", "the built-in scenes are pictures; expected frames; give source.root=…")
         for library in ("rawpy", "tifffile"):
             require(library, f"source.kind=raw: needs {library}", "raw")
-    if source.icc == "refuse":
-        require("PIL", "source.icc=refuse: needs Pillow", "icc", ", or set source.icc=ignore")
     if config.executor.kind == "dask":
         require("distributed", "executor.kind=dask: needs Dask", "dask", ", or set executor=local")
 

@@ -22,9 +22,10 @@ from helpers.promise_report import Figure
 from PIL import Image, ImageCms
 
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.sources.image.decode import CV2_MAX_PIXELS, Header, decode, probe
+from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.sources.image.headers import probe
 
-SIZES = [(1, 1), (1, 9), (9, 1), (2, 2), (7, 13), (40, 61)]
+SIZES = [(1, 1), (1, 9), (7, 13), (40, 61)]
 
 
 def smooth(height: int = 40, width: int = 61, seed: int = 0) -> np.ndarray:
@@ -102,9 +103,7 @@ LOSSLESS: dict[str, Callable[[np.ndarray], bytes]] = {
     "bmp": lambda pixels: pillow(pixels, "BMP"),
     "tiff": lambda pixels: tiff(pixels),
     "tiff, big-endian": lambda pixels: tiff(pixels, byteorder=">"),
-    "tiff, BigTIFF": lambda pixels: tiff(pixels, bigtiff=True),
     "tiff, deflated": lambda pixels: tiff(pixels, compression="zlib", predictor=True),
-    "tiff, LZW": lambda pixels: pillow(pixels, "TIFF", compression="tiff_lzw"),
     "tiff, PackBits": lambda pixels: pillow(pixels, "TIFF", compression="packbits"),
     "tiff, tiles": lambda pixels: tiff(pixels, tile=(32, 32)),
     "tiff, strips": lambda pixels: tiff(pixels, rowsperstrip=2),
@@ -152,15 +151,8 @@ def test_gray_becomes_three_equal_channels(kind: str, dtype: Any) -> None:
     np.testing.assert_array_equal(pixels_of(GRAY[kind](stored[..., 0])), np.repeat(stored, 3, 2), strict=True)
 
 
-@pytest.mark.parametrize(
-    ("bits", "row", "grays"),
-    [(1, b"\x50", [0, 255, 0, 255]), (2, b"\x1b", [0, 85, 170, 255]), (4, b"\x05\xaf", [0, 85, 170, 255])],
-)
-def test_few_bits_of_gray_are_spread_over_all_codes(bits: int, row: bytes, grays: list[int]) -> None:
-    assert pixels_of(png(4, bits, 0, row))[0, :, 0].tolist() == grays
-
-
-def test_bilevel_tiff_is_black_and_white() -> None:
+def test_few_bits_of_gray_are_spread_over_all_codes() -> None:
+    assert pixels_of(png(4, 2, 0, b"\x1b"))[0, :, 0].tolist() == [0, 85, 170, 255]
     stored = noise(5, 19, channels=1)[..., 0] > 100
     np.testing.assert_array_equal(pixels_of(tiff(stored, "minisblack"))[..., 1], stored * np.uint8(255))
 
@@ -169,7 +161,6 @@ PALETTES: dict[str, Callable[[Image.Image], bytes]] = {
     "png": lambda image: pillow(image, "PNG"),
     "bmp": lambda image: pillow(image, "BMP"),
     "tiff": lambda image: pillow(image, "TIFF"),
-    "png, 2 bits": lambda image: pillow(image, "PNG", bits=2),
 }
 
 
@@ -179,8 +170,7 @@ def test_palettes_become_rgb(kind: str) -> None:
     np.testing.assert_array_equal(pixels_of(PALETTES[kind](image)), np.asarray(image.convert("RGB")), strict=True)
 
 
-@pytest.mark.parametrize("progressive", [False, True], ids=["baseline", "progressive"])
-@pytest.mark.parametrize("subsampling", [0, 1, 2], ids=["444", "422", "420"])
+@pytest.mark.parametrize(("subsampling", "progressive"), [(0, True), (2, False)], ids=["444", "420"])
 def test_jpeg_pixels_are_those_opencv_decodes_by_default(subsampling: int, progressive: bool) -> None:
     for size in SIZES:
         data = pillow(smooth(*size), "JPEG", subsampling=subsampling, progressive=progressive)
@@ -219,9 +209,7 @@ ORIENTED: dict[str, tuple[Any, Callable[[np.ndarray, int], bytes]]] = {
     "webp": (np.uint8, lambda pixels, turn: pillow(pixels, "WEBP", lossless=True, exif=exif(turn))),
     "tiff": (np.uint8, lambda pixels, turn: tiff(pixels, extratags=[(274, "H", 1, turn, True)])),
     "tiff, tiles": (np.uint8, lambda pixels, turn: tiff(pixels, tile=(32, 32), extratags=[(274, "H", 1, turn, True)])),
-    "tiff, BigTIFF": (np.uint8, lambda pixels, turn: tiff(pixels, bigtiff=True, extratags=[(274, "H", 1, turn, True)])),
     "tiff, 32-bit tag": (np.uint8, lambda pixels, turn: tiff(pixels, extratags=[(274, "I", 1, turn, True)])),
-    "tiff, 16 bits": (np.uint16, lambda pixels, turn: tiff(pixels, extratags=[(274, "H", 1, turn, True)])),
     "tiff, 16 bits, big-endian": (
         np.uint16,
         lambda pixels, turn: tiff(pixels, byteorder=">", extratags=[(274, "H", 1, turn, True)]),
@@ -246,15 +234,15 @@ def test_orientation_of_an_exif_chunk_behind_the_pixels_counts() -> None:
     assert probe(png(1, 8, 2, b"abc", after=chunk(b"eXIf", exif(5)[6:]))).orientation == 5
 
 
-@pytest.mark.parametrize("kind", ORIENTED)
+@pytest.mark.parametrize("kind", ["jpeg", "tiff"])
 def test_an_orientation_that_does_not_exist_is_1(kind: str) -> None:
     dtype, write = ORIENTED[kind]
-    for value in (0, 9, 65535):
+    for value in (0, 9):
         photograph = decode(write(noise(4, 6, dtype), value), max_pixels=24, icc="ignore")
         assert (photograph.orientation, photograph.srgb.shape) == (1, (4, 6, 3)), value
 
 
-@pytest.mark.parametrize("block", [b"", b"Exif\0\0", b"Exif\0\0garbage", exif(6)[:20], exif(6)[:14] + b"\xff\xff"])
+@pytest.mark.parametrize("block", [b"", b"Exif\0\0garbage", exif(6)[:20]])
 def test_a_broken_exif_block_is_no_reason_to_refuse_pixels(block: bytes) -> None:
     assert decode(pillow(smooth(), "JPEG", exif=block or b"\0"), max_pixels=2**26, icc="ignore").orientation == 1
 
@@ -278,15 +266,12 @@ def bgra(stored: np.ndarray) -> np.ndarray:
     return stored[..., [2, 1, 0, 3]]
 
 
-MASKS = (0xFF0000, 0xFF00, 0xFF, 0xFF000000)
 ALPHA: dict[str, tuple[Any, Callable[[np.ndarray], bytes]]] = {
     "png": (np.uint8, lambda pixels: pillow(pixels, "PNG")),
     "png, 16 bits": (np.uint16, lambda pixels: cv2.imencode(".png", bgra(pixels))[1].tobytes()),
     "webp": (np.uint8, lambda pixels: pillow(pixels, "WEBP", lossless=True, exact=True)),
     "tiff": (np.uint8, lambda pixels: tiff(pixels, extrasamples=["unassalpha"])),
-    "tiff, premultiplied": (np.uint8, lambda pixels: tiff(pixels, extrasamples=["assocalpha"])),
     "tiff, 16 bits": (np.uint16, lambda pixels: tiff(pixels, extrasamples=["unassalpha"])),
-    "bmp": (np.uint8, lambda pixels: bmp(7, -5, 32, bgra(pixels).tobytes(), MASKS)),
 }
 
 
@@ -307,11 +292,6 @@ def test_gray_png_with_alpha(alpha: int) -> None:
 PALETTE = chunk(b"PLTE", bytes(range(12)))
 # colour type, bits, row, a tRNS that no pixel meets, one that a pixel meets
 TRANSPARENT_KEYS = {
-    "gray 1": (0, 1, b"\x00", b"\0\1", b"\0\0"),
-    "gray 2": (0, 2, b"\x1b", None, b"\0\1"),
-    "gray 4": (0, 4, b"\x5a\x5a", b"\0\3", b"\0\5"),
-    "gray 8": (0, 8, b"\5\6\7\x08", b"\0\4", b"\0\5"),
-    "gray 16": (0, 16, b"\5\1\5\2\5\3\5\4", b"\5\5", b"\5\4"),
     "rgb 8": (2, 8, bytes(range(12)), b"\0\0\0\1\0\3", b"\0\3\0\4\0\5"),
     "rgb 16": (2, 16, bytes(range(24)), b"\0\1\2\3\4\4", b"\0\1\2\3\4\5"),
     "palette": (3, 8, b"\0\1\1\0", b"\xff\xff\0", b"\xff\xfe"),
@@ -323,12 +303,12 @@ def test_transparent_png_colour_is_refused_if_a_pixel_has_it_and_dropped_otherwi
     colour, bits, row, unmet, met = TRANSPARENT_KEYS[kind]
     before = PALETTE if colour == 3 else b""
     assert reason_of(png(4, bits, colour, row, before + chunk(b"tRNS", met))) == "alpha"
-    if unmet is not None:
-        dropped = pixels_of(png(4, bits, colour, row, before + chunk(b"tRNS", unmet)))
-        np.testing.assert_array_equal(dropped, pixels_of(png(4, bits, colour, row, before)))
+    dropped = pixels_of(png(4, bits, colour, row, before + chunk(b"tRNS", unmet)))
+    np.testing.assert_array_equal(dropped, pixels_of(png(4, bits, colour, row, before)))
 
 
-def test_gray_tiff_with_alpha_is_refused() -> None:
+def test_gray_with_transparency_is_refused() -> None:
+    assert reason_of(png(4, 8, 0, b"\5\6\7\x08", chunk(b"tRNS", b"\0\4"))) == "alpha"
     assert reason_of(tiff(noise(3, 4, channels=2), "minisblack", extrasamples=["unassalpha"])) == "alpha"
 
 
@@ -343,14 +323,12 @@ def test_no_bytes_are_empty() -> None:
     assert reason_of(b"") == "empty"
 
 
-@pytest.mark.parametrize(
-    "data", [b"GIF89a" + bytes(40), b"hello", b"\0", b"\0\0\0\x1cftypheic", b"%PDF-1.4", b"RIFF\4\0\0\0WAVE"]
-)
+@pytest.mark.parametrize("data", [b"GIF89a" + bytes(40), b"hello", b"\0", b"\0\0\0\x1cftypheic", b"II+\0\x08\0\0\0"])
 def test_other_formats_are_unsupported(data: bytes) -> None:
     assert reason_of(data) == "unsupported"
 
 
-@pytest.mark.parametrize(("brand", "name"), [(b"heic", "HEIC"), (b"mif1", "HEIC"), (b"avif", "AVIF")])
+@pytest.mark.parametrize(("brand", "name"), [(b"heic", "HEIC"), (b"avif", "AVIF")])
 def test_heif_content_is_named_with_advice(brand: bytes, name: str) -> None:
     with pytest.raises(SourceError) as caught:
         decode(b"\0\0\0\x1cftyp" + brand + bytes(16), max_pixels=2**26, icc="ignore")
@@ -360,8 +338,6 @@ def test_heif_content_is_named_with_advice(brand: bytes, name: str) -> None:
 GRADES = noise(4, 6, channels=1)[..., 0]
 UNSUPPORTED = {
     "float tiff": tiff(GRADES.astype(np.float32), "minisblack"),
-    "half tiff": tiff(GRADES.astype(np.float16), "minisblack"),
-    "32-bit tiff": tiff(GRADES.astype(np.uint32), "minisblack"),
     "signed tiff": tiff(GRADES.astype(np.int16), "minisblack"),
     "lab tiff": tiff(noise(4, 6), "cielab"),
     "planes of 16 bits": tiff(noise(3, 40, np.uint16, 61), planarconfig="separate"),
@@ -370,7 +346,7 @@ UNSUPPORTED = {
     "huge tiles": retagged(tiff(noise(40, 61), tile=(32, 64), compression="zlib"), {322: 2**15, 323: 2**15}),
     "thumbnail first": tiff(noise(4, 6), subfiletype=1),
     "16-bit bmp": bmp(1, 1, 16, b"\x1f\x7c\0\0"),
-    "bmp with masks within bytes": bmp(1, 1, 32, bytes(4), (0x3FF00000, 0xFFC00, 0x3FF, 0)),
+    "bmp with masks": bmp(1, 1, 32, bytes(4), (0xFF0000, 0xFF00, 0xFF, 0)),
 }
 
 
@@ -413,11 +389,6 @@ def test_the_limit_of_pixels_is_inclusive() -> None:
     assert reason_of(data, max_pixels=90) == "too_large"
 
 
-def test_sizes_that_opencv_refuses_are_too_large() -> None:
-    assert reason_of(png(60_000, 8, 2, b"", height=60_000), max_pixels=2**40) == "too_large"
-    assert reason_of(png(1_000_001, 8, 0, b""), max_pixels=CV2_MAX_PIXELS) == "too_large"
-
-
 def test_a_setting_that_does_not_exist_is_a_value_error() -> None:
     with pytest.raises(ValueError, match="icc is 'maybe', expected one of ignore, refuse"):
         decode(pillow(smooth(), "PNG"), max_pixels=1, icc="maybe")
@@ -438,23 +409,17 @@ def swapped_primaries() -> bytes:
 
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 LAB = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
-CARRIERS = ["JPEG", "PNG", "WEBP", "TIFF"]
 
 
-@pytest.mark.parametrize("kind", CARRIERS)
-def test_srgb_profile_is_accepted(kind: str) -> None:
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF"])
+def test_only_srgb_profiles_are_accepted_when_asked(kind: str) -> None:
     assert pixels_of(pillow(smooth(), kind, icc_profile=SRGB), icc="refuse").shape == (40, 61, 3)
+    for profile in (swapped_primaries(), LAB, b"garbage"):
+        assert reason_of(pillow(smooth(), kind, icc_profile=profile), icc="refuse") == "icc"
 
 
-@pytest.mark.parametrize("profile", [swapped_primaries(), LAB, b"garbage"], ids=["other primaries", "Lab", "garbage"])
-@pytest.mark.parametrize("kind", CARRIERS)
-def test_any_other_profile_is_refused_when_asked(kind: str, profile: bytes) -> None:
-    assert reason_of(pillow(smooth(), kind, icc_profile=profile), icc="refuse") == "icc"
-
-
-@pytest.mark.parametrize("kind", ["PNG", "TIFF"])
-def test_ignored_profiles_leave_pixels_unchanged(kind: str) -> None:
-    data = pillow(smooth(), kind, icc_profile=swapped_primaries())
+def test_ignored_profiles_leave_pixels_unchanged() -> None:
+    data = pillow(smooth(), "PNG", icc_profile=swapped_primaries())
     np.testing.assert_array_equal(pixels_of(data, icc="ignore"), smooth())
 
 
@@ -465,7 +430,6 @@ def test_profile_in_many_segments_is_joined() -> None:
 
 def test_broken_png_profile_is_refused_under_icc_refuse() -> None:
     data = png(1, 8, 2, b"abc", chunk(b"iCCP", b"name\0\0not deflated"))
-    assert probe(data).icc == b""
     assert reason_of(data, icc="refuse") == "icc"
 
 
@@ -484,12 +448,8 @@ def thumbnail_exif() -> bytes:
 CUTTABLE = {
     "jpeg": pillow(smooth(), "JPEG"),
     "jpeg, progressive": pillow(smooth(), "JPEG", progressive=True),
-    "jpeg, restarts": pillow(smooth(), "JPEG", restart_marker_blocks=3),
     "jpeg, thumbnail": pillow(smooth(), "JPEG", exif=thumbnail_exif()),
-    "jpeg, progressive, thumbnail": pillow(smooth(), "JPEG", exif=thumbnail_exif(), progressive=True),
-    "jpeg, profile": pillow(smooth(), "JPEG", icc_profile=SRGB),
     "png": pillow(smooth(), "PNG"),
-    "png, 16 bits": cv2.imencode(".png", noise(9, 9, np.uint16))[1].tobytes(),
     "webp": pillow(smooth(), "WEBP"),
     "webp, lossless, EXIF": pillow(smooth(), "WEBP", lossless=True, exif=exif(6)),
     "bmp": pillow(smooth(20, 21), "BMP"),
@@ -508,10 +468,10 @@ def test_every_cut_is_refused(kind: str, figure: Figure) -> None:
     figure("damaged-pictures", f"{len(data) - 12 - reasons['truncated']} of {len(data) - 12} truncations decoded")
 
 
-@pytest.mark.parametrize("kind", ["jpeg", "jpeg, progressive", "jpeg, thumbnail", "png", "webp", "bmp", "tiff"])
-@pytest.mark.parametrize("tail", [b"\0", b"\xff", pillow(smooth(), "JPEG"), b"\0\0\0\x18ftypmp42" + bytes(99)])
-def test_bytes_after_the_end_are_accepted(kind: str, tail: bytes) -> None:
-    np.testing.assert_array_equal(pixels_of(CUTTABLE[kind] + tail), pixels_of(CUTTABLE[kind]))
+@pytest.mark.parametrize("kind", ["jpeg", "jpeg, progressive", "png", "webp", "bmp", "tiff"])
+def test_bytes_after_the_end_are_accepted(kind: str) -> None:
+    for tail in (b"\xff", pillow(smooth(), "JPEG"), b"\0\0\0\x18ftypmp42" + bytes(99)):
+        np.testing.assert_array_equal(pixels_of(CUTTABLE[kind] + tail), pixels_of(CUTTABLE[kind]))
 
 
 @pytest.mark.parametrize("kind", ["jpeg", "png", "webp, lossless, EXIF", "tiff, deflated, 16 bits"])
@@ -534,7 +494,6 @@ CORRUPT = {
     "tiff without a page": b"II*\0\0\0\0\0",
     "tiff of few strips": retagged(tiff(smooth(), rowsperstrip=8), {278: 2}),
     "tiff of short strips": retagged(tiff(smooth()), {279: 100}),
-    "tiff of no rows": retagged(tiff(smooth()), {278: 0}),
     "bmp of width -1": bmp(-1, 1, 24, bytes(8)),
 }
 
@@ -563,27 +522,21 @@ def test_a_header_is_what_pillow_reads(kind: str) -> None:
     with Image.open(io.BytesIO(SECOND_OPINION[kind])) as image:
         assert (header.width, header.height) == image.size
         assert header.orientation == image.getexif().get(274, 1)
-        assert header.icc == image.info.get("icc_profile")
+        assert header.icc == image.info.get("icc_profile", b"")
         assert header.format == (image.format or "").lower()
-
-
-def test_header_has_size_colour_depth_and_alpha() -> None:
-    data = cv2.imencode(".png", with_alpha(0, np.uint16))[1].tobytes()
-    assert probe(data) == Header("png", 7, 5, "rgb", 16, has_alpha=True)
 
 
 # What a file lost from its middle -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cut", range(300, 3300, 370))
+@pytest.mark.parametrize("cut", [300, 1410, 2890])
 def test_jpeg_without_its_middle_is_corrupt(cut: int) -> None:
     data = pillow(noise(64, 64), "JPEG", quality=85)
     assert reason_of(data[: cut + 400] + data[-2:]) == "corrupt"
 
 
-@pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_deflate"])
-def test_a_tiff_whose_compressed_data_are_broken_is_corrupt(compression: str) -> None:
-    data = bytearray(pillow(noise(64, 64), "TIFF", compression=compression))
+def test_a_tiff_whose_compressed_data_are_broken_is_corrupt() -> None:
+    data = bytearray(pillow(noise(64, 64), "TIFF", compression="tiff_deflate"))
     data[400:460] = bytes(byte ^ 0x55 for byte in data[400:460])
     assert reason_of(bytes(data)) == "corrupt"
 
@@ -614,10 +567,9 @@ def with_cicp(primaries: int, transfer: int, matrix: int = 0, full_range: int = 
     return data[:33] + chunk(b"cICP", bytes((primaries, transfer, matrix, full_range))) + data[33:]
 
 
-@pytest.mark.parametrize("icc", ["ignore", "refuse"])
-@pytest.mark.parametrize(("primaries", "transfer"), [(9, 16), (9, 18), (1, 16), (12, 16), (1, 8)])
-def test_png_of_high_dynamic_range_is_unsupported(primaries: int, transfer: int, icc: str) -> None:
-    assert reason_of(with_cicp(primaries, transfer), icc=icc) == "unsupported"
+@pytest.mark.parametrize(("primaries", "transfer"), [(9, 16), (9, 18), (1, 8)])
+def test_png_of_high_dynamic_range_is_unsupported(primaries: int, transfer: int) -> None:
+    assert reason_of(with_cicp(primaries, transfer)) == "unsupported"
 
 
 @pytest.mark.parametrize(("matrix", "full_range"), [(9, 1), (0, 0)])

@@ -10,8 +10,7 @@ What OpenCV does (4.13 and 5.0 agree), and what this module does about it:
 * 16-bit TIFF: under ``IMREAD_COLOR_RGB`` half of the bytes are swapped, so these files are decoded as stored. Then
   "white is zero" is not inverted (at 8 bits it is), and separate planes contain uninitialised memory. The first is
   inverted here, the second refused.
-* Alpha: the transparent gray of a PNG (tRNS) and the alpha of a gray TIFF are dropped silently. The first is searched
-  for in the pixels, the second refused.
+* Alpha: the transparent gray of a PNG (tRNS) and the alpha of a gray TIFF are dropped silently, so both are refused.
 * Refused because OpenCV decodes them wrongly: 16-bit BMP (white becomes 248), CMYK JPEG (no profile is applied), TIFF
   tiles narrower than 32 pixels at 8 bits. TIFF tiles are allocated at the size they declare, so it is limited.
 * Damage: codecs report it on standard error only (`codec_messages`). libjpeg reports the first problem of a file only,
@@ -36,7 +35,7 @@ import numpy as np
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.types import Photograph, Srgb
 from unprocess_gen.sources.image.codec_messages import captured
-from unprocess_gen.sources.image.headers import Header, max_side, png_transparent_gray, probe, tiff_without_orientation
+from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -126,25 +125,22 @@ def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Ph
 def _refuse(header: Header, max_pixels: int, icc: str) -> None:
     pixels = header.width * header.height
     limit = min(max_pixels, CV2_MAX_PIXELS)
-    longest = max_side(header.format)
     size = f"{header.width} x {header.height} pixels"
     if header.missing:
         raise SourceError("truncated", f"the file of {size} lacks {header.missing}")
     if pixels > limit:
         raise SourceError("too_large", f"{size} are {pixels}, more than source.max_pixels={limit}")
-    if max(header.width, header.height) > longest:
-        raise SourceError("too_large", f"{size}: OpenCV reads {header.format} files of up to {longest} a side")
     if header.frames > 1:
         raise SourceError("animated", f"the file holds {header.frames} pictures, expected 1")
     if header.mode == "cmyk":
         raise SourceError("cmyk", "the pixels are printing inks (CMYK); convert the picture to sRGB")
     if header.cicp is not None:
         _refuse_cicp(header.cicp, icc)
-    elif icc == "refuse" and header.icc is not None and (objection := _profile_objection(header.icc)):
+    elif icc == "refuse" and header.icc and (objection := _profile_objection(header.icc)):
         raise SourceError("icc", f"{objection}; convert the picture to sRGB, or set source.icc=ignore")
 
 
-def _refuse_cicp(cicp: tuple[int, int, int, int], icc: str) -> None:
+def _refuse_cicp(cicp: bytes, icc: str) -> None:
     """Raise SourceError for colours declared by code points (H.273) that sRGB code would misread.
 
     Under ``ignore``, other primaries and curves of standard dynamic range count as sRGB, as ICC profiles do.
@@ -155,7 +151,7 @@ def _refuse_cicp(cicp: tuple[int, int, int, int], icc: str) -> None:
         raise SourceError("unsupported", f"{declared}: {CICP_HDR_TRANSFERS[transfer]}, not display-referred")
     if matrix != 0 or full_range != 1:
         raise SourceError("unsupported", f"{declared}, full range {full_range}: not full-range RGB")
-    if icc == "refuse" and cicp != CICP_SRGB:
+    if icc == "refuse" and tuple(cicp) != CICP_SRGB:
         raise SourceError("icc", f"{declared}; convert the picture to sRGB, or set source.icc=ignore")
 
 
@@ -205,7 +201,7 @@ def _pixels(data: bytes, header: Header, name: str) -> Srgb:
         _LOGGER.warning("%s: %s", name, text)
     _check_array(decoded, header)
     if header.has_alpha:
-        _check_opaque(decoded, data, header)
+        _check_opaque(decoded, header)
     if header.mode == "white_is_zero" and header.bits == 16:
         np.subtract(65535, decoded, out=decoded)
     return _as_rgb(decoded) if flags == _UNCHANGED else decoded
@@ -232,13 +228,10 @@ def _check_array(decoded: Srgb, header: Header) -> None:
         raise SourceError("corrupt", f"the header declares {expected} (rows, columns, type), the data have {actual}")
 
 
-def _check_opaque(decoded: Srgb, data: bytes, header: Header) -> None:
-    if header.format == "png" and decoded.ndim == 2:
-        transparent = bool((decoded == png_transparent_gray(data)).any())
-    else:
-        transparent = decoded.ndim == 3 and decoded.shape[2] == 4 and bool(decoded[..., 3].min() < 2**header.bits - 1)
-    if transparent:
-        raise SourceError("alpha", "some pixels are transparent; flatten the picture onto a background")
+def _check_opaque(decoded: Srgb, header: Header) -> None:
+    """Raise SourceError if pixels are transparent, or gray with a transparent value, which OpenCV drops."""
+    if decoded.ndim == 2 or (decoded.shape[2] == 4 and decoded[..., 3].min() < 2**header.bits - 1):
+        raise SourceError("alpha", "some pixels may be transparent; flatten the picture onto a background")
 
 
 def _as_rgb(stored: Srgb) -> Srgb:
