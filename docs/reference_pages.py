@@ -248,7 +248,7 @@ def command_line_page() -> str:
     flags = [_argument(argument) for argument in STANDARD]
     flags += [["`-h, --help`", "print the help of the verb"], ["`--version`", "print the version"]]
     hydra = [_argument(argument) for argument in HYDRA_FLAGS]
-    codes = [[", ".join(map(str, one.codes)), one.meaning] for one in EXIT_CODES]
+    codes = [[code, meaning] for code, meaning in EXIT_CODES.items()]
     blocks += ["## Flags of every verb", table(["flag", "meaning"], flags)]
     blocks += [HYDRA_INTRODUCTION, table(["flag", "meaning"], hydra)]
     blocks += ["## Exit codes", table(["code", "meaning"], codes)]

@@ -14,7 +14,6 @@ import update_reference
 from helpers.datasets import Settings
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD
-from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.cli.help import global_help, synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
@@ -144,7 +143,6 @@ def test_every_form_reason_and_exit_code_has_a_meaning() -> None:
     """Generated pages list them (`test_generated_parts_follow_from_the_code`)."""
     assert all(form.meaning and form.numbers for form in [*DISTRIBUTION_FORMS.values(), *ISO_FORMS.values()])
     assert all(REASONS.values())
-    assert all(one.meaning and one.summary for one in EXIT_CODES)
 
 
 def test_every_column_is_explained() -> None:

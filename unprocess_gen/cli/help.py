@@ -51,7 +51,7 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
         ("--", "everything after it is a file or folder, even with a leading hyphen"),
     ]
     blocks += ["\nFlags:", *(_two_columns(*flag) for flag in flags)]
-    return "\n".join(blocks) + "\n\n" + exit_code_lines()
+    return "\n".join(blocks) + "\n\n" + exit_code_lines() + "\n"
 
 
 def key_help(name: str, conf: Path) -> list[str]:
@@ -77,9 +77,8 @@ def group_lines(conf: Path) -> list[tuple[str, str]]:
 
 
 def exit_code_lines() -> str:
-    """Return the exit codes with a few words for each."""
-    words = " · ".join(f"{', '.join(map(str, code.codes))} {code.summary}" for code in EXIT_CODES)
-    return "Exit codes:\n" + textwrap.fill(words, WIDTH, initial_indent="  ", subsequent_indent="  ") + "\n"
+    """Return the exit codes with their meaning."""
+    return "\n".join(["Exit codes:", *(_hanging(f"  {code:<{INDENT + 3}}", text) for code, text in EXIT_CODES.items())])
 
 
 def group_help(group: str, conf: Path) -> str:

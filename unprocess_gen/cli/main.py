@@ -22,7 +22,7 @@ from unprocess_gen.cli.arguments import Verb, flag_parser, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
 from unprocess_gen.cli.help import global_help, group_help, key_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
-from unprocess_gen.cli.signals import SIGNALS, TerminationSignal
+from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.core.errors import RESUME, ConfigError, UnprocessGenError
@@ -123,13 +123,10 @@ def _exit_code(step: Callable[[], int | None], arguments: Sequence[str]) -> int:
         return step() or 0
     except BrokenPipeError:
         return BROKEN_PIPE
-    except KeyboardInterrupt:
-        return _report_signal(signal.SIGINT, arguments)
-    except TerminationSignal as error:
-        return _report_signal(error.number, arguments)
-    except Exception as error:
-        if SIGNALS.received is not None:  # OmegaConf and LLVM may fail in their own way when they are interrupted
-            return _report_signal(SIGNALS.received, arguments)
+    except (KeyboardInterrupt, Exception) as error:
+        # OmegaConf and LLVM may fail in their own way when they are interrupted
+        if isinstance(error, KeyboardInterrupt) or SIGNALS.received is not None:
+            return _report_signal(SIGNALS.received or signal.SIGINT, arguments)
         if isinstance(error, UnprocessGenError | PermissionError):
             return report_error(error)
         if LOGGER.handlers:

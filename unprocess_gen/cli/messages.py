@@ -1,7 +1,7 @@
 """Write results to stdout, and messages to stderr and a log file.
 
 Messages go through the logger ``unprocess_gen``; the verbs' flags decide where they appear. A full stdout is a system
-error, while a full stderr is ignored: it must not end a run. Streams that the caller closed become ``/dev/null``.
+error, while a full stderr is ignored: it must not end a run.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
@@ -22,8 +22,6 @@ from unprocess_gen.sources.image.codec_messages import REDIRECTED
 LOGGER = logging.getLogger("unprocess_gen")
 RESULTS = logging.getLogger("unprocess_gen.results")
 """What goes to stdout, once more for the log file; never shown on stderr."""
-
-LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
 
 
 def print_result(text: object) -> None:
@@ -56,7 +54,6 @@ def report_error(error: BaseException, job: str = "") -> int:
 def report(message: str, level: int = logging.WARNING) -> None:
     """Show a message on stderr, also before the logger has been set up."""
     if LOGGER.handlers:
-        LOGGER.disabled = False  # Hydra disables all loggers that exist when it starts an application
         LOGGER.log(level, "%s", message)
     else:
         print(f"gen-dataset: {message}", file=sys.stderr)
@@ -67,32 +64,21 @@ def logging_to(quiet: bool = False, verbose: bool = False, log_file: str | None 
     """Show the messages of the logger ``unprocess_gen`` on stderr, and append them to a log file."""
     if quiet and verbose:
         raise ConfigError("--quiet and --verbose exclude each other; expected one of them")
-    handlers: list[logging.Handler] = [_StderrHandler()]
-    if log_file is not None:
-        check_log_file(Path(log_file), f"--log-file {log_file}")
-        try:
-            handlers.append(_FileHandler(log_file, encoding="utf-8"))
-        except OSError as error:
-            raise ConfigError(
-                f"--log-file {log_file}: cannot be written ({error.strerror}); expected a file name"
-            ) from None
-        handlers[-1].setFormatter(logging.Formatter(LOG_FORMAT))
-    before = LOGGER.level, LOGGER.propagate, RESULTS.level
+    handlers = [_StderrHandler(), *([] if log_file is None else [_file_handler(log_file)])]
     LOGGER.setLevel(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)
-    LOGGER.propagate = False
-    LOGGER.disabled = RESULTS.disabled = False
     RESULTS.setLevel(logging.INFO)
+    LOGGER.propagate = False
     for handler in handlers:
         LOGGER.addHandler(handler)
     try:
         yield
     finally:
+        LOGGER.propagate = True
+        LOGGER.setLevel(logging.NOTSET)
         for handler in handlers:
             LOGGER.removeHandler(handler)
-            handler.close()
-        level, LOGGER.propagate, results_level = before
-        LOGGER.setLevel(level)  # assigning the attribute would leave logging's cache of enabled levels stale
-        RESULTS.setLevel(results_level)
+            with suppress(OSError):  # what cannot be written to a full disk is dropped
+                handler.close()
 
 
 class _StderrHandler(logging.Handler):
@@ -105,64 +91,58 @@ class _StderrHandler(logging.Handler):
                 print(f"gen-dataset: {record.getMessage()}", file=sys.stderr, flush=True)
 
 
-class _FileHandler(logging.FileHandler):
-    """Append messages to a file; a full disk does not end the run."""
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (the name is logging's)
-        """Drop a message that cannot be written."""
-
-    def close(self) -> None:
-        """Close the file; what cannot be written is dropped."""
-        with suppress(OSError):
-            super().close()
-
-
-# ---------------------------------------------------------------------------------------------------- stdout, stderr
+def _file_handler(log_file: str) -> logging.Handler:
+    """Return a handler that appends messages to a file; a full disk does not end the run."""
+    check_log_file(Path(log_file), f"--log-file {log_file}")
+    try:
+        handler = logging.FileHandler(log_file, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"--log-file {log_file}: cannot be written ({error.strerror}); expected a file name"
+        ) from None
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.handleError = lambda record: None  # type: ignore[method-assign]
+    return handler
 
 
 class _Stream:
-    """Pass text on to a stream; handle its errors in one place."""
+    """Pass text on to stdout or stderr, and handle their errors in one place.
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    A stream that fails becomes `os.devnull`, so that the interpreter's own flush at exit succeeds. An error of stdout
+    is a MachineError, or BrokenPipeError if its reader ended.
+    """
+
+    def __init__(self, stream: TextIO, fails: bool) -> None:
+        self._stream, self._fails = stream, fails
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
         """Write text."""
-        try:
-            return self._stream.write(text)
-        except OSError as error:
-            self._failed(error)
-            return len(text)
+        self._call(self._stream.write, text)
+        return len(text)
 
     def flush(self) -> None:
         """Flush the stream."""
+        self._call(self._stream.flush)
+
+    def _call(self, method: Callable[..., object], *arguments: str) -> None:
         try:
-            self._stream.flush()
+            method(*arguments)
         except OSError as error:
-            self._failed(error)
-
-    def _failed(self, error: OSError) -> None:
-        """Let the interpreter's own flush at exit succeed, which would otherwise change the exit code to 120."""
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
-
-
-class _Stdout(_Stream):
-    """Raise an error of stdout as MachineError; BrokenPipeError remains as it is."""
-
-    def _failed(self, error: OSError) -> None:
-        super()._failed(error)
-        if isinstance(error, BrokenPipeError):
-            raise error
-        raise MachineError(f"stdout: cannot be written ({error.strerror}); redirect it elsewhere and rerun") from error
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            if self._fails and isinstance(error, BrokenPipeError):
+                raise
+            if self._fails:
+                problem = f"cannot be written ({error.strerror}); redirect it elsewhere and rerun"
+                raise MachineError(f"stdout: {problem}") from error
 
 
 @contextmanager
 def checked_streams() -> Iterator[None]:
-    """Replace ``sys.stdout`` and ``sys.stderr`` by streams whose errors are handled; restore them at the end.
+    """Handle the errors of ``sys.stdout`` and ``sys.stderr`` until the end.
 
     Streams that the caller closed become `os.devnull`: otherwise the next file to be opened would get the number of
     stdout, and receive what C libraries print.
@@ -175,7 +155,7 @@ def checked_streams() -> Iterator[None]:
     for stream in before:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # for terminals that cannot show a character
-    sys.stdout, sys.stderr = _Stdout(before[0]), _Stream(before[1])
+    sys.stdout, sys.stderr = _Stream(before[0], True), _Stream(before[1], False)
     try:
         yield
     finally:
