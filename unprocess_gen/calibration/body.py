@@ -1,10 +1,9 @@
-"""Combine what all ISOs show of the body: fixed patterns, dark current, hot pixels, full well."""
+"""Combine what all ISOs show of the body: fixed patterns, dark current, hot pixels."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -24,44 +23,24 @@ LEAST_EXPOSURE_RATIO = 2.0
 LEAST_HOT_EXPOSURE_S = 0.2
 """Least exposure of darks that show hot pixels. Chosen: their excess is some electrons then."""
 LARGEST_HOT = 0.95
-"""Signal of hot pixels, as a fraction of white and of the full well, from which their current is not known."""
+"""Signal of hot pixels, as a fraction of white, from which their current is not known."""
 
 
 def measure_body(results: Sequence[IsoResult], sensor: Sensor) -> dict[str, Estimate | None]:
     """Combine the results of all ISOs: numbers of the camera body by name, None for those that captures do not show."""
     prnu = _prnu(results)
     currents = [current for result in results if (current := _dark_current(result)) is not None]
-    current = combined(currents) if currents else None
-    wells = [
-        result.full_well_dn.times(estimate(1 / gain.value, gain.error / gain.value**2))
-        for result in results
-        if result.full_well_dn and (gain := result["dn_per_e"])
-    ]
-    well = wells[0] if wells else None
-    hot_share, hot_current = _hot(results, sensor, well.value if well else math.inf)
+    hot_share, hot_current = _hot(results, sensor)
     dsnus = [
         result["dsnu_std_dn"].scaled(1 / result["dn_per_e"].value) for result in results if result["dsnu_std_dn"].value
     ]
     return {
         "prnu_std": prnu if prnu is not None and prnu.value > 0 else None,
         "dsnu_std_e": combined(dsnus) if dsnus else None,
-        "dark_e_per_s": current if current is not None and current.low > 0 else None,
+        "dark_e_per_s": current if currents and (current := combined(currents)).low > 0 else None,
         "hot_pixel_share": hot_share,
         "hot_pixel_e_per_s": hot_current,
-        "full_well_e": well,
     }
-
-
-def without_dark_current(result: IsoResult, current: Estimate | None) -> IsoResult:
-    """Return a result whose read noise does not contain the dark current of its darks: K²·D·t less variance."""
-    if current is None:
-        return result
-    added = current.scaled(result["dn_per_e"].value ** 2 * result.dark.exposure_s)
-    reads = [
-        root_estimate(read.value**2 - added.value, math.hypot(2 * read.value * read.error, added.error))
-        for read in result.numbers["read_std_dn"]
-    ]
-    return replace(result, numbers=result.numbers | {"read_std_dn": reads})
 
 
 def _prnu(results: Sequence[IsoResult]) -> Estimate | None:
@@ -87,7 +66,7 @@ def _dark_current(result: IsoResult) -> Estimate | None:
     return estimate(slope.value, math.hypot(slope.error, 2 * slope.value * sensor.error / sensor.value))
 
 
-def _hot(results: Sequence[IsoResult], sensor: Sensor, full_well_e: float) -> tuple[Estimate | None, Estimate | None]:
+def _hot(results: Sequence[IsoResult], sensor: Sensor) -> tuple[Estimate | None, Estimate | None]:
     """Return share and mean current of hot pixels, from the darks that show the most currents.
 
     The currents are exponentially distributed (the profile's law), so those above a threshold have the mean of all plus
@@ -100,7 +79,7 @@ def _hot(results: Sequence[IsoResult], sensor: Sensor, full_well_e: float) -> tu
         gain, dark = result["dn_per_e"].value, result.darks[-1]
         if dark.exposure_s < LEAST_HOT_EXPOSURE_S:
             continue
-        limit = LARGEST_HOT * min(sensor.white_dn - float(dark.measured.mean_dn.max()), full_well_e * gain)
+        limit = LARGEST_HOT * (sensor.white_dn - float(dark.measured.mean_dn.max()))
         above = float((np.minimum(dark.hot_dn, limit) - dark.hot_threshold_dn).sum()) / (gain * dark.exposure_s)
         least = dark.hot_threshold_dn / (gain * dark.exposure_s)
         measured.append((int((dark.hot_dn < limit).sum()), least, len(dark.hot_dn), max(above, 1e-3 * least)))

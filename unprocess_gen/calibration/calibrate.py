@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 
-from unprocess_gen.calibration.body import measure_body, without_dark_current
+from unprocess_gen.calibration.body import measure_body
 from unprocess_gen.calibration.captures import CaptureSet, common, read_captures
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.measure import Watch, measure_iso
@@ -48,21 +46,9 @@ def measure_all(captures: CaptureSet, watch: Watch, gains: Mapping[float, Estima
     """Measure each ISO, and what all ISOs show together; of ISOs whose gain is given, darks alone are measured."""
     results = [measure_iso(captures, iso, watch, (gains or {}).get(iso)) for iso in captures.isos]
     body = measure_body(results, captures.sensor)
-    results = [without_dark_current(result, body["dark_e_per_s"]) for result in results]
     darks = {capture.path: capture for capture in captures.captures if capture.kind == "dark"}
-    calibration = Calibration(captures, results, body, common(darks, "temperature_c"), [])
-    notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(calibration)]
-    return replace(calibration, notes=_merged(notes))
-
-
-def _merged(notes: Iterable[str]) -> list[str]:
-    """Return notes once each, without the names of places that differ only in the frames."""
-    seen: dict[str, tuple[str, int]] = {}
-    for note in notes:
-        kind = re.sub(r"[0-9.]+", "#", note.rpartition("): ")[2])
-        first, count = seen.get(kind, (note, 0))
-        seen[kind] = first, count + 1
-    return [note + (f" (and {count - 1} more like it)" if count > 1 else "") for note, count in seen.values()]
+    notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(body)]
+    return Calibration(captures, results, body, common(darks, "temperature_c"), notes)
 
 
 def write_profile(calibration: Calibration, to: Path) -> None:

@@ -53,7 +53,7 @@ class Capture:
     """
 
     path: Path
-    kind: Annotated[str, Meta(pattern="^(dark|flat)$")]
+    kind: str
     iso: Annotated[float, Meta(gt=0, le=1e9)]
     exposure_s: Number | None = None
     level: str = ""
@@ -122,7 +122,7 @@ class CaptureSet(NamedTuple):
         return sorted({capture.iso for capture in self.captures})
 
 
-def read_captures(folder: Path, kind: str | None = None, default: Sensor | None = None) -> CaptureSet:
+def read_captures(folder: Path, kind: str = "", default: Sensor | None = None) -> CaptureSet:
     """List the frames of a folder; ``kind`` is for raw files whose names state none, ``default`` for the sensor.
 
     Raises ConfigError or MachineError.
@@ -181,18 +181,28 @@ def _from_list(folder: Path) -> Iterator[Capture]:
         yield _listed(folder, f"{path}, line {number}", {name: value or "" for name, value in row.items() if name})
 
 
+def _from_names(folder: Path, default: str) -> Iterator[Capture]:
+    """Yield the raw files of a folder; their names, or the names of their folders, state the kind."""
+    for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
+        name = str(file.relative_to(folder))
+        kinds = [kind for kind, words in KIND_NAMES.items() if any(word in name.lower() for word in words)]
+        kind = kinds[0] if len(kinds) == 1 else "" if kinds else default
+        yield _listed(folder, f"calibrate: {file}", {"file": name, "kind": kind})
+
+
 def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
     """Return the frame of a line of ``captures.csv``; empty cells follow from the metadata of a raw file."""
-    file = folder / row["file"]
+    file, kind = folder / row["file"], row["kind"].strip().lower()
     if not file.is_file() or file.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{place}: file={row['file']}: no such frame; expected a file as {', '.join(SUFFIXES)}")
-    cells = {name: text.strip() for name, text in row.items() if name != "file" and text.strip()}
-    cells |= {"kind": row["kind"].strip().lower()}
+    if kind not in KIND_NAMES:
+        raise ConfigError(f"{place}: kind={kind}: expected dark or flat, in {TABLE} or in the name of the file")
+    cells = {name: text.strip() for name, text in row.items() if name not in ("file", "kind") and text.strip()}
     stated = _metadata(file) if file.suffix.lower() in RAW_FILES else {}
     if "iso" not in stated | cells:
-        raise ConfigError(f"{place}: iso is empty, and {file.name} does not state it; expected an ISO")
+        raise ConfigError(f"{place}: iso is empty, and {file.name} does not state it; expected an ISO in {TABLE}")
     try:
-        capture = check_record({"path": file} | stated | cells, Capture, strict=False)
+        capture = check_record({"path": file, "kind": kind} | stated | cells, Capture, strict=False)
     except ValueError as error:
         name, _, problem = str(error).partition(": ")
         raise ConfigError(f"{place}: {name}={row.get(name)}: {problem}") from error
@@ -207,31 +217,10 @@ def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
 def _metadata(file: Path) -> dict[str, Any]:
     """Return the facts of a raw file by the names of `Capture`."""
     facts = read_metadata(file, "calibrate")
-    stated = {
-        "iso": facts.iso,
-        "exposure_s": facts.exposure_s,
-        "black_level_dn": None if facts.black_dn is None else sum(facts.black_dn) / len(facts.black_dn),
-        "white_level_dn": facts.white_dn,
-        "pattern": facts.pattern,
-        "bits": facts.bits,
-    }
+    stated = {name: getattr(facts, name) for name in ("iso", "exposure_s", "pattern", "bits")}
+    black = None if facts.black_dn is None else sum(facts.black_dn) / len(facts.black_dn)
+    stated |= {"black_level_dn": black, "white_level_dn": facts.white_dn}
     return {name: value for name, value in stated.items() if value is not None}
-
-
-def _from_names(folder: Path, default: str | None = None) -> Iterator[Capture]:
-    """Yield the raw files of a folder; their names, or the names of their folders, state the kind."""
-    for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
-        name, facts = str(file.relative_to(folder)).lower(), dict[str, Any]()
-        kinds = [kind for kind, words in KIND_NAMES.items() if any(word in name for word in words)]
-        if not kinds and default:
-            kinds = [default]
-        if file.suffix.lower() in RAW_FILES:
-            facts = _metadata(file)
-        if len(kinds) != 1 or "iso" not in facts:
-            problem = "its name has not one of the words dark and flat" if "iso" in facts else "it states no ISO"
-            expected = f"expected {TABLE} in {folder} with the columns {','.join((*REQUIRED, 'exposure_s', 'level'))}"
-            raise ConfigError(f"calibrate: {file}: {problem}; {expected}")
-        yield Capture(file, kinds[0], **facts)
 
 
 def _from_emva(folder: Path) -> Iterator[Capture]:

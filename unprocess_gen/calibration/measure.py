@@ -46,8 +46,6 @@ ROUNDED_STD_DN = 0.7
 """Noise below which variances are taken from the fitted distribution, because rounding distorts them."""
 STILL_RISING = 0.9
 """Least variance of brighter levels that are not saturated, relative to the largest."""
-LARGEST_WELL = 0.97
-"""Signal, as a fraction of white, from which the converter may end first."""
 LEAST_FITTED_DN2 = 0.04
 """Variance without rounding below which nearly all values are equal, so that no distribution is fitted."""
 
@@ -100,11 +98,10 @@ class IsoResult:
     curves: list[Transfer]
     darks: list[Dark]
     dark: Dark
-    flats: list[Flat]
+    levels: list[Flat]
     shapes: list[ReadShape]
     histogram: Histogram
     prnu_square: tuple[float, float] | None
-    full_well_dn: Estimate | None
     notes: list[str]
 
     def __getitem__(self, name: str) -> Estimate:
@@ -121,12 +118,11 @@ def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate |
     darks = _darks(captures, iso, notes, watch)
     dark = max(darks, key=lambda dark: dark.measured.count)
     flats = [] if gain else _flats(captures, iso, darks, watch, notes)
-    if not gain:
-        _check_levels(iso, flats, sensor)
+    levels = [] if gain else _levels(iso, flats, sensor)
     shapes, histogram = _shapes(dark, watch)
     spread = _variances(dark.measured, shapes[0])[0] + np.maximum(dark.measured.dsnu, 0.0)  # both are dither
     checks.check_dark_noise(dark.frames, sensor, math.sqrt(float(spread.mean())))
-    curves = _curves(usable(flats), shapes[0]) if flats else []
+    curves = _curves(levels, shapes[0]) if levels else []
     gains = [gain] if gain else fit_gain(curves, sensor.span_dn)
     return IsoResult(
         iso=iso,
@@ -134,11 +130,10 @@ def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate |
         curves=curves,
         darks=darks,
         dark=dark,
-        flats=flats,
+        levels=levels,
         shapes=shapes,
         histogram=histogram,
-        prnu_square=_prnu_square(usable(flats), watch) if flats else None,
-        full_well_dn=_full_well(flats, sensor),
+        prnu_square=_prnu_square(levels, watch) if levels else None,
         notes=notes,
     )
 
@@ -179,16 +174,11 @@ def _summed(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSum
     sums = FrameSums()
     for frame in watch(frames):
         mosaic = frame.pixels()
-        if mosaic.shape != sensor.shape:
-            raise ConfigError(
-                f"calibrate: {frame.path}: has {mosaic.shape[1]} x {mosaic.shape[0]} pixels; expected "
-                f"{sensor.shape[1]} x {sensor.shape[0]}, as the first frame has"
-            )
-        if int(mosaic.max()) >= 2**sensor.bits:
-            raise ConfigError(
-                f"calibrate: {frame.path}: has values up to {mosaic.max()} DN; expected {sensor.bits} bits; "
-                "correct bits in captures.csv"
-            )
+        if mosaic.shape != sensor.shape or int(mosaic.max()) >= 2**sensor.bits:
+            (height, width), (rows, columns) = mosaic.shape, sensor.shape
+            problem = f"has {width} x {height} values up to {mosaic.max()} DN"
+            expected = f"expected {columns} x {rows}, as the first frame has, and {sensor.bits} bits"
+            raise ConfigError(f"calibrate: {frame.path}: {problem}; {expected}; remove it, or correct bits")
         sums.add(mosaic)
     return sums
 
@@ -211,21 +201,23 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
     return sorted(flats, key=lambda flat: flat.signal_dn)
 
 
-def _check_levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> None:
-    """Refuse too few levels."""
-    signals = [flat.signal_dn for flat in usable(flats)]
-    if len(signals) < LEAST_LEVELS:
-        raise ConfigError(
-            f"calibrate: ISO {iso:g} has {len(signals)} levels of {LEAST_FRAMES} flats that are not saturated; "
-            f"expected {LEAST_LEVELS} or more"
-        )
-    if min(signals) <= 0:
-        raise ConfigError(f"calibrate: ISO {iso:g} has flats that are not brighter than the darks; correct kind")
-    if min(signals) > DARKEST_LEVEL * sensor.span_dn:
-        raise ConfigError(
-            f"calibrate: ISO {iso:g}: the darkest level has {min(signals) / sensor.span_dn:.0%} of white; expected one "
-            f"below {DARKEST_LEVEL:.0%}, which shows whether the gain depends on the light"
-        )
+def _levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> list[Flat]:
+    """Return the levels below saturation: not at white, and no plane beyond its largest variance; refuse too few."""
+    below = [flat for flat in flats if not flat.is_full]
+    variances = np.array([flat.measured.variance for flat in below]).reshape(-1, 4)
+    is_rising = variances > variances.max(axis=0, initial=0) * STILL_RISING
+    is_rising |= np.arange(len(below))[:, None] <= np.argmax(np.vstack([variances, np.zeros(4)]), axis=0)
+    levels = [flat for flat, is_below in zip(below, is_rising.all(axis=1), strict=True) if is_below]
+    darkest = min((flat.signal_dn / sensor.span_dn for flat in levels), default=0.0)
+    if len(levels) < LEAST_LEVELS:
+        problem = f"has {len(levels)} levels of {LEAST_FRAMES} flats that are not saturated; expected {LEAST_LEVELS}"
+    elif darkest <= 0:
+        problem = "has flats that are not brighter than the darks; correct kind"
+    elif darkest > DARKEST_LEVEL:
+        problem = f"has a darkest level of {darkest:.0%} of white; expected one below {DARKEST_LEVEL:.0%}"
+    else:
+        return levels
+    raise ConfigError(f"calibrate: ISO {iso:g} {problem}")
 
 
 # --------------------------------------------------------------------------------------------------------------- noise
@@ -301,15 +293,6 @@ def _black_errors(measured: Measured, variances: Float) -> Float:
     return np.asarray(np.sqrt(np.where(drifts, drift, own) + per_line + ripple**2))
 
 
-def usable(flats: Sequence[Flat]) -> list[Flat]:
-    """Return the levels below saturation: not at white, and no plane beyond its largest variance."""
-    below = [flat for flat in flats if not flat.is_full]
-    variances = np.array([flat.measured.variance for flat in below]).reshape(-1, 4)
-    is_rising = variances > variances.max(axis=0, initial=0) * STILL_RISING
-    is_rising |= np.arange(len(below))[:, None] <= np.argmax(np.vstack([variances, np.zeros(4)]), axis=0)
-    return [flat for flat, is_below in zip(below, is_rising.all(axis=1), strict=True) if is_below]
-
-
 def _prnu_square(flats: Sequence[Flat], watch: Watch) -> tuple[float, float]:
     """Return the square of the PRNU, and its standard error, from the mean of all frames of all levels.
 
@@ -336,22 +319,3 @@ def _prnu_square(flats: Sequence[Flat], watch: Watch) -> tuple[float, float]:
         error = math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt((counts - 1).sum()))
         squares.append((square, math.hypot(error, dark_factor * dark.fixed_error[plane])))
     return weighted_mean(*np.transpose(squares))
-
-
-def _full_well(flats: Sequence[Flat], sensor: Sensor) -> Estimate | None:
-    """Return the signal of full pixels, DN: the largest mean of the planes whose variance has fallen.
-
-    None if the converter ends first, or no level is that bright.
-    """
-    chosen = usable(flats)
-    beyond = [flat for flat in flats if flat not in chosen and not flat.is_full]
-    if not beyond:
-        return None
-    variances = np.array([flat.measured.variance for flat in (*chosen, *beyond)])
-    is_full = variances[-1] < STILL_RISING * variances.max(axis=0)
-    planes = is_full if is_full.any() else np.ones(4, bool)
-    level, below = (float(flat.signals_dn[planes].mean()) for flat in (beyond[-1], chosen[-1]))
-    if level > LARGEST_WELL * sensor.span_dn:
-        return None
-    has_plateau = bool((variances[-1] < variances[len(chosen) - 1] / 4)[planes].all())  # all their pixels are full
-    return Estimate(level, 0.995 * level, 1.005 * level) if has_plateau else Estimate(level, below, 1.1 * level)

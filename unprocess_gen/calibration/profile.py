@@ -99,22 +99,14 @@ LEAST_CORRELATION = 0.02
 """Least correlation of neighbouring rows that is written."""
 SHAPE_DIGITS = 4
 
-UNKNOWN_REASONS = {
-    "prnu_std": "more flats of each level show it",
-    "dark_e_per_s": "darks of several exposures, up to some seconds, show it",
-    "hot_pixel_share": "darks of 0.2 s or more show it",
-    "full_well_e": "a series of flats up to saturation, at the lowest ISO, shows it",
-}
-"""What shows a number that the captures do not."""
+NULL = ("prnu_std", "dark_e_per_s", "hot_pixel_share")
+"""Numbers that are null in a profile if captures do not show them; others are left out."""
 
 
-def unknown_numbers(calibration: Calibration) -> list[str]:
+def unknown_numbers(body: Mapping[str, Estimate | None]) -> list[str]:
     """Return a note for each number that is null."""
-    return [
-        f"{name} is null: the captures do not show it; {advice}"
-        for name, advice in UNKNOWN_REASONS.items()
-        if calibration.body[name] is None
-    ]
+    advice = "the captures do not show it; the guide on calibration lists the frames that do"
+    return [f"{name} is null: {advice}" for name in NULL if body[name] is None]
 
 
 # ---------------------------------------------------------------------------------------------------------------- YAML
@@ -190,7 +182,7 @@ def _common_keys(calibration: Calibration) -> dict[str, Any]:
     if abs(row.value) > max(4 * row.error, LEAST_CORRELATION):
         keys["row_correlation"] = rounded(max(min(row.value, 0.95), -0.95))
     for name, number in calibration.body.items():
-        if number is not None or name in UNKNOWN_REASONS:  # null is no value of the others
+        if number is not None or name in NULL:
             keys[name] = None if number is None else rounded(number.value)
     if calibration.body["dark_e_per_s"] is not None:
         keys["dark_reference_c"] = ASSUMED_C if calibration.celsius is None else calibration.celsius

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unprocess_gen.calibration.measure import IsoResult, usable
+from unprocess_gen.calibration.measure import IsoResult
 from unprocess_gen.calibration.profile import ENDS, Calibration, NamedNumber, estimates, site_names
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
@@ -84,7 +84,7 @@ def _draw_transfer(curve_axes: Axes, residual_axes: Axes, result: IsoResult, sit
         error = NORMAL_95 * np.hypot(curve.error, curve.dark_error)
         curve_axes.errorbar(curve.signal, curve.variance, error, label=name or None, **style)
         residual_axes.errorbar(curve.signal, (curve.variance / line - 1) * 100, error / line * 100, **style)
-    ends = np.array([0.0, usable(result.flats)[-1].signal_dn])
+    ends = np.array([0.0, result.levels[-1].signal_dn])
     curve_axes.plot(ends, gain * ends, color="#888888", linewidth=1)
     residual_axes.axhline(0, color="#888888", linewidth=1)
     curve_axes.set(title="photon transfer", xlabel="signal (DN)", ylabel="variance above the darks (DN²)")
