@@ -16,7 +16,6 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.shards import json_inside
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.planning.source_noise import noise_ratio, source_noise_dn, tile_noise
-from unprocess_gen.reports.plan_text import source_noise_sentence
 from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.sources.loader import downscaled
 
@@ -94,14 +93,6 @@ def test_ratio_compares_with_simulated_noise_at_the_same_signal(plan: Plan, line
     expected = float(np.median(tiles.std_dn)) / np.sqrt(plan.noise.a_dn * signal_dn + plan.noise.b_dn2)
     assert noise_ratio(srgb, plan) == pytest.approx(expected, rel=0.1)
     assert noise_ratio(srgb, linear) is None  # no noise is simulated
-
-
-def test_sentence_counts_noisy_sources_and_names_the_remedy() -> None:
-    sentence = source_noise_sentence([0.1, 0.21, 0.4], "source.downscale=4")
-    assert sentence is not None
-    assert sentence.startswith("the noise of 2 of 3 sources exceeds a fifth of the simulated noise (0.1 to 0.4 of it)")
-    assert sentence.endswith("source.downscale=4 averages it")
-    assert source_noise_sentence([0.1], "source.downscale=2") is None
 
 
 # ------------------------------------------------------------------------------------------------------------ datasets

@@ -6,18 +6,14 @@ import re
 import shutil
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 
-import unprocess_gen as ug
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.reports.estimate import SAMPLE, estimate_run
-from unprocess_gen.reports.highlights import coarse_share
 from unprocess_gen.reports.plan_text import format_estimate
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 
@@ -38,7 +34,7 @@ def test_sources_are_sampled_and_their_sizes_give_the_bytes(
     assert lines[2].startswith(f"bytes     about {estimate.bytes:,} in shards, ")
 
 
-def test_time_has_start_up_pairs_by_the_workers_with_a_shard_and_disk(settings: Settings, tmp_path: Path) -> None:
+def test_time_has_start_up_and_pairs_by_the_workers_with_a_shard(settings: Settings, tmp_path: Path) -> None:
     root = f"source.root={fill(tmp_path / 'p', 3)}"
     for per_shard, workers in ((1, 2), (8, 1)):
         config = settings(root, f"output.pairs_per_shard={per_shard}", f"out={tmp_path}/not/yet/there")
@@ -47,11 +43,8 @@ def test_time_has_start_up_pairs_by_the_workers_with_a_shard_and_disk(settings: 
         assert estimate.n_jobs == workers
         assert estimate.pair_seconds == pytest.approx(seconds / workers)
         assert estimate.start_seconds > 0.1  # the imports of this process alone
-        assert estimate.disk_seconds > 0
-        assert estimate.seconds == estimate.start_seconds + estimate.pair_seconds + estimate.disk_seconds
-    assert re.search(
-        r"^time      about .* with 1 worker: start-up .*, pairs .*, disk ", format_estimate(estimate), re.M
-    )
+        assert estimate.seconds == estimate.start_seconds + estimate.pair_seconds
+    assert " with 1 worker: start-up " in format_estimate(estimate)
     assert list(tmp_path.iterdir()) == [tmp_path / "p"]
     assert estimate.free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.1)
 
@@ -88,7 +81,7 @@ def estimate_text(settings: Settings, folder: Path, *overrides: str) -> str:
     """Return the estimate of two photographs, each sentence in one line."""
     config = settings(f"source.root={fill(folder / 'p', 2)}", f"out={folder}/ds", *overrides)
     text = format_estimate(estimate_run(config, 1, True))
-    return re.sub(r"\n {10}(?=[a-z(°])", " ", text)
+    return re.sub(r"\n {10}(?=\S)", " ", text)
 
 
 @pytest.mark.parametrize("overrides", ["noise=sony_a7s2 scene=night", "body=nikon_d850 scene=long_exposure", ""])
@@ -129,8 +122,6 @@ def test_scene_names_what_the_profile_uses_and_ignores(settings: Settings, tmp_p
     physical = estimate_text(settings, tmp_path / "a", "noise=sony_a7s2", "scene=night")
     assert night in physical
     assert "; sony_a7s2 ignores" not in physical
-    fixed = estimate_text(settings, tmp_path / "b", "noise=sony_a7s2", "scene=night", "noise.iso=800")
-    assert "; sony_a7s2 ignores ISO\n" in fixed
     two_numbers = estimate_text(settings, tmp_path / "c", "scene=night")
     assert night in two_numbers
     assert "; imx385_iso3200 ignores ISO, time, temperature\n" in two_numbers
@@ -138,19 +129,17 @@ def test_scene_names_what_the_profile_uses_and_ignores(settings: Settings, tmp_p
 
 def test_dark_scene_with_a_profile_of_two_numbers_is_warned_about(settings: Settings, tmp_path: Path) -> None:
     warning = estimate_text(settings, tmp_path / "a", "scene=night").split("warning   ")[1]
-    assert re.match(
-        r"scene=night: light is divided by \d+ to \d+, which leaves \d+ to \d+ distinct DN in a clean ", warning
-    )
+    assert re.match(r"scene=night: light is divided by \d+ to \d+, but noise=imx385_iso3200 ignores ISO 6400", warning)
     assert "nikon_d850" in warning
     bright = ("noise=nikon_d850", "scene=indoor", "sensor=generic_14bit")
     assert "warning" not in estimate_text(settings, tmp_path / "c") + estimate_text(settings, tmp_path / "d", *bright)
 
 
-def test_posterised_clean_frames_are_warned_about(settings: Settings, tmp_path: Path) -> None:
+def test_few_levels_of_rounded_clean_frames_are_warned_about(settings: Settings, tmp_path: Path) -> None:
     overrides = ("sensor=generic_14bit", "noise=nikon_d850", "scene.exposure_ratio=100")
     text = estimate_text(settings, tmp_path, *overrides)
     assert "no denoiser exceeds a PSNR of 54.5 dB" in text
-    assert "output.clean_dtype=float32" in text
+    assert "PSNR" not in estimate_text(settings, tmp_path / "b", *overrides, "output.clean_dtype=float32")
 
 
 def test_failed_source_has_no_bytes_and_a_reason(settings: Settings, tmp_path: Path) -> None:
@@ -189,24 +178,3 @@ def test_sources_of_numbers_are_stated_on_request(run_main: RunMain) -> None:
     assert "black_error_dn: ELD, color_bias of its dark frames; uncertainty: " in text
     assert "assumed, without a source: prnu_std, " in text
     assert "uncertainty" not in run_main("plan", *overrides).out
-
-
-# Highlights -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("method", "stated"), [("off", True), ("dither", True), ("dither_all", False)])
-def test_coarse_highlights_are_stated(method: str, stated: bool, settings: Settings, tmp_path: Path) -> None:
-    (tmp_path / "p").mkdir()
-    cv2.imwrite(str(tmp_path / "p" / "bright.png"), np.full((20, 20, 3), 254, dtype=np.uint8))
-    config = settings(f"source.root={tmp_path / 'p'}", f"source.dequantize={method}", "gains=paper_max")
-    text = format_estimate(estimate_run(config, 1, True))
-    assert ("100 % of the pixels are highlights where neighbouring 8-bit codes are far apart" in text) == stated
-
-
-def test_only_codes_next_to_an_empty_range_are_counted() -> None:
-    plan = ug.plan_image(
-        np.zeros((2, 2, 3), np.uint8), ug.load_config(["gains=paper_max", "camera=identity", "noise=none"])
-    )
-    for code, share in ((255, 0), (254, 1), (240, 0)):
-        assert coarse_share(np.full((8, 8, 3), code, np.uint8), plan) == share
-    assert coarse_share(np.full((8, 8, 3), 254 * 257, np.uint16), plan) == 0

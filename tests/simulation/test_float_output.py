@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.kernels import normalised_values
 from helpers.noise_fits import dataset_fits, fit_pair
@@ -278,13 +277,6 @@ def test_every_byte_is_verified_and_every_pair_regenerated(packed: Path, photos:
     again = list(replay(read_rows(packed / "manifest.csv"), str(photos)))
     assert len(again) == 12
     assert not any(one.complaint for one in again)
-
-
-def test_plan_reports_the_loss_of_odd_sides(photos: Path, run_main: RunMain) -> None:
-    done = run_main("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
-    assert done.code == 0
-    assert "patches   complete images without the last row or column of an odd side: " in done.out
-    assert "one.png: too_small\n          1 x 1 pixels contain no 2 x 2 tile" in done.out
 
 
 @pytest.mark.parametrize("accuracy", ["fast", pytest.param("reference", marks=pytest.mark.slow)])

@@ -14,7 +14,7 @@ from unprocess_gen.config.values import value_range
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 
-def dark_scene_warning(config: Config, ratios: Sequence[float] = (), levels: Sequence[int] = ()) -> str:
+def dark_scene_warning(config: Config, ratios: Sequence[float] = ()) -> str:
     """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text."""
     if is_physical(config.noise):
         return ""
@@ -25,9 +25,8 @@ def dark_scene_warning(config: Config, ratios: Sequence[float] = (), levels: Seq
         return ""
     ratios = [float(f"{ratio:.3g}") for ratio in ratios]
     iso = parse_drawn("scene.iso", config.scene.iso, ISO)
-    left = f", which leaves {value_range(levels)} distinct DN in a clean frame" if levels else ""
     return (
-        f"scene={config.scene.name}: light is divided by {value_range(ratios)}{left}, but noise={config.noise.name} "
+        f"scene={config.scene.name}: light is divided by {value_range(ratios)}, but noise={config.noise.name} "
         f"ignores ISO {value_range((lowest(iso), highest(iso)))}; physical profiles follow the scene: "
         f"{', '.join(physical_profiles())}"
     )

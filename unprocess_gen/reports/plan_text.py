@@ -8,17 +8,19 @@ from collections.abc import Iterable, Sequence
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.bodies import body_sentence
-from unprocess_gen.config.schema import Config, SourceConfig
+from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Plan
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
 from unprocess_gen.planning.sensor_levels import sensor_warning
 from unprocess_gen.reports.estimate import RunEstimate, SourceEstimate
-from unprocess_gen.reports.formatting import byte_size, counted, percentage
+from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.sources.listing import unmatched_sentence
+
+Estimates = Sequence[SourceEstimate]
 
 
 def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
@@ -29,7 +31,7 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
     listed = f"{len(run.sources)} in {place}; {len(read)} of them read"
     per_shard = f"{counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}"
     size = f"about {estimate.bytes:,} in shards, {byte_size(estimate.bytes)}; {byte_size(estimate.free_bytes)} free"
-    start, pairs, disk = map(format_duration, (estimate.start_seconds, estimate.pair_seconds, estimate.disk_seconds))
+    total, start, pairs = map(format_duration, (estimate.seconds, estimate.start_seconds, estimate.pair_seconds))
     return "\n".join(
         [
             *_labelled("sources", [listed, unmatched_sentence(run.listing.unmatched), *run.listing.warnings]),
@@ -38,8 +40,7 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
             *_labelled("patches", [_patch_sentence(config, read)]),
             *_labelled("targets", [", ".join(config.output.targets)]),
             *_labelled("bytes", [size + (": NOT ENOUGH" if estimate.free_bytes < estimate.bytes else "")]),
-            f"time      about {format_duration(estimate.seconds)} with {counted(estimate.n_jobs, 'worker')}: start-up "
-            f"{start}, pairs {pairs}, disk {disk}",
+            f"time      about {total} with {counted(estimate.n_jobs, 'worker')}: start-up {start}, pairs {pairs}",
             *_failure_lines(config, read),
             *noise_lines(config, [source for source in read if source.levels], run.settings.dark_frames, with_numbers),
         ]
@@ -66,20 +67,16 @@ def _split_sentence(config: Config, sources: int) -> str:
     return f"{', '.join(expected)} of {sources} sources" if config.split else ""
 
 
-def _patch_sentence(config: Config, estimates: Sequence[SourceEstimate]) -> str:
-    """State what is cut from each image, and the fraction of its pixels in no patch; empty for complete images."""
-    rule, readable = interpretation.patch_rule(config.source), [source for source in estimates if source.patches]
-    unused, pixels = (sum(getattr(source, name) for source in readable) for name in ("unused_pixels", "pixels"))
-    if not readable or (rule is None and not unused):
+def _patch_sentence(config: Config, estimates: Estimates) -> str:
+    """State what is cut from each image; empty for complete images."""
+    rule, counts = interpretation.patch_rule(config.source), [source.patches for source in estimates if source.patches]
+    if rule is None or not counts:
         return ""
-    if rule is None:
-        return f"complete images without the last row or column of an odd side: {unused / pixels:.2%} of the pixels"
     places = f"{rule.count} at random places" if rule.kind == "random" else f"a grid, {rule.stride} apart"
-    counts = value_range([source.patches for source in readable])
-    return f"{rule.side} x {rule.side}, {places}: {counts} per image; {unused / pixels:.1%} of the pixels unused"
+    return f"{rule.side} x {rule.side}, {places}: {value_range(counts)} per image"
 
 
-def _failure_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
+def _failure_lines(config: Config, estimates: Estimates) -> list[str]:
     failed = [source for source in estimates if source.status == "failed"]
     lines = [f"fails     {source.source.name}: {source.reason}\n          {source.detail}" for source in failed]
     if len(failed) > config.source.max_failed:
@@ -95,55 +92,38 @@ def _failure_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[
 
 
 def noise_lines(
-    config: Config,
-    estimates: Sequence[SourceEstimate],
-    dark_frames: DarkFrames | None,
-    with_numbers: bool = False,
+    config: Config, estimates: Estimates, dark_frames: DarkFrames | None, with_numbers: bool = False
 ) -> list[str]:
     """Scene, noise, warnings and effects for the sources that can be read."""
     plans = [plan for source in estimates for plan in source.levels]
     if not plans:
         return []
-    levels = [source.clean_levels for source in estimates if source.clean_levels]
-    ratios = [source.noise_ratio for source in estimates if source.noise_ratio is not None]
-    warnings = (
-        dark_scene_warning(config, [plan.scene.exposure_ratio for plan in plans], levels),
-        posterisation_warning(plans, levels),
-        sensor_warning(config),
-    )
-    about_source = (
-        _highlight_sentence([source.coarse_share for source in estimates]),
-        source_noise_sentence(ratios, averaging(config.source)),
-    )
+    ratios = [plan.scene.exposure_ratio for plan in plans]
     is_physical = interpretation.is_physical(config.noise)
     return [
         *_labelled("accuracy", [config.accuracy]),
-        *_labelled("pattern", ["MONO: no colour filters"] if config.sensor.pattern == MONO else []),
+        *_labelled("pattern", ["MONO: no colour filters" if config.sensor.pattern == MONO else ""]),
         *_labelled("body", [body_sentence(config) or config.body.name]),
         *_labelled("scene", [_scene_sentence(config, plans)]),
         *_labelled("noise", (_physical_sentences if is_physical else _line_sentences)(config, plans)),
-        *_labelled("dark", [_dark_frames_sentence(config, dark_frames)] if dark_frames else []),
+        *_labelled("dark", [_dark_frames_sentence(config, dark_frames) if dark_frames else ""]),
         *_labelled("numbers", _number_sources(config, plans) if with_numbers else []),
-        *_labelled("source", about_source),
-        *_labelled("warning", warnings),
+        *_labelled("source", [_source_noise_sentence(config, [source.noise_ratio for source in estimates])]),
+        *_labelled("warning", [dark_scene_warning(config, ratios), _rounding_warning(plans), sensor_warning(config)]),
         *(_effect_table if is_physical else _effect_lines)(config, estimates),
     ]
 
 
 def _scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
     """The scene, and what of it the noise profile ignores."""
-    physics = [plan.noise.physics for plan in plans if plan.noise.physics is not None]
-    scene, noise = config.scene, config.noise
-    ignored = ["ISO"] if noise.iso is not None or not physics else []
-    if not any(interpretation.missing_number(noise, name) is None for name in ("dark_current", "hot_pixels")):
-        ignored += ["time", "temperature"]
+    scene, physics = config.scene, [plan.noise.physics for plan in plans if plan.noise.physics is not None]
     iso, seconds, celsius = (
         value_range([getattr(numbers, name) for numbers in physics]) if physics else value_text(getattr(scene, name))
         for name in ("iso", "exposure_s", "temperature_c")
     )
     ratio = value_range([plan.scene.exposure_ratio for plan in plans], 4)
-    text = f"{scene.name}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}"
-    return f"{text}; {noise.name} ignores {', '.join(ignored)}" if ignored else text
+    ignored = "" if physics else f"; {config.noise.name} ignores ISO, time, temperature"
+    return f"{scene.name}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}{ignored}"
 
 
 def _sensor_text(plans: Sequence[Plan]) -> str:
@@ -184,12 +164,9 @@ def _physical_sentences(config: Config, plans: Sequence[Plan]) -> list[str]:
 def _number_sources(config: Config, plans: Sequence[Plan]) -> list[str]:
     """The source and the uncertainty of each number of a physical profile, and the numbers that have no source."""
     isos = [plan.noise.physics.iso for plan in plans if plan.noise.physics is not None]
-    sources = [
-        f"{', '.join(origin.numbers)}: {origin.source}; uncertainty: {origin.uncertainty}"
-        for origin in interpretation.provenance_at(config.noise, isos)
-    ]
-    assumed = ", ".join(config.noise.assumed)
-    return [*sources, f"assumed, without a source: {assumed}"] if assumed else sources
+    sources = interpretation.provenance_at(config.noise, isos)
+    stated = [f"{', '.join(each.numbers)}: {each.source}; uncertainty: {each.uncertainty}" for each in sources]
+    return [*stated, f"assumed, without a source: {', '.join(config.noise.assumed) or 'none'}"]
 
 
 def _dark_frames_sentence(config: Config, dark_frames: DarkFrames) -> str:
@@ -203,57 +180,36 @@ def _dark_frames_sentence(config: Config, dark_frames: DarkFrames) -> str:
 
 # ------------------------------------------------------------------------------------------------------------- warnings
 
-POSTERISED_BELOW = 256
+FEW_LEVELS = 256
 """Levels between black and the white of a darkened scene below which ``plan`` warns: fewer than 8-bit codes."""
 
 NOISY_SOURCE = 0.2
 """Noise of a source, relative to the simulated noise, above which ``plan`` counts it: it adds 2 % to the total."""
 
 
-def posterisation_warning(plans: Sequence[Plan], levels: Sequence[int]) -> str | None:
+def _rounding_warning(plans: Sequence[Plan]) -> str:
     """Warn if rounded clean frames have few levels.
 
     The rounding error is uniform in ±½ DN, so its mean square is 1/12 DN². White of the darkened scene is
     span / exposure ratio above black. A denoiser that returned the unrounded mean would have a PSNR of
     20 log10(√12 · span / ratio).
     """
-    spans_dn = [plan.sensor.span_dn / plan.scene.exposure_ratio for plan in plans]
-    if not levels or min(spans_dn) >= POSTERISED_BELOW:
-        return None
-    bound = value_range([round(20 * math.log10(math.sqrt(12) * span_dn), 1) for span_dn in spans_dn])
+    span_dn = min(plan.sensor.span_dn / plan.scene.exposure_ratio for plan in plans)
+    if plans[0].output.clean_normalised or span_dn >= FEW_LEVELS:
+        return ""
     return (
-        f"clean frames are rounded to {value_range(levels)} levels; compared with them no denoiser exceeds a PSNR of "
-        f"{bound} dB; output.clean_dtype=float32 keeps the unrounded mean"
+        f"no denoiser exceeds a PSNR of {20 * math.log10(math.sqrt(12) * span_dn):.1f} dB, because clean frames are "
+        f"rounded and white of the scene is {span_dn:.3g} DN above black; output.clean_dtype=float32 keeps the mean"
     )
 
 
-def _highlight_sentence(shares: Sequence[float]) -> str | None:
-    """State the mean share of the pixels that are highlights between whose codes raw levels are empty."""
-    share = sum(shares) / len(shares)
-    if not share:
-        return None
-    return (
-        f"{percentage(share)} of the pixels are highlights where neighbouring 8-bit codes are far apart in raw; "
-        "source.dequantize=dither_all fills the levels between them"
-    )
-
-
-def averaging(source: SourceConfig) -> str:
-    """Return the setting that averages the noise of sources further; empty if none is left."""
-    if source.kind == "raw":
-        return f"source.shrink={2 * source.shrink}" if source.shrink < 4 else ""
-    return f"source.downscale={2 * source.downscale}"
-
-
-def source_noise_sentence(ratios: Sequence[float], remedy: str) -> str | None:
-    """Count the sources that bring visible noise into the clean frame, and name the remedy."""
-    noisy = sum(ratio > NOISY_SOURCE for ratio in ratios)
-    if not noisy:
-        return None
-    return (
-        f"the noise of {noisy} of {len(ratios)} sources exceeds a fifth of the simulated noise "
-        f"({value_range(ratios, 2)} of it); it stays in the clean frame" + (f": {remedy} averages it" if remedy else "")
-    )
+def _source_noise_sentence(config: Config, ratios: Sequence[float | None]) -> str:
+    """Count the sources that bring visible noise into the clean frame."""
+    measured = [ratio for ratio in ratios if ratio is not None]
+    noisy = sum(ratio > NOISY_SOURCE for ratio in measured)
+    remedy = "" if config.source.kind == "raw" else f"; source.downscale={2 * config.source.downscale} averages it"
+    sentence = f"the noise of {noisy} of {len(measured)} sources exceeds a fifth of the simulated noise{remedy}"
+    return sentence if noisy else ""
 
 
 # -------------------------------------------------------------------------------------------------------------- effects
@@ -261,13 +217,13 @@ def source_noise_sentence(ratios: Sequence[float], remedy: str) -> str | None:
 _TABLE_LINE = "{:16}{:>13}  {:12}{:>11}  {:9}{}"
 
 
-def _effect_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
+def _effect_lines(config: Config, estimates: Estimates) -> list[str]:
     """The effects of a profile with two numbers."""
     noise = estimates[0].levels[0].noise
     return [*_labelled("effects", [", ".join(noise.effects)]), *_labelled("skipped", noise.skipped)]
 
 
-def _effect_table(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
+def _effect_table(config: Config, estimates: Estimates) -> list[str]:
     """A line per effect: what it adds where it is strongest, the noise there, and why it is simulated or not.
 
     Hot and dead pixels are judged by the number of pixels that exceed the noise, other effects by their ratio to

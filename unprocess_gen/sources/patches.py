@@ -13,8 +13,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
-import numpy as np
-
 from unprocess_gen.core.random_streams import patch_words
 from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchRule, Srgb
 
@@ -52,11 +50,3 @@ def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:
     The result is array, [patch.height, patch.width, 3].
     """
     return srgb[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width]
-
-
-def pixels_in_none(cuts: tuple[Patch, ...], height: int, width: int) -> int:
-    """Return the number of pixels of an image that are in no patch."""
-    left = np.ones((height, width), dtype=bool)
-    for patch in cuts:
-        left[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width] = False
-    return int(left.sum())

@@ -20,8 +20,7 @@ from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.planning.plan import plan_levels
-from unprocess_gen.reports.estimate import SourceEstimate, count_levels
-from unprocess_gen.reports.highlights import coarse_share
+from unprocess_gen.reports.estimate import SourceEstimate
 from unprocess_gen.reports.plan_text import noise_lines
 from unprocess_gen.reports.sheets.panels import MosaicArray
 from unprocess_gen.simulation import self_test
@@ -142,8 +141,6 @@ def _plan_lines(
         0.0,
         levels=(plan,),
         predictions=(levels[plan.noise.level][1],),
-        clean_levels=count_levels(pair.clean),
-        coarse_share=coarse_share(image.srgb, plan),
     )
     return noise_lines(image.config, [estimate], settings.dark_frames)
 
