@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unprocess_gen.calibration.captures import Capture, Sensor
-from unprocess_gen.calibration.frame_sums import Measured
+from unprocess_gen.calibration.frame_sums import ROUNDING_DN2, Measured
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.statistics.scores import UNFORESEEN, Score, alarm_limit
 
@@ -64,7 +64,7 @@ LIMITS = {
 """Limits of the statistics of one measurement, by name."""
 ALARM = alarm_limit(100 * len(LIMITS))
 """Surprise beyond which a limit is exceeded, for up to a hundred measurements."""
-LEAST_DARK_STD_DN, LEAST_DARK_STD_8_BITS_DN = 0.4, 1.0
+LEAST_DARK_STD_DN, LEAST_DARK_STD_8_BITS_DN = 0.35, 1.0
 """Least noise of darks without rounding, which hides the noise below; values of 8 bits are mostly rounding."""
 LEAST_OF_CODE = 100
 """Mean number of values from which none is hardly by chance."""
@@ -94,6 +94,13 @@ def _check(frames: Sequence[Capture], scores: dict[str, Score], notes: list[str]
 
 def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes: list[str]) -> None:
     """Refuse darks that are clipped, contain light or differ; warn of doubtful ones."""
+    std_dn = math.sqrt(max(float((dark.variance + dark.dsnu).mean()) - ROUNDING_DN2, 0.0))  # both are dither
+    least = LEAST_DARK_STD_8_BITS_DN if sensor.bits <= 8 else LEAST_DARK_STD_DN
+    if std_dn < least:
+        raise ConfigError(
+            f"{place(frames)}: the noise without light is {std_dn:.3f} DN at {sensor.bits} bits; expected {least:g} "
+            "DN or more: rounding hides it, and variances are no measure; record with more bits, or at a higher gain"
+        )
     variances, mean_variance = dark.frame_variances, float(dark.variance.mean()) / dark.sites
     light = abs(float(dark.mean_dn.mean()) - sensor.black_dn) / sensor.span_dn
     # a variance has half as many differences as a plane has sites, and neighbouring ones share a site
@@ -104,11 +111,6 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
         "frames differ": ratio,
     }
     _check(frames, scores | _pixel_scores(dark), notes)
-
-
-def is_clipped(dark: Measured) -> bool:
-    """True if black is clipped."""
-    return _exceeds(clipped_black(dark), LIMITS["clipped black"].refused)
 
 
 def clipped_black(dark: Measured) -> Score:
@@ -139,16 +141,6 @@ def _missing_codes(codes: np.ndarray) -> Score:
     # a value that is expected n times is missing with the probability exp(-n)
     step = 3 / LEAST_OF_CODE / len(inner)
     return Score(float(np.mean(inner == 0)), 1.0, UNFORESEEN / len(inner), step=step)
-
-
-def check_dark_noise(frames: Sequence[Capture], sensor: Sensor, std_dn: float) -> None:
-    """Refuse data whose noise is too small against rounding."""
-    least = LEAST_DARK_STD_8_BITS_DN if sensor.bits <= 8 else LEAST_DARK_STD_DN
-    if std_dn < least:
-        raise ConfigError(
-            f"{place(frames)}: the noise without light is {std_dn:.3f} DN at {sensor.bits} bits; expected {least:g} "
-            "DN or more: rounding hides it, and variances are no measure; record with more bits, or at a higher gain"
-        )
 
 
 def check_flat(frames: Sequence[Capture], sensor: Sensor, flat: Measured, dark: Measured, notes: list[str]) -> None:

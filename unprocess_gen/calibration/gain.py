@@ -43,12 +43,6 @@ class Estimate:
         """Return the number in other units."""
         return Estimate(self.value * factor, self.low * factor, self.high * factor)
 
-    def times(self, other: Estimate) -> Estimate:
-        """Return the product with an independent number."""
-        value, ends = self.value * other.value, ((self.low, other.low), (self.high, other.high))
-        below, above = (math.hypot(own / self.value - 1, end / other.value - 1) * value for own, end in ends)
-        return Estimate(value, value - below, value + above)
-
 
 def estimate(value: float, error: float, least: float = -math.inf) -> Estimate:
     """Return a number with a normal standard error; ``least`` limits the interval."""
@@ -167,4 +161,5 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> list[Estimate]:
         return [estimate(base.gain, base.error), *base.planes]
     chosen, intervals = fits[largest, True], [fit.interval for fit in fits.values()]
     sensor = Estimate(chosen.gain, min(one.low for one in intervals), max(one.high for one in intervals))
-    return [sensor, *(plane.times(sensor.scaled(1 / chosen.gain)) for plane in chosen.planes)]
+    below, above = (abs(end - chosen.gain) for end in (sensor.low, sensor.high))  # planes share the systematic error
+    return [sensor, *(Estimate(one.value, one.low - below, one.high + above) for one in chosen.planes)]

@@ -29,7 +29,7 @@ from unprocess_gen.calibration.gain import (
     root_estimate,
     weighted_mean,
 )
-from unprocess_gen.calibration.shape import Histogram, ReadShape, fit_shape, histograms, joined_histogram
+from unprocess_gen.calibration.shape import Histogram, ReadShape, fill_histogram, fit_shape
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float
 from unprocess_gen.statistics.mosaics import planes_of
@@ -46,8 +46,6 @@ ROUNDED_STD_DN = 0.7
 """Noise below which variances are taken from the fitted distribution, because rounding distorts them."""
 STILL_RISING = 0.9
 """Least variance of brighter levels that are not saturated, relative to the largest."""
-LEAST_FITTED_DN2 = 0.04
-"""Variance without rounding below which nearly all values are equal, so that no distribution is fitted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +86,9 @@ class Flat:
 class IsoResult:
     """Measured noise of one ISO.
 
-    ``numbers`` are the estimates by name: of the sensor, then of each plane of `TILE` if planes may differ. ``shapes``
-    are in the same order. ``dark`` are the darks from which read noise and offsets are measured. ``prnu_square`` is the
-    square of the PRNU, and its standard error.
+    ``numbers`` are the estimates by name: of the sensor, then of each plane of `TILE` if planes may differ. ``dark``
+    are the darks from which read noise and offsets are measured. ``prnu_square`` is the square of the PRNU, and its
+    standard error.
     """
 
     iso: float
@@ -99,7 +97,7 @@ class IsoResult:
     darks: list[Dark]
     dark: Dark
     levels: list[Flat]
-    shapes: list[ReadShape]
+    shape: ReadShape
     histogram: Histogram
     prnu_square: tuple[float, float] | None
     notes: list[str]
@@ -119,19 +117,18 @@ def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate |
     dark = max(darks, key=lambda dark: dark.measured.count)
     flats = [] if gain else _flats(captures, iso, darks, watch, notes)
     levels = [] if gain else _levels(iso, flats, sensor)
-    shapes, histogram = _shapes(dark, watch)
-    spread = _variances(dark.measured, shapes[0])[0] + np.maximum(dark.measured.dsnu, 0.0)  # both are dither
-    checks.check_dark_noise(dark.frames, sensor, math.sqrt(float(spread.mean())))
-    curves = _curves(levels, shapes[0]) if levels else []
+    histogram = fill_histogram((frame.pixels() for frame in watch(dark.frames)), dark.measured)
+    shape = fit_shape(histogram)
+    curves = _curves(levels, shape) if levels else []
     gains = [gain] if gain else fit_gain(curves, sensor.span_dn)
     return IsoResult(
         iso=iso,
-        numbers={"dn_per_e": gains} | _dark_numbers(dark.measured, sensor, shapes),
+        numbers={"dn_per_e": gains} | _dark_numbers(dark.measured, sensor, shape),
         curves=curves,
         darks=darks,
         dark=dark,
         levels=levels,
-        shapes=shapes,
+        shape=shape,
         histogram=histogram,
         prnu_square=_prnu_square(levels, watch) if levels else None,
         notes=notes,
@@ -144,12 +141,6 @@ def _darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> 
     for frames in _groups(captures, "dark", iso, notes):
         sums = _summed(frames, captures.sensor, watch)
         measured = sums.measure()
-        moment = max(float(measured.variance.mean()) - ROUNDING_DN2, 0.0)
-        if captures.sensor.bits <= 8 or moment < LEAST_FITTED_DN2:
-            checks.check_dark_noise(frames, captures.sensor, math.sqrt(moment))
-        if darks and checks.is_clipped(measured):
-            notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
-            continue
         checks.check_dark(frames, captures.sensor, measured, notes)
         patterns = [high_passed(plane) for plane in planes_of(sums.mean_frame())]
         threshold = FAR * max(*(robust_std(pattern)[1] for pattern in patterns), 0.05)
@@ -223,14 +214,6 @@ def _levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> list[Flat]:
 # --------------------------------------------------------------------------------------------------------------- noise
 
 
-def _shapes(dark: Dark, watch: Watch) -> tuple[list[ReadShape], Histogram]:
-    """Fit the distribution of the read noise of all planes, then of each plane."""
-    counts = histograms((frame.pixels() for frame in watch(dark.frames)), dark.measured)
-    together = joined_histogram(counts)
-    first = fit_shape(together)
-    return [first, *(fit_shape(histogram, first) for histogram in counts)], together
-
-
 def _variances(measured: Measured, shape: ReadShape) -> tuple[Float, Float]:
     """Return the variance of a site without rounding, and its error.
 
@@ -251,11 +234,11 @@ def _curves(flats: Sequence[Flat], shape: ReadShape) -> list[Transfer]:
     return [Transfer(signal, variance, error, dark, darks) for signal, variance, error, dark in by_plane]
 
 
-def _dark_numbers(measured: Measured, sensor: Sensor, shapes: Sequence[ReadShape]) -> dict[str, list[Estimate]]:
+def _dark_numbers(measured: Measured, sensor: Sensor, shape: ReadShape) -> dict[str, list[Estimate]]:
     """Return the estimates that darks give."""
     columns, fixed_column = measured.column, measured.fixed_column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
-    variances, errors = _variances(measured, shapes[0])
+    variances, errors = _variances(measured, shape)
     variances, errors = variances - temporal, np.hypot(errors, columns[1] if temporal else 0.0)
     row, (correlation, error) = root_estimate(*measured.row), measured.row_correlation
     return {
@@ -263,7 +246,7 @@ def _dark_numbers(measured: Measured, sensor: Sensor, shapes: Sequence[ReadShape
             root_estimate(float(variances.mean()), float(np.linalg.norm(errors)) / 4),
             *map(root_estimate, variances.tolist(), errors.tolist()),
         ],
-        "read_shape": [shape.interval for shape in shapes],
+        "read_shape": [shape.interval],
         "row_std_dn": [row],
         "row_correlation": [estimate(correlation, error) if row.value else estimate(0.0, 1.0)],
         "column_std_dn": [root_estimate(*fixed_column)],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -138,14 +138,16 @@ def provenance(numbers: Sequence[str], isos: Sequence[float], source: str, uncer
 
 def measured_yaml(calibration: Calibration, name: str) -> str:
     """Return the noise profile of measured frames."""
-    isos = [result.iso for result in calibration.isos]
+    isos, digest = [result.iso for result in calibration.isos], calibration.captures.sha256
     places = modes(isos, [result["read_std_dn"] for result in calibration.isos])
     branches = [_branch([calibration.isos[place] for place in mode], calibration.sensor) for mode in places]
     profile = profile_head(name, calibration.sensor) | {"branches": branches} | _common_keys(calibration)
-    written = {*profile, *(key for branch in branches for key in branch)}
-    profile["provenance"] = [_provenance(calibration, written)]
+    listed = {entry.name for entry in estimates(calibration) if entry.number is not None}
+    written = [key for key in (*branches[0], *profile) if key in listed]
+    source = f"calibrate, own flats and darks, {len(calibration.captures.captures)} frames, SHA-256 {digest[:16]}"
+    profile["provenance"] = [provenance(written, isos, source, f"95 % intervals in {name}.json")]
     frames = f"{len(calibration.captures.captures)} raw frames, ISO {', '.join(f'{iso:g}' for iso in isos)}"
-    return profile_yaml(f"Measured {MARK} on {frames}", calibration.captures.sha256, calibration.notes, profile)
+    return profile_yaml(f"Measured {MARK} on {frames}", digest, calibration.notes, profile)
 
 
 def dark_variance(result: IsoResult) -> Estimate:
@@ -158,7 +160,7 @@ def dark_variance(result: IsoResult) -> Estimate:
 
 def _branch(results: Sequence[IsoResult], sensor: Sensor) -> dict[str, Any]:
     """Return a branch of neighbouring ISOs: gain, and noise without light."""
-    isos, shapes = [result.iso for result in results], [result.shapes[0] for result in results]
+    isos, shapes = [result.iso for result in results], [result.shape for result in results]
     branch: dict[str, Any] = {"iso": [isos[0], isos[-1]], "read_law": "gaussian"}
     if any(shape.is_tukey for shape in shapes):
         values = [shape.interval.value if shape.is_tukey else NORMAL_SHAPE for shape in shapes]
@@ -202,21 +204,3 @@ def _gains_by_colour(calibration: Calibration) -> list[float] | None:
         colours.append(combined(relative))
     differ = any(abs(gain.value - 1) > max(4 * gain.error, SAME_GAIN) for gain in colours)
     return [rounded(gain.value) for gain in colours] if differ else None
-
-
-ABSOLUTE = ("black_error_dn", "read_shape", "row_correlation")
-"""Numbers whose errors are not stated relative to them, because they may be near 0."""
-
-
-def _provenance(calibration: Calibration, written: Iterable[str]) -> dict[str, Any]:
-    """Return the source of the numbers of a profile, and the largest error of each."""
-    isos, widths = [result.iso for result in calibration.isos], dict[str, tuple[float, str]]()
-    for entry in estimates(calibration):
-        if entry.site is None and entry.number is not None and entry.number.value and entry.name in written:
-            half = (entry.number.high - entry.number.low) / 2
-            width, unit = (half, entry.unit) if entry.name in ABSOLUTE else (100 * half / abs(entry.number.value), "%")
-            widths[entry.name] = max(widths.get(entry.name, (0.0, unit)), (width, unit))
-    digest = calibration.captures.sha256[:16]
-    source = f"calibrate, own flats and darks, {len(calibration.captures.captures)} frames, SHA-256 {digest}"
-    errors = ", ".join(f"{name} ±{width:.2g} {unit}".strip() for name, (width, unit) in widths.items())
-    return provenance([*widths], isos, source, f"{errors} (95 %, systematic errors included)")

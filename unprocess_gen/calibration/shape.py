@@ -9,7 +9,7 @@ pattern's standard deviation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,12 +72,12 @@ class ReadShape:
         return self.tukey_std_dn if self.is_tukey else self.normal_std_dn
 
 
-def histograms(frames: Iterable[NDArray[np.uint16]], measured: Measured) -> list[Histogram]:
-    """Return the histogram of each plane of the frames that were measured."""
+def fill_histogram(frames: Iterable[NDArray[np.uint16]], measured: Measured) -> Histogram:
+    """Return the histogram of the frames that were measured."""
     columns, is_seen = measured.column_offsets, measured.dsnu > 2 * measured.fixed_error
-    patterns = np.where(is_seen, measured.dsnu, 0.0)
-    width, half = math.sqrt(float((measured.variance + patterns).mean())) / PARTS, PARTS * REACH
-    counts = np.zeros((4, 2 * half + 1))
+    pattern = float(np.where(is_seen, measured.dsnu, 0.0).mean())
+    width, half = math.sqrt(float(measured.variance.mean()) + pattern) / PARTS, PARTS * REACH
+    counts = np.zeros(2 * half + 1)
     for pixels in frames:
         planes = np.stack(planes_of(pixels)).astype(np.float32)
         rows = planes.mean(axis=2, keepdims=True, dtype=np.float64)
@@ -86,15 +86,8 @@ def histograms(frames: Iterable[NDArray[np.uint16]], measured: Measured) -> list
         offsets = (rows - levels).reshape(2, 2, -1, 1).mean(axis=1).repeat(2, axis=0)
         rest = planes - (levels + offsets + columns[:, None, :]).astype(np.float32)
         places = np.clip(np.rint(rest / np.float32(width)), -half, half).astype(np.int32) + half
-        counts += [np.bincount(place.ravel(), minlength=2 * half + 1) for place in places]
-    deviations = np.sqrt(patterns).tolist()
-    return [Histogram(own, width, 2 * columns.shape[1], std) for own, std in zip(counts, deviations, strict=True)]
-
-
-def joined_histogram(parts: Sequence[Histogram]) -> Histogram:
-    """Return the histogram of all planes."""
-    pattern_dn = math.sqrt(sum(part.pattern_dn**2 for part in parts) / len(parts))
-    return Histogram(np.sum([part.counts for part in parts], axis=0), parts[0].width, parts[0].sites, pattern_dn)
+        counts += np.bincount(places.ravel(), minlength=2 * half + 1)
+    return Histogram(counts, width, 2 * columns.shape[1], math.sqrt(pattern))
 
 
 def cumulative(std: float, shape: float | None) -> Callable[[Float], Float]:
@@ -113,7 +106,7 @@ def probabilities(values: Float, std: float, shape: float | None) -> Float:
     return np.asarray(below(values + 0.5) - below(values - 0.5))
 
 
-def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape:
+def fit_shape(histogram: Histogram) -> ReadShape:
     """Fit a normal distribution and Tukey's lambda to a histogram."""
     from scipy.ndimage import gaussian_filter1d
     from scipy.optimize import minimize, minimize_scalar
@@ -137,7 +130,6 @@ def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape
     whole = float(counts @ values**2 / counts.sum())
     first = math.log(max(whole - histogram.pattern_dn**2, whole / 64)) / 2
     normal = minimize_scalar(surprise, bounds=(first - 1, first + 1), method="bounded", options={"xatol": 1e-6})
-    starts = [(math.log(start.tukey_std_dn), start.shape)] if start else [(normal.x, 0.1), (normal.x, -0.2)]
     results = [
         minimize(
             lambda numbers: surprise(*numbers.tolist()),
@@ -145,7 +137,7 @@ def fit_shape(histogram: Histogram, start: ReadShape | None = None) -> ReadShape
             method="Nelder-Mead",
             options={"initial_simplex": begin + np.array([[0, 0], [0.02, 0], [0, 0.05]]), "fatol": 0.01},
         )
-        for begin in starts
+        for begin in ((normal.x, 0.1), (normal.x, -0.2))
     ]
     best = min(results, key=lambda result: float(result.fun))
     error = _error_of_shape(best.x, lambda numbers: likelihoods(histogram.centres, *numbers), histogram)

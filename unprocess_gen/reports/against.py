@@ -17,7 +17,6 @@ from unprocess_gen.calibration.captures import Sensor, read_captures
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.measure import Watch
 from unprocess_gen.calibration.profile import (
-    ABSOLUTE,
     Calibration,
     NamedNumber,
     dark_variance,
@@ -38,6 +37,8 @@ from unprocess_gen.statistics.scores import NORMAL_95, Score, alarm_limit
 
 EFFECT_OF_NUMBER = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
 """Effect of each number that is compared, by its name in the list of estimates."""
+ABSOLUTE = ("black_error_dn", "read_shape", "row_correlation")
+"""Numbers whose differences are not stated relative to them, because they may be near 0."""
 AT_TEMPERATURE = ("dark_e_per_s", "hot_pixel_share", "hot_pixel_e_per_s")
 """Numbers that can be compared only if the frames state their temperature."""
 FIELDS = (
@@ -121,7 +122,7 @@ def _compared(calibration: Calibration, profile: Profile, known: dict[float, Est
     variances = [NamedNumber("b_dn2", result.iso, None, dark_variance(result)) for result in calibration.isos]
     listed = [estimate for estimate in [*estimates(calibration), *variances] if estimate.name in EFFECT_OF_NUMBER]
     limit, sites = alarm_limit(len(listed)), site_names(calibration.sensor)
-    tukey = {result.iso: [shape.is_tukey for shape in result.shapes] for result in calibration.isos}
+    tukey = {result.iso: result.shape.is_tukey for result in calibration.isos}
     for estimate in listed:
         numbers = profile.numbers(estimate.iso or isos[0], celsius)
         place = 1 + sites.index(estimate.site) if estimate.site else 0
@@ -132,7 +133,7 @@ def _compared(calibration: Calibration, profile: Profile, known: dict[float, Est
         is_open |= estimate.name == "dn_per_e" and estimate.iso in known
         is_open |= estimate.name in AT_TEMPERATURE and celsius is None and bool(expected)
         # a normal distribution is nearest to Tukey's at a shape that a fit may miss
-        is_open |= estimate.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[estimate.iso or 0.0][place]
+        is_open |= estimate.name == "read_shape" and expected == NORMAL_SHAPE and not tukey[estimate.iso or 0.0]
         if is_open or estimate.number is None or expected is None:
             yield Comparison(estimate, expected, Score(0.0, 1.0, 0.0), NOT_COMPARED)
             continue

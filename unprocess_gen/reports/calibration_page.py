@@ -95,7 +95,7 @@ def _draw_transfer(curve_axes: Axes, residual_axes: Axes, result: IsoResult, sit
 
 def _draw_histogram(axes: Axes, result: IsoResult) -> None:
     """Draw the histogram of the darks against both fitted distributions."""
-    histogram, shape = result.histogram, result.shapes[0]
+    histogram, shape = result.histogram, result.shape
     group = max(1, round(1 / histogram.width))  # a bin for each DN, because values are integers
     edges = np.arange(0, len(histogram.counts), group)
     counts, moments = (
