@@ -1,12 +1,12 @@
 """Measure the goals for the speed of pairs as ratios, all in one run: one process, one thread, in turns.
 
-    python tests/benchmarks/bench_goals.py [PHOTO_OR_FOLDER ...] [--rounds 5] [--yardstick naive.py]
+    python tests/benchmarks/bench_goals.py [PHOTO_OR_FOLDER ...] [--rounds 5]
 
 Without photographs, the image is a frame of 2.4 megapixels made of synthetic scenes. In each round the benchmark
 measures both sides of a ratio directly after each other: the shortest processor time of several calls. The Markdown
 table shows the median ratio over rounds and images, the lowest and the highest one, and nanoseconds per site of both
-sides. Planning is compared with a pair of 128 x 128 pixels. The yardstick is Algorithm 1 in float64 NumPy:
-`helpers.algorithm1`, or any module with the functions unprocess(rgb, dtype), add_noise(raw) and to_dn(raw).
+sides. Planning is compared with a pair of 128 x 128 pixels. The yardstick is Algorithm 1 in float64 NumPy
+(`helpers.algorithm1`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-import runpy
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -92,7 +91,7 @@ class Row:
 # Yardsticks -----------------------------------------------------------------------------------------------------------
 
 
-def own_yardstick(plan: Plan) -> Callable[[Srgb], object]:
+def yardstick(plan: Plan) -> Callable[[Srgb], object]:
     """A function that simulates a pair by `algorithm1` with the parameters of a plan."""
     tiny = make_pair(np.zeros((1, 1, 3), np.uint8), plan)
     values = pair_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""), Patch(0, 0, 0, 1, 1))
@@ -102,17 +101,6 @@ def own_yardstick(plan: Plan) -> Callable[[Srgb], object]:
     def pair(rgb: Srgb) -> object:
         raw, white = algorithm1.unprocess(rgb, row), 2**plan.sensor.bits - 1
         return algorithm1.to_dn(raw, white), algorithm1.to_dn(algorithm1.add_noise(raw, row, rng), white)
-
-    return pair
-
-
-def other_yardstick(path: str) -> Callable[[Srgb], object]:
-    """A function that simulates a pair by the module at ``path``."""
-    module = runpy.run_path(path)
-
-    def pair(rgb: Srgb) -> object:
-        raw = module["unprocess"](rgb, np.float64)
-        return module["to_dn"](raw), module["to_dn"](module["add_noise"](raw))
 
     return pair
 
@@ -129,12 +117,11 @@ def config_of(settings: str) -> Config:
 
 @dataclass(frozen=True)
 class Bench:
-    """Work on one image, whose parameters are drawn from ``number``; ``yardstick`` is the path of a module."""
+    """Work on one image, whose parameters are drawn from ``number``."""
 
     srgb: Srgb
     number: int = 0
     patch_side: int = 128
-    yardstick: str | None = None
 
     @property
     def sites(self) -> int:
@@ -176,7 +163,7 @@ class Bench:
 
     def naive(self) -> Work:
         (plan,) = self.plans(TWO_NUMBERS)
-        simulate = other_yardstick(self.yardstick) if self.yardstick else own_yardstick(plan)
+        simulate = yardstick(plan)
         return Work(lambda: simulate(self.srgb), self.sites)
 
     def rows(self) -> Iterator[Row]:
@@ -240,12 +227,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", nargs="*", type=Path)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--yardstick")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     files = [file for path in options.photos for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
     images = [decode(file.read_bytes(), max_pixels=2**26, icc="ignore").srgb for file in files] or [synthetic_frame()]
-    benches = [Bench(srgb, number, yardstick=options.yardstick) for number, srgb in enumerate(images)]
+    benches = [Bench(srgb, number) for number, srgb in enumerate(images)]
     print(table(benches, options.rounds))
 
 

@@ -5,7 +5,7 @@
 In turns, the benchmark makes datasets of them and measures the lower
 bound: `cv2.imdecode`, one SHA-256, one write and one fdatasync of as many bytes, in one thread. Each run is the second
 in a process of its own. The Markdown table has the medians of the ratios of elapsed and of processor times, which
-depend less on other programs, the peak memory, and the processor time of a process that makes one pair.
+depend less on other programs, and the peak memory.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import shutil
 import statistics
 import subprocess
@@ -68,14 +67,6 @@ def measured(script: str, cores: Sequence[int], *arguments: str) -> Times:
     return times
 
 
-def start_cpu_s(*settings: str) -> float:
-    """Processor time of a command that makes one pair."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-m", "unprocess_gen", "source.limit=1", "n_jobs=1", *settings], check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
 def compare(source: Path, folder: Path, rounds: int) -> None:
     """Print the table of runs of the photographs in ``source``."""
     cores = sorted(os.sched_getaffinity(0))
@@ -102,8 +93,6 @@ def compare(source: Path, folder: Path, rounds: int) -> None:
         ratios = [f"{statistics.median(a[what] / b[what] for a, b in both):.3f}" for what in ("s", "cpu_s")]
         print(f"| {name} | {statistics.median(a['s'] for a in runs):.2f} | {other} | {' | '.join(ratios)} |")
     print(f"\npeak {max(one_core['peak_mb'] for one_core in times['one core']):.0f} MB")
-    starts = [start_cpu_s(f"source.root={source}", f"out={folder / f'start{number}'}") for number in range(rounds)]
-    print(f"start {statistics.median(starts):.2f} s of processor time")
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from helpers.datasets import Make
 import unprocess_gen as ug
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "experiments"))
-from live_pairs_numpy import NumpyPairs, brooks_colours
+from live_pairs_numpy import NumpyPairs
 
 from unprocess_gen.sources.scenes import synthetic
 
@@ -51,18 +51,3 @@ def moments(noisy: np.ndarray, clean: np.ndarray) -> list[float]:
     """Variance of the darker and the brighter half of the sites, and of all; variance of row means; mean."""
     noise, bright = noisy - clean.astype(float), clean > np.median(clean)
     return [noise[~bright].var(), noise[bright].var(), noise.var(), noise.mean(axis=1).var(), noise.mean()]
-
-
-def test_items_are_crops_and_colours_those_of_brooks() -> None:
-    row = {"tone": "smoothstep", "gamma": 2.2, "highlight": "per_channel", "effects": "heteroscedastic;quantise"}
-    row |= {"red_gain": 2.0, "blue_gain": 1.7, "inverse_rgb_gain": 0.8, "black_level_dn": 240, "white_level_dn": 4095}
-    row |= {"bits": 12, "exposure_ratio": 1.0, "pattern": "RGGB", "a_dn": 7.0, "b_dn2": 38.0, "body_key": "none"}
-    row |= {f"rgb2cam_{i}{j}": float(i == j) for i in range(3) for j in range(3)} | {"saturated_as": "noisy"}
-    pixels = np.random.default_rng(0).integers(0, 256, (64, 80, 3), dtype=np.uint8)
-    pairs = NumpyPairs([row], lambda _: pixels, 16, lambda rng: brooks_colours(rng, np.stack([np.eye(3)] * 4)))
-    for frame in pairs[0, 0]:
-        assert (frame.shape, frame.dtype) == ((16, 16), np.uint16)
-    colours = [brooks_colours(pairs.rng, np.stack([np.eye(3)] * 4)) for _ in range(200)]
-    green = np.array([gains[1] for _, gains in colours])
-    assert 0.5 <= green.min() < green.max() <= 1.1
-    np.testing.assert_allclose(colours[0][0], np.eye(3), atol=1e-6)

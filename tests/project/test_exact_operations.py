@@ -11,21 +11,8 @@ import pytest
 from helpers.modules import MODULES, PACKAGE, tree
 
 EXACT_FUNCTIONS = {
-    *("abs", "add", "subtract", "multiply", "divide", "sqrt", "square", "rint", "floor", "ceil", "trunc"),
-    *(
-        "minimum",
-        "maximum",
-        "copysign",
-        "isfinite",
-        "isnan",
-        "fabs",
-        "frexp",
-        "ldexp",
-        "gcd",
-        "lcm",
-        "nextafter",
-        "prod",
-    ),
+    *("abs", "add", "subtract", "multiply", "divide", "sqrt", "square", "rint", "floor", "ceil", "trunc", "minimum"),
+    *("maximum", "copysign", "isfinite", "isnan", "fabs", "frexp", "ldexp", "gcd", "lcm", "nextafter", "prod"),
 }
 """Functions of NumPy and `math` whose results IEEE 754 or integer arithmetic determines."""
 
@@ -90,12 +77,8 @@ def test_modules_call_no_function_that_machines_round_differently() -> None:
 
 
 def test_only_reports_use_what_the_noise_check_expects() -> None:
-    calls = {
-        path.relative_to(PACKAGE).parts[0]
-        for path in MODULES
-        for node in ast.walk(tree(path))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == NOISE_CHECK_METHOD
-    }
+    call = f".{NOISE_CHECK_METHOD}("
+    calls = {path.relative_to(PACKAGE).parts[0] for path in MODULES if call in path.read_text(encoding="utf-8")}
     assert calls == {"reports"}
 
 

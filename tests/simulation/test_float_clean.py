@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.noise_fits import dataset_fits
 
 import unprocess_gen as ug
 from unprocess_gen import RawPairs
@@ -76,25 +74,6 @@ def test_every_byte_is_verified_and_every_pair_regenerated(mixed: Path, photos: 
     assert not any(one.complaint for one in again)
 
 
-def test_flipped_bits_of_both_frames_are_found_and_repaired(
-    mixed: Path, photos: Path, run_main: RunMain, tmp_path: Path
-) -> None:
-    shutil.copytree(mixed, tmp_path / "ds")
-    shard = tmp_path / "ds/shards/shard-00000.tar"
-    content = bytearray(shard.read_bytes())
-    content[700] ^= 1
-    content[-2000] ^= 1
-    shard.write_bytes(content)
-    assert run_main("verify", "ds", "--repair", f"source.root={photos}").code == 0
-    assert shard.read_bytes() == (mixed / "shards/shard-00000.tar").read_bytes()
-
-
-def test_dataset_is_regenerated_from_its_config(mixed: Path, photos: Path, run_main: RunMain) -> None:
-    done = run_main("again", mixed, f"source.root={photos}", "out=again", "n_jobs=1")
-    assert done.code == 0
-    assert "the same as" in done.out
-
-
 def test_plan_warns_of_rounded_clean_frames_only(photos: Path, run_main: RunMain) -> None:
     assert "no denoiser exceeds a PSNR" in run_main("plan", *NIGHT, f"source.root={photos}").out
     assert "no denoiser exceeds a PSNR" not in run_main("plan", *FLOAT_CLEAN, f"source.root={photos}").out
@@ -108,26 +87,6 @@ def test_frames_are_developed_and_converted_to_dn(mixed: Path) -> None:
     rounded = np.rint(dn).astype(np.uint16)
     difference = ug.develop(clean, row).astype(int) - ug.develop(rounded, row)
     assert np.abs(difference).mean() < 8
-
-
-def test_dng_of_a_clean_frame_is_rounded(mixed: Path, rounded: Path, run_main: RunMain, tmp_path: Path) -> None:
-    tifffile = pytest.importorskip("tifffile")
-    key = next(row["key"] for *_, row in RawPairs(mixed) if min(row["width"], row["height"]) >= 22)
-    for name, folder in (("mixed", mixed), ("rounded", rounded)):
-        assert run_main("dng", folder, "--keys", key, "--to", tmp_path / name).code == 0
-    for frame in ("clean", "noisy"):
-        found, expected = (
-            tifffile.imread(tmp_path / name / f"{key}.{frame}.dng").astype(int) for name in ("mixed", "rounded")
-        )
-        assert (np.abs(found - expected) <= (frame == "clean")).all()  # float32 may move a value across a half
-        assert (found != expected).mean() < 1e-3
-
-
-def test_noise_is_fitted_with_the_rounding_of_one_frame(make: Make, settings: Settings, tmp_path: Path) -> None:
-    make(None, tmp_path / "ds", "source.limit=2", "scene=indoor", "output.clean_dtype=float32")
-    fits = dataset_fits(tmp_path / "ds")
-    assert len(fits) == 2
-    assert max(fit.deviation for fit in fits) < 5
 
 
 def test_rounded_clean_frame_next_to_float32_is_refused(settings: Settings) -> None:

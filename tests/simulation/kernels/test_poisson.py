@@ -100,7 +100,7 @@ LEAST_ERROR, COMPUTED_ERROR = 0.5, 0.05
 """Integer words approximate a distribution function to half a word; computing adds a twentieth, 1e-11."""
 
 
-@pytest.mark.parametrize("rate", PROFILE_RANGES)
+@pytest.mark.parametrize("rate", slow_except((1e-3, 3.7, 63.99, LIMIT, 1e5), PROFILE_RANGES))
 def test_counts_follow_the_distribution_to_one_word(rate: float, figure: Figure) -> None:
     """The promise is one word in 2**32. The error is little more than half a word, the smallest possible."""
     error = np.abs(error_in_words(rate)).max()
@@ -126,7 +126,7 @@ def test_the_distribution_holds_at_random_rates(count: int, figure: Figure) -> N
 # Order and coupling ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rate", PROFILE_RANGES)
+@pytest.mark.parametrize("rate", slow_except((1e-3, 3.7, 63.99, LIMIT, 1e5), PROFILE_RANGES))
 def test_counts_increase_with_the_words_normal(rate: float) -> None:
     """Words are tested where the count changes, in both tails, and at random."""
     counts, _ = law(rate)
@@ -159,7 +159,7 @@ def pairs(words: list[int], rates: list[float]) -> tuple[np.ndarray, np.ndarray]
 
 def test_kernels_equal_the_reference_for_all_magnitudes() -> None:
     rng = np.random.default_rng(7)
-    rates = random_rates(999_999, seed=8)
+    rates = random_rates(300_000, seed=8)
     words = rng.integers(0, WORDS, len(rates), dtype=np.uint32)
     words[::4] = (2 ** (31 * rng.random(len(words[::4])))).astype(np.uint32) ^ (words[::4] & np.uint32(SIGN))  # tails
     assert (fast(words, rates) == poisson(words, rates)).all()
@@ -216,7 +216,7 @@ def real_quantile(rate: float, w: float) -> float:
 RATES = (LOW_RATE, 5.6, 6.3, 7.1, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9)
 
 
-@pytest.mark.parametrize("rate", slow_except((LOW_RATE, 8.3, 25.0, *RATES[12:]), RATES))
+@pytest.mark.parametrize("rate", slow_except((8.3, *RATES[12:]), RATES))
 def test_the_first_terms_are_within_their_error(rate: float) -> None:
     """What remains of the bound is for the words between those that are tested."""
     reach = min(math.sqrt(NORMAL_REACH2[0] + NORMAL_REACH2[1] * math.sqrt(rate)), 6.3)
@@ -262,7 +262,7 @@ CELLS = 64
 """Cells of √rate below rate 16 in which counts are tested."""
 
 
-RATE_ERRORS = slow_except((-0.8 * FLOAT32_RATE, 0.8 * FLOAT32_RATE), (-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE))
+RATE_ERRORS = slow_except((0.8 * FLOAT32_RATE,), (-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE))
 
 
 @pytest.mark.parametrize("rate_error", RATE_ERRORS)
@@ -287,7 +287,7 @@ def test_counts_of_low_rates_are_within_their_bounds(inside: tuple[float, ...], 
 @pytest.mark.parametrize(
     "rate",
     slow_except(
-        (5.0, 8.1, 25.0, 64.0, 1234.5, 2.0**21),
+        (5.0, 25.0, 1234.5),
         (5.0, 5.1, 6.3, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21),
     ),
 )
@@ -295,7 +295,7 @@ def test_counts_by_expansion_are_within_their_bounds(rate: float, rate_error: fl
     assert wrong(rate, 20_000, rate_error) == 0
 
 
-@pytest.mark.parametrize("rate", [1.0, 5.0, 8.5, 25.0, 1e4])
+@pytest.mark.parametrize("rate", [1.0, 25.0, 1e4])
 def test_a_rate_beyond_its_error_is_found(rate: float) -> None:
     """The tests above would find counts that are outside their bounds."""
     assert wrong(rate, 400, rate_error=4000 * FLOAT32_RATE) > 0
@@ -303,7 +303,7 @@ def test_a_rate_beyond_its_error_is_found(rate: float) -> None:
 
 @pytest.mark.parametrize(
     ("rate", "share"),
-    [*((rate, 0.004) for rate in (0.01, 0.1, 0.3, 1.0, 4.0, 4.9, 64.0)), (5.1, 0.018), (8.1, 0.012), (1e4, 0.014)],
+    [(0.1, 0.004), (4.9, 0.004), (5.1, 0.018), (1e4, 0.014)],
 )
 def test_few_counts_are_uncertain(rate: float, share: float, figure: Figure) -> None:
     """Each costs as much as tens of approximate ones."""
@@ -326,9 +326,7 @@ def test_bounds_hold_for_huge_rates() -> None:
 # One rate everywhere --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "rate", [0.0, 1e-12, 1e-6, 0.01, 0.0400001, 0.06, 0.3, 1.0, 3.7, 7.99, 12.5, MAX_THRESHOLD_RATE]
-)
+@pytest.mark.parametrize("rate", [0.0, 1e-12, 0.01, 0.3, 7.99, MAX_THRESHOLD_RATE])
 def test_counts_by_thresholds_equal_the_reference_for_every_word(rate: float) -> None:
     """Counts change only at the thresholds, so the words next to them decide for all."""
     smallest, ranks = count_thresholds(rate)
@@ -362,11 +360,3 @@ def test_tables_with_another_hash_are_refused(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(MachineError, match="expected 0000"):
         poisson_tables()
     poisson_tables.cache_clear()
-
-
-def test_the_hash_covers_every_table() -> None:
-    right = poisson_tables()
-    for name, table in right._asdict().items():
-        wrong = table.copy()
-        wrong.flat[wrong.size // 2] += 1
-        assert poissons.digest(right._replace(**{name: wrong})) != poissons.TABLES_SHA256

@@ -153,8 +153,8 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
         clean, noisy = deviations(pairs[tier], pairs[REFERENCE], plans)
         errors = dict(zip(STAGES, (NO_DEVIATION, clean, noisy, NO_DEVIATION, noisy), strict=True))
         for stage in STAGES:
-            ns = stage_ns[tier][stage] if tier in stage_ns else None
-            ratio = None if ns is None else ns / stage_ns[EXACT][stage]
+            ns, exact_ns = (stage_ns[name][stage] if name in stage_ns else None for name in (tier, EXACT))
+            ratio = ns / exact_ns if ns is not None and exact_ns else None  # a stage can be too short to be measured
             rows.append(Measurement(tier, stage, ns, ratio, *errors[stage]))
     totals = {tier: [sum(run) for run in runs] for tier, runs in times.items()}
     ratios = {tier: [run / exact for run, exact in zip(totals[tier], totals[EXACT], strict=False)] for tier in TIERS}
