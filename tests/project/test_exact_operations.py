@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ ALLOWED_IN_OPENCV = {"imdecode", "error", "getNumThreads", "setNumThreads", "uti
 OUTSIDE_OUTPUT = {
     *("core/exact_distributions.py", "core/lookup_tables.py", "core/tone_curves.py"),
     *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
-    "simulation/effects/expectation.py",  # the noise check compares datasets with it
     "config/noise_validation.py",  # a logarithm decides only whether a config is refused
     *("dataset/dng.py", "reports", "calibration", "statistics", "torch.py", "camera_noise.py"),
 }
@@ -33,23 +31,10 @@ OUTSIDE_OUTPUT = {
 with a checked SHA-256, the formulas of the reference, its inverse, measurements, drawings and exports."""
 
 
-NOISE_CHECK_METHOD = "expected"
-"""Method of an effect that only the noise check calls: no byte of a dataset depends on it."""
-
-
-def nodes_deciding_bytes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the nodes of a module, without the methods for the noise check."""
-    yield node
-    for child in ast.iter_child_nodes(node):
-        is_method = isinstance(node, ast.ClassDef) and isinstance(child, ast.FunctionDef)
-        if not (is_method and child.name == NOISE_CHECK_METHOD):
-            yield from nodes_deciding_bytes(child)
-
-
 def inexact_operations(module: ast.Module) -> list[str]:
     """Return the expressions of a module that machines may round differently."""
     found: list[ast.AST] = []
-    for node in nodes_deciding_bytes(module):
+    for node in ast.walk(module):
         match node:
             case ast.BinOp(op=ast.MatMult()) | ast.Call(func=ast.Name(id="pow")):
                 found.append(node)
@@ -74,12 +59,6 @@ def test_modules_call_no_function_that_machines_round_differently() -> None:
     }
     assert len(found) > 50
     assert {name: operations for name, operations in found.items() if operations} == {}
-
-
-def test_only_reports_use_what_the_noise_check_expects() -> None:
-    call = f".{NOISE_CHECK_METHOD}("
-    calls = {path.relative_to(PACKAGE).parts[0] for path in MODULES if call in path.read_text(encoding="utf-8")}
-    assert calls == {"reports"}
 
 
 INEXACT = ("a @ b", "np.exp(a)", "np.einsum('ij,j', a, b)", "math.log(2)", "a ** 2.2", "a ** b", "pow(a, b)")

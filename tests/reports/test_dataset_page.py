@@ -257,7 +257,7 @@ def test_noise_that_differs_from_the_manifest_is_reported(
     scenes: Path, scenes_page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "All agree with the manifest." in scenes_page
-    monkeypatch.setattr("unprocess_gen.reports.noise_check.checks.threshold", lambda pairs: 0.0)
+    monkeypatch.setattr("unprocess_gen.reports.noise_check.checks.alarm_limit", lambda scores: 0.0)
     assert "The noise of 2 of them differs from the manifest: noise of 00000000: " in dataset_report.dataset_page(
         scenes
     )

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.noise_fits import dataset_fits, fit_pair
+from helpers.noise_fits import dataset_fits
 from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs, make_pair
+from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.sources.scenes import synthetic
 
 
@@ -99,9 +100,3 @@ def test_noise_that_rounding_hides_is_not_damage(
     make(None, tmp_path / "ds", "source.limit=1", *overrides)
     done = run_main("verify", tmp_path / "ds", "--noise")
     assert (done.code, done.err) == (0, "")
-
-
-def test_verify_reports_the_pair_farthest_from_its_row(scenes: Path, run_main: RunMain) -> None:
-    done = run_main("verify", scenes, "--noise")
-    assert done.code == 0
-    assert "noise of 3 pairs fitted" in done.out

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.datasets import Make, Settings
 from helpers.kernels import normalised_values
-from helpers.noise_fits import dataset_fits, fit_pair
+from helpers.noise_fits import dataset_fits
 from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +19,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.types import REFERENCE, Frame, Plan
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import cfa as bayer

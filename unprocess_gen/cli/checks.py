@@ -16,6 +16,7 @@ from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 from unprocess_gen.core.paths import AnyPath, local_path
 from unprocess_gen.core.types import Row
+from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.repair import repair
@@ -100,7 +101,7 @@ def _complaint(result: ReplayResult) -> str:
 
 def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
-    from unprocess_gen.reports import photon_transfer
+    from unprocess_gen.reports.noise_check.checks import check_pairs
     from unprocess_gen.sources.dark_frames import dark_folder
 
     dark_frames = dark_frames_of(folder / "manifest.csv", call)
@@ -110,19 +111,14 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
         if "noise.dark_frames" in call.values:
             raise
         access = None
-    summary = photon_transfer.examine_dataset(folder, access)
-    checks = summary.checks
+    pairs = RawPairs(folder)
+    checks = check_pairs(with_bar(pairs, "pair checked", len(pairs)), len(pairs), access)
     if not checks.count:
         print_result(
             f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
             "noise.dark_frames=FOLDER names their folder"
         )
         return []
-    if summary.worst is not None:
-        print_result(
-            f"noise of {counted(summary.count, 'pair')} fitted (a, b with 95 % intervals); "
-            f"the farthest from its row: {summary.worst}"
-        )
     unchecked = f"; {checks.unchecked} not checked: too few usable sites, or a dark frame that is not available"
     print_result(
         f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong"

@@ -26,7 +26,7 @@ def alarm_limit(scores: int) -> float:
 
 
 class Score(NamedTuple):
-    """Sum of a statistic over the sites of a pair, minus its expectation; or a statistic of captures.
+    """Sum of a statistic over the rows, columns or clean values of a pair; or a statistic of captures.
 
     Attributes
     ----------
@@ -36,10 +36,6 @@ class Score(NamedTuple):
         ``total / information`` estimates the difference of a quantity from its expected value.
     variance : float
         Variance of the sum due to noise.
-    rounding : float
-        Standard deviation due to the rounding of the clean frame, which pairs with the same curve and gains may share.
-    fixed : float
-        Standard deviation due to patterns that the frames of one body share.
     step : float
         Largest contribution of one site or line.
     low, high : float
@@ -49,8 +45,6 @@ class Score(NamedTuple):
     total: float
     information: float
     variance: float
-    rounding: float = 0.0
-    fixed: float = 0.0
     step: float = 0.0
     low: float = 0.0
     high: float = 0.0
@@ -63,7 +57,7 @@ class Score(NamedTuple):
     @property
     def std(self) -> float:
         """Standard deviation of the sum."""
-        return math.sqrt(self.variance + self.rounding**2 + self.fixed**2)
+        return math.sqrt(self.variance)
 
     @property
     def errors(self) -> float:

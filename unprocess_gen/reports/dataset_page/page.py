@@ -28,7 +28,6 @@ from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.workspace import read_dataset
-from unprocess_gen.reports import photon_transfer
 from unprocess_gen.reports.dataset_page.statistics import (
     MEANINGS,
     SITE_COLUMNS,
@@ -39,7 +38,8 @@ from unprocess_gen.reports.dataset_page.statistics import (
 from unprocess_gen.reports.encoding import figure_png, picture_jpeg
 from unprocess_gen.reports.formatting import byte_size, short_number
 from unprocess_gen.reports.html_pages import data_uri, render_page
-from unprocess_gen.reports.noise_check.checks import Checker
+from unprocess_gen.reports.noise_check.checks import check_pairs
+from unprocess_gen.reports.photon_transfer import NoiseFit, draw_fits, fit_pair
 from unprocess_gen.reports.report_files import page_file, write_files
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 from unprocess_gen.sources.dark_frames import dark_folder
@@ -133,24 +133,23 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
 
     The noise of a few evenly spaced pairs is checked and fitted, unless their dark frames are not available.
     """
-    pairs, figure, missing, noise = RawPairs(folder), b"", "", None
-    numbers = evenly_spaced(range(len(pairs)), PAIRS_FITTED)
+    every, missing, checks, fits = RawPairs(folder), "", None, list[NoiseFit]()
+    pairs = [every[number] for number in evenly_spaced(range(len(every)), PAIRS_FITTED)]
     try:
         if first["dark_frame"] and dark_frames is None:
             raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
         access = dark_folder(dark_frames) if dark_frames and first["dark_frame"] else None
-        examined = with_bar((pairs[number] for number in numbers), "pair checked", len(numbers))
-        noise = photon_transfer.examine_pairs(examined, Checker(np.ones((len(numbers), 2), int)), access)
-        if noise.first:
-            figure = photon_transfer.draw_fits(noise.first)
+        fits = [fit for pair in pairs if (fit := fit_pair(*pair, access)) is not None]
+        checks = check_pairs(pairs, len(pairs), access)
     except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
         missing = str(error)
     return {
         "contact_sheet": data_uri(picture_jpeg(contact_sheet(folder, source=source), JPEG_QUALITY), "jpeg"),
-        "noise": noise,
+        "checks": checks,
+        "fits": fits,
         "missing": missing,
-        "count": len(numbers),
-        "figure": data_uri(figure),
+        "count": len(pairs),
+        "figure": data_uri(draw_fits(fits)) if fits else "",
         "first_shard": f"{folder_name(folder)}/shards/{shard_name(int(first['shard'] or 0))}",
         "first_key": sample_key(first),
     }

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.types import PACKED, Float
 from unprocess_gen.reports.explorer.exploration import Shown
-from unprocess_gen.reports.noise_check.checks import pair_sums
-from unprocess_gen.reports.photon_transfer import fit_sums
+from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.contact_sheet import common_stretch, develop_detail, stretch
 from unprocess_gen.reports.sheets.panels import MosaicArray, Window
@@ -165,9 +164,7 @@ def photon_transfer(shown: Shown) -> TransferPlot:
     side = FITTED_PX // 2 if shown.plan.output.layout == PACKED else FITTED_PX
     clean, noisy = (frame[..., :side, :side] for frame in (shown.pair.clean, shown.pair.noisy))
     height, width = (min(length, FITTED_PX) for length in shown.clean.shape)
-    row = {**shown.row, "height": height, "width": width}
-    sums = pair_sums(clean, noisy, row, shown.dark_pixels)
-    fit = None if sums is None else fit_sums(str(row["key"]), sums)
+    fit = fit_pair(clean, noisy, {**shown.row, "height": height, "width": width}, shown.dark_pixels)
     if fit is None:
         return TransferPlot(([], []), ([], []), "too few sites or levels for a fit")
     step = max(1, len(fit.signal_dn) // POINTS_DRAWN)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
 from unprocess_gen.simulation.effects.numbers import LARGEST, SITES, EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
@@ -47,8 +46,3 @@ class BlackError(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets by plane."""
         return {"planes_dn": plan.physics.black_error_dn}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Error of the black level at this place of the tile."""
-        crop = Crop(site.plan, site.physics, (2, 2), site.patch.origin)
-        return known_offset(site, float(self.plane_offset_dn(crop)[site.place]))

@@ -6,7 +6,6 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
@@ -42,9 +41,3 @@ class ColumnNoise(Effect):
         """Fill the offsets of columns of the body."""
         physics = plan.physics
         return {"fixed_columns": LineOffsets(SlotWords(physics.body_key, "column"), physics.column_std_dn)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Offset of each column of the body, which the row determines."""
-        crop = Crop(site.plan, site.physics, (1, site.shape[1]), (0, site.patch.x))
-        offset_dn = self.column_offset_dn(crop)[0, site.place[1] :: 2]
-        return known_offset(site, offset_dn)

@@ -6,7 +6,6 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
@@ -46,9 +45,3 @@ class ColumnTemporal(Effect):
         """Fill the offsets of columns of the frame."""
         std_dn = plan.physics.column_temporal_std_dn
         return {"columns": LineOffsets(slot_words(plan, "column_temporal"), std_dn)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Offset of each column of the frame, which the row determines."""
-        crop = Crop(site.plan, site.physics, (1, site.shape[1]), (0, site.patch.x))
-        offset_dn = self.column_offset_dn(crop)[0, site.place[1] :: 2]
-        return EffectNoise(offset_dn=offset_dn)

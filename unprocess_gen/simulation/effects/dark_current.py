@@ -6,7 +6,6 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, known_offset, poisson_noise
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, Number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.poisson import poisson
@@ -75,10 +74,3 @@ class DarkCurrent(Effect):
         physics = plan.physics
         removed_e = physics.dark_e if physics.dark_offset == "removed" else 0.0
         return {"uniform": UniformCounts("dark_current", physics.dark_e, removed_e)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Poisson counts with a constant mean, which the camera subtracts or keeps."""
-        physics = site.physics
-        kept_dn = physics.dark_e * site.gain_dn if physics.dark_offset == "kept" else 0.0
-        noise = poisson_noise(site.gain_dn, constant(physics.dark_e))
-        return known_offset(site, kept_dn)._replace(variance=noise.variance, factor=noise.factor)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
-from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, EffectNoise, Site, uniform
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 
@@ -106,10 +105,3 @@ class DarkFrameNoise(Effect):
         """Fill the noise of a site with the dither, and the offsets by site."""
         dither = SiteNoise("dark_dither", dither_std_dn(plan), DITHER_LAW, DITHER_SHAPE)
         return {"noise": dither, "has_site_offsets": True}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Known pixels with a uniform dither; sites far from black, such as hot pixels, cannot be checked."""
-        plan, (y, x) = site.plan, site.place
-        offset_dn = dark_frame_offsets(plan, site.dark_pixels, site.shape, site.patch.origin)[y::2, x::2].copy()
-        offset_dn[np.abs(offset_dn) > NORMAL_DISTANCE * math.sqrt(max(plan.noise.b_dn2, 0.0))] = np.nan
-        return uniform(plan.noise.dark.scale)._replace(offset_dn=offset_dn)

@@ -8,11 +8,9 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import Defects, EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
-from unprocess_gen.simulation.reference.sensor import noisy_limits
 from unprocess_gen.simulation.slots import DeadSlot
 
 if TYPE_CHECKING:
@@ -65,17 +63,6 @@ class DeadPixels(Effect):
         physics = plan.physics
         dead_dn = dead_pixel_dn(physics, plan.sensor.black_level_dn)
         return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share, dead_dn)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Sites of the body with one value."""
-        plan = site.plan
-        if plan.noise.averaged:
-            return EffectNoise()
-        y, x = site.defects("dead_pixels", site.physics.dead_pixel_share)
-        black_dn = plan.sensor.black_level_dn
-        lowest_dn = noisy_limits(plan.sensor.bits, black_dn, plan.noise.sensor_clip)[0]
-        value_dn = max(lowest_dn, dead_pixel_dn(site.physics, black_dn)) - black_dn
-        return EffectNoise(defects=Defects(y, x, np.full(len(y), value_dn), replaces=True))
 
 
 def dead_pixel_dn(physics: Physics, black_dn: float) -> float:

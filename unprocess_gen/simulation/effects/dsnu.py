@@ -6,7 +6,6 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
@@ -50,10 +49,3 @@ class Dsnu(Effect):
         """Fill the offsets by site of the body."""
         physics = plan.physics
         return {"sites_dn": NormalPattern(physics.body_key, "dsnu", physics.dsnu_std_e * physics.dn_per_e)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Normal offsets; no site is checked if the clean frame contains them, as it does not state the light then."""
-        if site.plan.noise.averaged:
-            return EffectNoise(largest_dn=0.0)
-        std_dn = site.physics.dsnu_std_e * site.physics.dn_per_e
-        return gaussian(constant(std_dn * std_dn))._replace(is_fixed=True)

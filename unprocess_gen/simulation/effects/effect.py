@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.random_streams import Words, words
 from unprocess_gen.core.types import DarkPixels, Float, Plan
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, Number, numbers_of
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.slots import SlotWords
@@ -168,10 +167,6 @@ class Effect:
     def slots(self, plan: Plan) -> SlotValues:
         """Return the slots that the effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
         return {}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Return the noise that the noise check expects of the sites of a plane."""
-        return EffectNoise()
 
     def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return the variance of a pixel, DN², at a signal in DN above black."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
@@ -46,10 +45,6 @@ class FullWell(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the limit of the well."""
         return {"full_well_e": plan.physics.full_well_e}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Saturation of the pixel, which sites must not reach."""
-        return EffectNoise(largest_dn=site.physics.full_well_e * site.physics.dn_per_e)
 
 
 def _reach(mean_e: float) -> float:

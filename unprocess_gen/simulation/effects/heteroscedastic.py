@@ -9,8 +9,7 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Shape, frame_words
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
-from unprocess_gen.simulation.effects.shot import counts, expected_counts
+from unprocess_gen.simulation.effects.shot import counts
 from unprocess_gen.simulation.reference.noise import normals
 
 
@@ -19,18 +18,6 @@ class Heteroscedastic(Effect):
 
     name = "heteroscedastic"
     meaning = "noise of a two-parameter profile, its only effect"
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Variance a·signal + b; normal, or Poisson counts with the gain a and normal read noise."""
-        a, b = site.plan.noise.variance_line
-        if site.plan.noise.law == "gaussian" or a == 0:
-            return gaussian(lambda signal: np.maximum(a * signal + b, 0.0))
-        read_dn2 = max(b, 0.0)
-        shot, read = expected_counts(site), gaussian(constant(read_dn2))
-        return EffectNoise(
-            lambda signal: shot.variance(signal) + read_dn2,
-            lambda signal, tau: shot.factor(signal, tau) * read.factor(signal, tau),
-        )
 
 
 def noise_variance(clean_dn: Float, plan: Plan) -> Float:

@@ -11,7 +11,6 @@ import numpy as np
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import Defects, EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
@@ -66,18 +65,6 @@ class HotPixels(Effect):
         """Fill the bright defects."""
         physics = plan.physics
         return {"bright": BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Sites of the body with a known mean excess; frames with few of them need few rows of random words."""
-        if site.plan.noise.averaged:
-            return EffectNoise()
-        width, (top, left) = site.shape[1], site.patch.origin
-        y, x = site.defects("hot_pixels", site.physics.hot_pixel_share)
-        mean_e = np.zeros(len(y))
-        for row in np.unique(y).tolist():
-            crop = Crop(site.plan, site.physics, (1, width), (top + 2 * row + site.place[0], left))
-            mean_e[y == row] = self.mean_electrons(crop)[0, site.place[1] :: 2][x[y == row]]
-        return EffectNoise(defects=Defects(y, x, site.gain_dn * mean_e, replaces=False))
 
 
 @functools.lru_cache(maxsize=256)

@@ -6,7 +6,6 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, gaussian
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
@@ -59,9 +58,3 @@ class Prnu(Effect):
         """Fill the factor on the electrons."""
         physics = plan.physics
         return {"electrons": NormalPattern(physics.body_key, "prnu", physics.prnu_std, mean=1.0, least=0.0)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Relative gain of each pixel with standard deviation p: variance (p·signal)²."""
-        if site.plan.noise.averaged:
-            return EffectNoise()
-        return gaussian(lambda signal: (site.physics.prnu_std * signal) ** 2)._replace(is_fixed=True)

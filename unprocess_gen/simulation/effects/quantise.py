@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from unprocess_gen.simulation.effects.effect import Effect
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, uniform
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 
 VARIANCE_DN2 = 1 / 12
@@ -19,7 +18,3 @@ class Quantise(Effect):
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the variance of rounding."""
         return independent(frame, VARIANCE_DN2)
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Rounding of the noisy frame."""
-        return EffectNoise() if site.plan.output.normalised else uniform(1.0)

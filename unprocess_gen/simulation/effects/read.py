@@ -5,7 +5,6 @@ from __future__ import annotations
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian, tukey_noise
 from unprocess_gen.simulation.effects.numbers import SHAPE, EffectNumbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
@@ -61,11 +60,3 @@ class ReadNoise(Effect):
         """Fill the noise of a site."""
         physics = plan.physics
         return {"noise": SiteNoise("read", physics.read_std_dn, physics.read_law, physics.read_shape)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Normal noise, or Tukey's lambda distribution."""
-        physics = site.physics
-        std = physics.read_std_dn
-        if physics.read_law == "gaussian":
-            return gaussian(constant(std * std))
-        return tukey_noise(std, physics.read_shape)

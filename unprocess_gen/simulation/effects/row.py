@@ -6,7 +6,6 @@ import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
@@ -64,8 +63,3 @@ class RowNoise(Effect):
         """Fill the offsets of rows."""
         physics = plan.physics
         return {"rows": LineOffsets(slot_words(plan, "row"), physics.row_std_dn, physics.row_correlation)}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Normal offset of each row, an autoregressive process of order 1."""
-        variance, correlation = site.physics.row_std_dn**2, site.physics.row_correlation
-        return gaussian(constant(variance))._replace(row_variance=variance, row_correlation=correlation)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues, frame_words
-from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, poisson_noise
 from unprocess_gen.simulation.effects.numbers import DN, EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.poisson import poisson
@@ -21,12 +20,6 @@ class ShotNumbers(EffectNumbers):
 def counts(plan: Plan, electrons: Float, origin: Shape = (0, 0)) -> Float:
     """Draw the electrons of light, [H, W]: Poisson counts of their means."""
     return poisson(frame_words(plan, "shot", electrons.shape, origin), electrons)
-
-
-def expected_counts(site: Site) -> EffectNoise:
-    """Poisson counts of the electrons of light."""
-    gain = site.gain_dn
-    return poisson_noise(gain, lambda signal: signal / gain)
 
 
 class Shot(Effect):
@@ -48,7 +41,3 @@ class Shot(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the counts of light."""
         return {"light_stream": "shot"}
-
-    def expected(self, site: Site) -> EffectNoise:
-        """Poisson counts with the mean signal / K."""
-        return expected_counts(site)

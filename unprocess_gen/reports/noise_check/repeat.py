@@ -1,0 +1,110 @@
+"""Simulate the noise of a pair again from its clean frame: the same sensor, with other random numbers.
+
+The repetition is what the row says the noisy frame could be. Fixed patterns of the camera body, defects, dark frames
+and column offsets are those of the row, so both noisy frames have them. The reference simulates it, not the kernels
+that make datasets.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.types import DarkPixels, Float, Frame, Patch, Plan, Row
+from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
+from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.simulation.effects import order
+from unprocess_gen.simulation.reference.sensor import noisy_limits
+from unprocess_gen.statistics.mosaics import TILE
+
+EPOCH = 2**14 - 1
+"""Epoch of the random numbers; that of datasets is 0."""
+LEAST_STD_DN = 1.0
+"""Least standard deviation of noise in rounded frames; below it, codes depend on the light before rounding."""
+LARGEST_Z = 8.0
+"""Bound of z, so that few defects do not decide a mean."""
+FAR_Z = 16.0
+"""Distance of outliers, in standard deviations."""
+
+Single = NDArray[np.float32]
+
+
+class Noise(NamedTuple):
+    """Noise of a pair, and of its repetition.
+
+    Attributes
+    ----------
+    plan : Plan
+        Plan of the pair.
+    clean_dn, noisy_dn : ndarray of float64, [H, W] and [2, H, W]
+        Clean frame, noisy frame and its repetition, DN; an odd last row or column is left out.
+    weight : ndarray of float32, [H, W]
+        1 / std, the standard deviation of shot and read noise in DN; 0 at sites that are not used.
+    z : ndarray of float32, [2, H, W]
+        Noise over std, without the median of each plane, limited to ±`LARGEST_Z`.
+    is_far : ndarray of bool, [2, H, W]
+        Sites beyond `FAR_Z`.
+    """
+
+    plan: Plan
+    clean_dn: Float
+    noisy_dn: Float
+    weight: Single
+    z: Single
+    is_far: NDArray[np.bool_]
+
+    @property
+    def rounding_dn2(self) -> float:
+        """Variance of the rounding of the clean frame, DN²."""
+        return 0.0 if self.plan.output.clean_normalised else 1 / 12
+
+
+def measure_noise(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> Noise:
+    """Measure the noise of a pair with its manifest row, and of its repetition."""
+    plan, patch = plan_from_row(row), patch_from_row(row)
+    even = tuple(slice(length // 2 * 2) for length in mosaic_dn(clean, row).shape)
+    clean_dn, own_dn = (mosaic_dn(frame, row)[even].astype(np.float64) for frame in (clean, noisy))
+    noisy_dn = np.stack([own_dn, _repetition(clean_dn, plan, patch, dark_pixels)])
+    std = _usable_std(clean_dn, plan)
+    weight = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
+    noise_dn = noisy_dn - clean_dn
+    for y, x in TILE:
+        of_repetition = noise_dn[1, y::2, x::2][std[y::2, x::2] > 0]
+        noise_dn[:, y::2, x::2] -= np.median(of_repetition) if of_repetition.size else 0.0
+    z = (noise_dn * weight).astype(np.float32)
+    limited = np.clip(z, -LARGEST_Z, LARGEST_Z)
+    return Noise(plan, clean_dn, noisy_dn, weight.astype(np.float32), limited, np.abs(z) > FAR_Z)
+
+
+def _usable_std(clean_dn: Float, plan: Plan) -> Float:
+    """Standard deviation of shot and read noise, [H, W] DN; 0 at sites that are not used.
+
+    At black and at clipped light, many sites can have exactly the same light before rounding, so these are not used.
+    """
+    slope, intercept = plan.noise.variance_line
+    black_dn, brightest_dn = plan.sensor.black_level_dn, plan.brightest_dn
+    std = np.sqrt(np.maximum(slope * (clean_dn - black_dn) + intercept, 0))
+    is_used = std >= (0.0 if plan.output.clean_normalised and plan.output.normalised else LEAST_STD_DN)
+    for end_dn in (black_dn, brightest_dn, black_dn + (brightest_dn - black_dn) * plan.scene.exposure):
+        is_used &= np.abs(clean_dn - end_dn) > 0.5
+    return np.asarray(std * is_used)
+
+
+def _repetition(clean_dn: Float, plan: Plan, patch: Patch, dark_pixels: DarkPixels | None) -> Float:
+    """Simulate a noisy frame for a clean one, [H, W] DN; light before rounding is drawn within half a DN."""
+    black_dn, origin, again = plan.sensor.black_level_dn, patch.origin, plan.replace(epoch=EPOCH)
+    light_dn = clean_dn
+    if not plan.output.clean_normalised:
+        light_dn = clean_dn + np.random.default_rng(plan.stream_key).uniform(-0.5, 0.5, clean_dn.shape)
+    if plan.noise.averaged:  # the clean frame contains the fixed patterns
+        light_dn = light_dn - (order.average(np.full_like(clean_dn, black_dn), plan, origin) - black_dn)
+    noisy_dn = order.noisy(np.clip(light_dn, black_dn, plan.brightest_dn), again, origin, dark_pixels)
+    if plan.noise.physics is not None:
+        line = 1, clean_dn.shape[1]
+        own, other = (order.crop_of(of_plan, line, (0, patch.x), dark_pixels) for of_plan in (plan, again))
+        for effect in order.effects_of(plan):
+            noisy_dn += effect.column_offset_dn(own) - effect.column_offset_dn(other)
+    low_dn, high_dn = noisy_limits(plan.sensor.bits, black_dn, plan.noise.sensor_clip)
+    return np.clip(noisy_dn if plan.output.normalised else np.rint(noisy_dn), low_dn, high_dn)
