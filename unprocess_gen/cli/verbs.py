@@ -51,11 +51,7 @@ OUT = Argument(("out",), "folder of the new dataset", "FOLDER", required=True)
 SOURCE = Argument(("source.root",), "folder of the photographs; by default the one recorded in dataset.json", "ROOT")
 INPUTS = (
     SOURCE,
-    Argument(
-        ("noise.dark_frames",),
-        "folder of the dark frames, if it is not the recorded one",
-        "FOLDER",
-    ),
+    Argument(("noise.dark_frames",), "folder of the dark frames, if it is not the recorded one", "FOLDER"),
 )
 """Where the files are that pairs are regenerated from."""
 
@@ -117,21 +113,14 @@ _VERBS = (
         "replay",
         "regenerate rows and compare them, or write their arrays",
         "checks.replay",
-        (
-            *INPUTS,
-            KEYS,
-            _folder("--to", "write the arrays to FOLDER"),
-        ),
+        (*INPUTS, KEYS, _folder("--to", "write the arrays to FOLDER")),
         PlaceArgument("MANIFEST", "a manifest.csv, or the folder of a dataset"),
     ),
     Verb(
         "report",
         "write an HTML page about a dataset or a sweep",
         "reports.report",
-        (
-            _file("--to", "write FILE instead of DIR/report.html"),
-            *INPUTS,
-        ),
+        (_file("--to", "write FILE instead of DIR/report.html"), *INPUTS),
         PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
     ),
     Verb(
@@ -210,11 +199,7 @@ _VERBS = (
         (
             _file("--to", "write the profile to FILE.yaml, and all estimates to FILE.json", required=True),
             _file("--report", "draw curves, histograms and maps in PAGE (HTML)", "PAGE"),
-            choice(
-                ("--from",),
-                "make the profile from NoiseProfile tags of DNG files",
-                "noise_profile",
-            ),
+            choice(("--from",), "make the profile from NoiseProfile tags of DNG files", "noise_profile"),
         ),
         PlaceArgument("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
     ),
