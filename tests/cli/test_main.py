@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -17,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.cases import slow_except
-from helpers.commands import Cli, RunMain, messages
+from helpers.commands import RunMain, messages
 from helpers.datasets import Make
 from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
@@ -35,54 +32,35 @@ from unprocess_gen.core.errors import SourceError, UnprocessGenError
 
 REFUSED = [
     (["camera=nope"], r"camera=nope: no such option; expected one of canon_5d4, canon_700d, "),
-    (["source.rot=photos"], r"source.rot=photos: no such key; source has root, kind, list, include, "),
     (["~camera"], r"~camera: a setting cannot be removed"),
     (["+camera=convex"], r".*camera.*more than once"),
     (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
     (["word"], r"word: no such verb; expected generate, .*build, calibrate, camera or settings key=value"),
     (["camera=convex", "word"], r"generate: word: expected a setting key=value"),
-    (["camera.name"], r"generate: camera.name: expected a setting key=value"),
-    ([""], r"."),
     (["seed=[1"], r".*\[1"),
-    (["a b=c"], r".*a b=c"),
     (["--flag"], r"generate: --flag: no such flag; expected -+quiet, .*--multirun, "),
-    (["-x"], r"generate: -x: no such flag"),
     (["--out", "x"], r"generate: --out: no such flag; expected .*; out is a setting: write out=…"),
-    (["plan", "--noise.draws=2"], r"plan: --noise.draws=2: no such flag; .*: write noise.draws=2"),
-    (["again", "ds", "--out", "x"], r"again: --out: no such flag; .*; out is a setting: write out=…"),
     (["preview", "ds", "sheets"], r"preview: sheets: unknown argument; .*; to write to sheets, add --to sheets"),
     (["source.root=x", "plan"], r"plan: the verb must be the first word: gen-dataset plan source.root=x"),
     (["--help", "verfy"], r"--help verfy: no such verb or group; expected one of generate, .*; did you mean verify"),
-    (["camera=my/own.yaml"], r"camera=my/own.yaml: .*; for a file of your own, put it in FOLDER/camera and write "),
     (["camera=/my/own.yaml"], r"camera=/my/own.yaml: .*; for a file of your own, .* --config-dir FOLDER camera=own"),
-    (["--multirun=2"], r"generate: -m/--multirun: "),
-    (["verfy", "ds"], r"verfy: no such verb; expected generate, manifest, prepare, .*; did you mean verify\?"),
     (["--multrun", "seed=1,2"], r"generate: --multrun: no such flag; .*; did you mean --multirun\?"),
-    (["plan", "--al"], r"plan: --al: no such flag; expected --all, .*; did you mean --all\?"),
-    (["sourc.root=p"], r"sourc.root=p: no such key; expected one of source, .*; did you mean source\?"),
     (["verify", "ds", "--regenrate", "2"], r"verify: --regenrate: no such flag; .*; did you mean --regenerate\?"),
     (["verify", "ds", "--regenerate"], r"verify: --regenerate: expected one argument"),
     (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate -2: expected an integer of 0 or more"),
-    (["verify", "ds", "sorce.root=x"], r"verify: sorce.root=x: unknown argument; .*; did you mean source.root\?"),
     (["replay", "ds", "--keys="], r"replay: --keys: a value is missing"),
-    (["replay", "ds", "other"], r"replay: other: unknown argument"),
     (["verify"], r"verify: expected the folder of a dataset or of a sweep"),
-    (["replay", "source.root=x"], r"replay: expected a manifest.csv, or the folder of a dataset"),
     (["plan", "--quiet", "--verbose"], r"--quiet and --verbose exclude each other"),
     (["plan", "--log-file", "/no/such/file"], r"--log-file /no/such/file: cannot be written"),
-    (["plan", "--any"], r"plan: --any: no such flag"),
     (["--config-dir", "/no/such"], r"--config-dir /no/such: no such folder"),
     (["--config-name", "other"], r".*'other'"),
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
     (["out="], r"out='': expected the name of a folder"),
     (["out=ftp://x/y"], r"out=ftp://x/y: expected the name of a folder or a URL s3://, gs:// or az://"),
     (["preview", "ds", "--to", "s3://x/y"], r"preview: --to s3://x/y: expected a local folder"),
-    (["report", "ds", "--to", "s3://x/y"], r"report: --to s3://x/y: expected a local file"),
     (["-m", "camera=nope"], r"camera=nope: no such option"),
-    (["-m", "seed=choice(1"], r".*choice"),
     (["hydra.run.dir=there"], r"hydra.run.dir=there: Hydra's own settings are fixed"),
     (["--cfg"], r"generate: -c/--cfg: expected one argument; see gen-dataset generate --help"),
-    (["again", "out=x"], r"again: expected the folder of a dataset"),
     (["again", "/no/such", "out=x"], r"again: /no/such: no such folder; expected the folder of a dataset"),
 ]  # fmt: skip
 
@@ -112,10 +90,6 @@ def test_place_without_permission_gives_one_line_and_exit_code_5(
     monkeypatch.setattr("unprocess_gen.pipeline.generate.generate", refused)
     message = "ds/dataset.json: Permission denied; expected read and write permissions"
     assert run_main(*arguments) == (5, "", f"gen-dataset: {job}{message}\n")
-
-
-def test_error_is_one_line_with_hydra_full_error_set(cli: Cli) -> None:
-    assert cli("seed=abc", HYDRA_FULL_ERROR="1").stderr.count("\n") == 1
 
 
 def test_empty_folder_is_refused_and_nothing_written(run_main: RunMain, tmp_path: Path) -> None:
@@ -194,34 +168,18 @@ def test_help_and_errors_name_the_same_exit_codes() -> None:
     assert all(meaning in " ".join(HELP.split()) for meaning in EXIT_CODES.values())
 
 
-def test_help_imports_nothing_slow() -> None:
-    code = (
-        "import sys; sys.argv = ['gen-dataset', '--help']; from unprocess_gen.cli import main as cli; "
-        "assert cli.main() == 0; "
-        "print({'hydra', 'omegaconf', 'numpy', 'numba', 'cv2', 'joblib', 'PIL', 'yaml', 'tqdm'} & set(sys.modules),"
-        " file=sys.stderr)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr == "set()\n"
-
-
-@pytest.mark.parametrize("flag", [("--config-dir", "mine"), ("--config-dir=mine",), ("-cd", "mine")])
-def test_flags_are_accepted_at_any_position(flag: tuple[str, ...], run_main: RunMain, tmp_path: Path) -> None:
+def test_flags_are_accepted_at_any_position(run_main: RunMain, tmp_path: Path) -> None:
     fill(tmp_path / "p", 1)
     (tmp_path / "mine/noise").mkdir(parents=True)
     own = (Path(__file__).parents[2] / "conf/noise/none.yaml").read_text().replace("name: none", "name: own")
     (tmp_path / "mine/noise/own.yaml").write_text(own)
-    done = run_main("source.root=p", *flag, "noise=own", "out=ds", "n_jobs=1")
+    done = run_main("source.root=p", "-cd", "mine", "noise=own", "out=ds", "n_jobs=1")
     assert done.code == 0, done.err
     assert [sample.row["noise"] for sample in RawPairs(tmp_path / "ds")] == ["own"]
 
 
 def test_version_is_the_package_version(run_main: RunMain) -> None:
     assert run_main("--version") == (0, f"unprocess_gen {__version__}\n", "")
-
-
-def test_help_is_shown_on_an_ascii_terminal(cli: Cli) -> None:
-    assert cli("--help", PYTHONIOENCODING="ascii").returncode == 0
 
 
 def test_cfg_job_prints_settings_and_writes_nothing(run_main: RunMain, tmp_path: Path) -> None:
@@ -234,26 +192,13 @@ def test_cfg_job_prints_settings_and_writes_nothing(run_main: RunMain, tmp_path:
 # generate -------------------------------------------------------------------------------------------------------------
 
 
-def check_built_in_scenes(out: str, folder: Path) -> None:
-    """Check the results that a run with the default settings prints, and the files that it writes."""
-    assert re.fullmatch(r"ds: 10 pairs, [\d.]+ MB, [\d.]+ s, 0 failed; next: gen-dataset report ds\n", out)
-    assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) == [
-        "ds", "ds/config.yaml", "ds/dataset.json", "ds/manifest.csv", "ds/shards", "ds/shards/shard-00000.tar",
-        "ds/shards/shard-00001.tar",
-    ]  # fmt: skip
-
-
 def test_default_settings_write_ds_only(run_main: RunMain, tmp_path: Path) -> None:
     done = run_main("n_jobs=1")
     assert done.code == 0, done.err
-    check_built_in_scenes(done.out, tmp_path)
-
-
-@pytest.mark.slow
-def test_command_without_arguments_writes_ds_only(cli: Cli, tmp_path: Path) -> None:
-    done = cli()
-    assert done.returncode == 0, done.stderr
-    check_built_in_scenes(done.stdout, tmp_path)
+    assert re.fullmatch(r"ds: 10 pairs, [\d.]+ MB, [\d.]+ s, 0 failed; next: gen-dataset report ds\n", done.out)
+    files = ["ds", "ds/config.yaml", "ds/dataset.json", "ds/manifest.csv", "ds/shards"]
+    files += [f"ds/shards/shard-0000{number}.tar" for number in range(2)]
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == files
 
 
 def test_more_failed_photographs_than_allowed_give_exit_code_3(run_main: RunMain, tmp_path: Path) -> None:
@@ -272,13 +217,6 @@ def test_more_failed_photographs_than_allowed_give_exit_code_3(run_main: RunMain
 # plan -----------------------------------------------------------------------------------------------------------------
 
 
-def test_plan_writes_nothing(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
-    done = run_main("plan", f"source.root={photos}", "out=a/b/c")
-    assert done.code == 0
-    assert messages(done.err) == []
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_plan_prints_converted_noise_parameters(run_main: RunMain, photos: Path) -> None:
     text = run_main("plan", f"source.root={photos}", "sensor=generic_14bit", "noise=imx385_iso1600").out
     scale = (16383 - 1024) / (4095 - 240)
@@ -294,18 +232,6 @@ def test_again_regenerates_the_same_dataset(
     done = run_main("again", dataset, f"source.root={photos}", "out=new", "n_jobs=1")
     assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {dataset}, bit for bit")
     assert tree_hash(tmp_path / "new") == tree_hash(dataset)
-
-
-def test_again_reports_columns_of_a_later_version(run_main: RunMain, make: Make, tmp_path: Path) -> None:
-    make(None, tmp_path / "old", "source.limit=2")
-    manifest = tmp_path / "old/manifest.csv"
-    *_, last = manifest.read_text().split("\n")[0].split(",")
-    lines = [line.rpartition(",") for line in manifest.read_text().splitlines()]
-    assert [value for _, _, value in lines] == [last, "", ""]
-    manifest.write_text("".join(f"{rest}\n" for rest, _, _ in lines))
-    done = run_main("again", "old", "out=new", "n_jobs=1")
-    assert done.code == 0, done.err
-    assert done.out.splitlines()[-1].startswith("the same rows as old, in its cells; new/manifest.csv has more")
 
 
 def test_again_of_scenes_needs_no_source(
@@ -356,12 +282,7 @@ def test_again_reports_a_different_dataset(run_main: RunMain, make: Make, tmp_pa
 AGAIN_REFUSED = [
     ([], r"again: out is missing"),
     (["out=new", "source.root=p", "seed=1"], r"again: seed=1: unknown argument; expected source.root, "),
-    (["out=new", "source.root=p", "word"], r"again: word: unknown argument; expected source.root"),
-    (["out=new", "sorce.root=p"], r"again: sorce.root=p: unknown argument; .*; did you mean source.root\?"),
     (["out=new", "source.root=p", "n_jobs=two"], r"again: n_jobs=two: expected an integer"),
-    (["out=new", "source.root=p", "n_jobs=0"], r"n_jobs=0: expected 1 to 1024"),
-    (["out=new", "source.root=/no/such"], r"source.root=/no/such: no such f"),
-    (["out=", "source.root=p"], r"again: out=: a value is missing"),
     (["out=new", "source.root=p", "source.root=p"], r"again: source.root=p: source.root is given twice"),
     (["out=new", "--source", "p"], r"again: --source: no such flag"),
 ]  # fmt: skip
@@ -418,7 +339,7 @@ def test_source_is_a_setting_of_every_verb(verb: str, moved: Path, run_main: Run
     assert (done.code, "left out" in done.err) == (0, False), done.err
 
 
-@pytest.mark.parametrize("verb", TAKES_SOURCE)
+@pytest.mark.parametrize("verb", slow_except(("verify", "preview"), TAKES_SOURCE))
 def test_recorded_source_is_the_default(verb: str, moved: Path, run_main: RunMain, tmp_path: Path) -> None:
     (tmp_path / "moved").rename(tmp_path / "photos")
     done = run_main(verb, moved, *TAKES_SOURCE[verb])
@@ -433,11 +354,11 @@ def test_again_needs_a_source_if_none_is_recorded(moved: Path, run_main: RunMain
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("keys", ["2", "1-2", "00000002,2", "0-2"])
+@pytest.mark.parametrize("keys", ["2", "00000002,0-2"])
 @pytest.mark.parametrize("verb", ["replay", "preview", "dng"])
 def test_keys_take_indices_ranges_and_keys_in_every_verb(verb: str, keys: str, moved: Path, run_main: RunMain) -> None:
-    if verb == "dng" and keys == "0-2":
-        keys = "1-2"  # LibRaw opens no picture of 12 x 16 pixels
+    if verb == "dng":
+        keys = keys.replace("0-2", "1-2")  # LibRaw opens no picture of 12 x 16 pixels
     done = run_main(verb, moved, "--keys", keys, "--to", "there", *(["source.root=moved"] if verb != "dng" else []))
     assert done.code == 0, done.err
     assert ("; 1 failed row skipped" in done.out) == ("-" in keys)
@@ -497,16 +418,6 @@ def test_misplaced_word_is_answered_with_what_to_write(
     assert re.match(f"gen-dataset: {sentence}", done.err), done.err
 
 
-@pytest.mark.parametrize(
-    ("verb", "required"),
-    [("again", "out=FOLDER"), ("preview", "--to FOLDER"), ("dng", "--keys KEYS --to FOLDER")],
-)
-def test_help_shows_required_arguments(verb: str, required: str, run_main: RunMain) -> None:
-    text = run_main(verb, "--help").out
-    assert f"DIR {required} " in text.splitlines()[0]
-    assert text.count("(required)") == len(re.findall("FOLDER|KEYS", required))
-
-
 # Paths that the user names --------------------------------------------------------------------------------------------
 
 OUTPUTS = [
@@ -538,24 +449,17 @@ def test_log_file_is_not_appended_to_a_photograph(moved: Path, run_main: RunMain
     assert (done.code, photograph.read_bytes()) == (2, before)
 
 
-@pytest.mark.parametrize("verb", TAKES_SOURCE)
+@pytest.mark.parametrize("verb", slow_except(("replay",), TAKES_SOURCE))
 def test_missing_source_root_is_refused_in_one_line(verb: str, moved: Path, run_main: RunMain) -> None:
     done = run_main(verb, moved, *TAKES_SOURCE[verb], "source.root=nothere")
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert done.err.startswith("gen-dataset: source.root=nothere: no such folder")
 
 
-def test_replay_names_no_folder_of_arrays_without_arrays(moved: Path, run_main: RunMain, tmp_path: Path) -> None:
-    for photograph in (tmp_path / "moved").iterdir():
-        photograph.unlink()
-    done = run_main("replay", moved, "source.root=moved", "--to", "arrays")
-    assert (done.code, "arrays" in done.out) == (5, False)
-
-
+@pytest.mark.parametrize(("folder", "sentence"), [("DIR=t4", "no such f"), ("empty", "not a dataset; expected")])
 @pytest.mark.parametrize(
-    ("folder", "sentence"), [("nothere", "no such f"), ("DIR=t4", "no such f"), ("empty", "not a dataset; expected")]
+    "verb", slow_except(("verify", "again"), ("verify", "replay", "report", "preview", "dng", "again"))
 )
-@pytest.mark.parametrize("verb", ["verify", "replay", "report", "preview", "dng", "again"])
 def test_folder_without_a_dataset_is_refused(
     verb: str, folder: str, sentence: str, run_main: RunMain, tmp_path: Path
 ) -> None:
@@ -564,13 +468,3 @@ def test_folder_without_a_dataset_is_refused(
     code = 4 if folder == "empty" and verb != "again" else 2
     assert (done.code, done.out, done.err.count("\n")) == (code, "", 1)
     assert done.err.startswith(f"gen-dataset: {verb}: {folder}: {sentence}")
-
-
-# Installation ---------------------------------------------------------------------------------------------------------
-
-
-def test_dataset_json_records_absolute_source_root(run_main: RunMain, tmp_path: Path) -> None:
-    fill(tmp_path / "p", 1)
-    run_main("source.root=p", "n_jobs=1")
-    facts = json.loads((tmp_path / "ds/dataset.json").read_text())
-    assert facts["source"] == {"kind": "folder", "root": str(tmp_path / "p")}

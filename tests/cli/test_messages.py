@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import logging
 import os
 import re
@@ -27,17 +26,12 @@ from unprocess_gen.sources.image.codec_messages import captured
 
 COMMANDS = {
     "help": ["--help"],
-    "version": ["--version"],
-    "verb help": ["plan", "--help"],
     "generate": ["source.root=p", "out=ds", "n_jobs=1"],
-    "settings": ["--cfg", "job"],
     "plan": ["plan", "source.root=p"],
     "verify": ["verify", "ds"],
     "replay": ["replay", "ds"],
     "report": ["report", "ds", "--to", "page.html"],
     "preview": ["preview", "ds", "--keys", "0", "--to", "sheets"],
-    "dng": ["dng", "wide", "--keys", "0", "--to", "dngs"],
-    "again": ["again", "ds", "out=copy"],
 }
 """Commands that print something, one for each verb that takes seconds."""
 
@@ -74,18 +68,16 @@ def test_full_stdout_gives_one_line_and_exit_code_5(
     assert (done.code, messages(done.err)) == (5, [FULL])
 
 
-@pytest.mark.parametrize("name", slow_except(("help", "verify"), COMMANDS))
+@pytest.mark.parametrize("name", ["help", "verify"])
 def test_full_stdout_of_a_process_gives_exit_code_5(name: str, folder: Path) -> None:
     done = shell('exec "$@" > /dev/full', folder, *COMMANDS[name])
     assert (done.returncode, messages(done.stderr)) == (5, [FULL])
 
 
-STREAMS = [">&-", "2>&-", "2>/dev/full", "<&- >&- 2>&-"]
-QUICK = [("verify", "<&- >&- 2>&-"), ("generate", "2>/dev/full"), *(("help", stream) for stream in STREAMS)]
-CASES = itertools.product(("help", "generate", "plan", "verify"), STREAMS)
+STREAMS = [("verify", "<&- >&- 2>&-"), ("generate", "2>/dev/full"), ("help", ">&-"), ("help", "2>&-")]
 
 
-@pytest.mark.parametrize(("name", "stream"), slow_except(QUICK, CASES))
+@pytest.mark.parametrize(("name", "stream"), STREAMS)
 def test_closed_streams_and_full_stderr_do_not_end_a_command(name: str, stream: str, folder: Path) -> None:
     done = shell(f'exec "$@" {stream}', folder, *COMMANDS[name])
     assert done.returncode == 0
@@ -97,7 +89,7 @@ def test_mistake_keeps_its_exit_code_without_stderr(folder: Path) -> None:
     assert shell('exec "$@" 2>&-', folder, "verify", "no such folder").returncode == 2
 
 
-@pytest.mark.parametrize("name", slow_except(("help", "verify"), ("help", "plan", "verify")))
+@pytest.mark.parametrize("name", ["help", "verify"])
 def test_broken_pipe_gives_exit_code_141_without_a_message(name: str, folder: Path) -> None:
     done = shell('{ "$@"; echo $? >&3; } 3>&2 | true', folder, *COMMANDS[name])
     assert done.stderr in ("141\n", "0\n")  # 0: the pipe still had a reader
@@ -123,7 +115,7 @@ def test_unwritable_stdout_ends_a_sweep_and_keeps_the_row(code: int, tmp_path: P
         assert [(row["folder"], row["exit"]) for row in csv.DictReader(stream)] == [("seed=1", "0")]
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("sent", [signal.SIGTERM])
 def test_signal_hidden_by_a_library_error_ends_a_sweep(
     sent: signal.Signals, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,26 +138,17 @@ def test_signal_hidden_by_a_library_error_ends_a_sweep(
 # Messages -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("flag", ["-q", "--quiet"])
-def test_quiet_shows_no_progress_but_results(flag: str, run_main: RunMain, tmp_path: Path) -> None:
+def test_quiet_shows_no_progress_but_results(run_main: RunMain, tmp_path: Path) -> None:
     fill(tmp_path / "p", 2)
-    done = run_main("source.root=p", "n_jobs=1", flag)
+    done = run_main("source.root=p", "n_jobs=1", "-q")
     assert (done.code, done.err) == (0, "")
     assert done.out.startswith("ds: 2 pairs")
 
 
-def test_quiet_shows_errors(run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("verify", "nothing", "-q")
-    assert (done.code, done.err.count("\n")) == (2, 1)
-
-
-@pytest.mark.parametrize("flag", ["-v", "--verbose"])
-def test_verbose_shows_version_and_command(flag: str, run_main: RunMain, tmp_path: Path) -> None:
+def test_verbose_shows_version_and_command(run_main: RunMain, tmp_path: Path) -> None:
     fill(tmp_path / "p", 2)
-    done = run_main("plan", flag, "source.root=p")
-    assert re.match(r"gen-dataset: unprocess_gen [\d.]+\S*, Python 3\.\d+\.\d+\S*: \['plan', '-v", done.err) or (
-        flag == "--verbose" and "'--verbose'" in done.err
-    )
+    done = run_main("plan", "-v", "source.root=p")
+    assert re.match(r"gen-dataset: unprocess_gen [\d.]+\S*, Python 3\.\d+\.\d+\S*: \['plan', '-v'", done.err)
 
 
 def test_log_file_has_messages_results_errors_and_exit_code(run_main: RunMain, tmp_path: Path) -> None:
@@ -185,11 +168,6 @@ def test_log_file_has_messages_results_errors_and_exit_code(run_main: RunMain, t
         "exit code 2",
     ):
         assert part in text
-
-
-def test_refused_setting_is_logged(run_main: RunMain, tmp_path: Path) -> None:
-    assert run_main("camera=nope", "--log-file", "run.log").code == 2
-    assert "ERROR camera=nope: no such option" in (tmp_path / "run.log").read_text()
 
 
 def test_full_log_file_does_not_end_a_run(run_main: RunMain, tmp_path: Path) -> None:
@@ -235,9 +213,7 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize(
-    "module", ["unprocess_gen.cli", "unprocess_gen.cli.main", "argparse", "unprocess_gen.cli.verbs"]
-)
+@pytest.mark.parametrize("module", ["unprocess_gen.cli", "unprocess_gen.cli.verbs"])
 def test_interrupted_import_gives_one_line(module: str) -> None:
     command = [sys.executable, "-c", INTERRUPTING, module]
     done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
@@ -268,7 +244,7 @@ sys.exit(main.main())
 """
 
 
-@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+@pytest.mark.parametrize("number", [signal.SIGTERM], ids=lambda number: number.name)
 def test_error_that_replaces_a_signal_is_reported_as_the_signal(number: signal.Signals) -> None:
     command = [sys.executable, "-c", MASKED, str(int(number))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)

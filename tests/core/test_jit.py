@@ -21,9 +21,6 @@ from unprocess_gen.core.jit import KERNEL_PACKAGES, by_class, has_run, inner, ke
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "unprocess_gen"
 
-content_stamps = pytest.mark.skipif(
-    numba.version_info.short < (0, 68), reason="Numba below 0.68 also compares the modification time of a kernel's file"
-)
 
 LIBRARY = """
 from unprocess_gen.core.jit import inner
@@ -110,15 +107,6 @@ def test_editing_other_packages_keeps_machine_code(copy: Copy) -> None:
     assert copy.call() == "True 2.0 1"
 
 
-@pytest.mark.slow
-@content_stamps
-def test_other_modification_times_keep_machine_code(copy: Copy) -> None:
-    for path in copy.package.rglob("*.py"):
-        os.utime(path, (1e9, 1e9))
-
-    assert copy.call() == "True 2.0 1"
-
-
 def test_editing_a_called_kernel_recompiles_its_callers(copy: Copy) -> None:
     """Machine code of the earlier sources is removed."""
     copy.write("simulation/library.py", LIBRARY.replace("/ 2", "/ 4"))
@@ -164,12 +152,6 @@ def test_no_place_for_a_cache_compiles_without_one(tmp_path: Path, monkeypatch: 
     assert double(2.0) == 4.0 and cast(Any, double).stats.cache_path is None
 
 
-def test_missing_sources_compile_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jit, "__file__", str(tmp_path / "core" / "jit.py"))
-
-    assert kernel_cache_folder() is None
-
-
 def test_a_numba_that_ignores_the_folder_gets_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     def njit(cache: bool = False, **options: object) -> Callable[..., Any]:
         path = "/elsewhere" if cache else None
@@ -195,14 +177,6 @@ def kernel_cache_folder() -> Path | None:
 
 def _double(x: float) -> float:
     return x * 2
-
-
-def test_functions_without_a_file_are_compiled_without_a_cache() -> None:
-    names: dict[str, Any] = {"inner": inner, "kernel": kernel}
-    exec("@inner\ndef square(x):\n    return x * x\n@kernel\ndef power(x):\n    return square(x) * x", names)
-
-    assert names["power"](3.0) == 27.0
-    assert names["power"].stats.cache_path is None
 
 
 def test_kernels_of_other_packages_call_no_unhashed_files() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from unprocess_gen.core.suggestions import did_you_mean, suggest
+from unprocess_gen.core.suggestions import suggest
 
 VERBS = ("plan", "verify", "replay", "report", "preview")
 
@@ -19,8 +19,3 @@ def test_closest_word_is_suggested(word: str, closest: str | None) -> None:
 
 def test_flag_keeps_its_hyphens() -> None:
     assert suggest("--kyes", ("--keys", "--to")) == suggest("-keys", ("--keys", "--to")) == "--keys"
-
-
-def test_question_is_empty_without_a_similar_word() -> None:
-    assert did_you_mean("verfy", VERBS) == "; did you mean verify?"
-    assert did_you_mean("xyzzy", VERBS) == ""

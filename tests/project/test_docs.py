@@ -183,11 +183,6 @@ def test_columns_allow_every_value_that_settings_allow() -> None:
 # Pages ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*settings_of(Config), *GROUPS])
-def test_help_names_every_group_and_top_level_key(name: str) -> None:
-    assert re.search(rf"\b{name}\b", HELP)
-
-
 @pytest.mark.parametrize("path", sorted(set(re.findall(r"`(?:python )?((?:tests|\.readme)/[\w./]+\.py)", TEXT))))
 def test_files_that_the_docs_name_exist(path: str) -> None:
     assert (ROOT / path).is_file()
