@@ -77,7 +77,7 @@ DARK = PHYSICAL.replace(dark=DarkFramePlan("ab" * 32, (2, 4), 512.0, 0.5))
 
 
 RAW = PHYSICAL.replace(
-    shrink=4, raw_pattern="XTRANS", raw_black_dn=(512.25, 1e-05, 513.0, 0.0), raw_white_dn=(16383.0,) * 4,
+    shrink=2, raw_pattern="GBRG", raw_black_dn=(512.25, 1e-05, 513.0, 0.0), raw_white_dn=(16383.0,) * 4,
     mosaic_xxh3="ab" * 16, source_iso=100.0, source_exposure_s=0.04, own_a_dn=0.5, own_b_dn2=2.25,
 )  # fmt: skip
 

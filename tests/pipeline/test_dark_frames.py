@@ -375,7 +375,7 @@ def test_frames_with_light_are_refused(tmp_path: Path) -> None:
 def test_file_that_is_no_picture_is_refused(tmp_path: Path) -> None:
     for name in ("a.npy", "a.png", "a.tif", "a.dng"):
         (tmp_path / name).write_bytes(b"not a frame")
-        with pytest.raises(ConfigError, match="cannot be decoded"):
+        with pytest.raises(ConfigError, match=r"cannot be decoded|begins with"):
             open_frames(tmp_path)
         (tmp_path / name).unlink()
 

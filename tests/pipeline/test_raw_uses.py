@@ -19,7 +19,7 @@ import unprocess_gen as ug
 from unprocess_gen.core.object_store import ObjectPath
 
 SETTINGS = (
-    "source.kind=raw", "source.clips=true", "source.raw.pattern=GRBG", "source.raw.black_dn=[501,500,500,503]",
+    "source.kind=raw", "source.clips=true", "source.raw.pattern=GRBG", "source.raw.black_dn=501",
     "source.raw.white_dn=15001", "source.patch=[random,32,2]", "noise.draws=2", "split={train: 0.5, val: 0.5}",
     "noise=heteroscedastic", "noise.levels=[{a: 2, b: 4}, {a: 6, b: 20}]", "output.pairs_per_shard=2", "n_jobs=1",
 )  # fmt: skip

@@ -22,15 +22,12 @@ def camera(call: Call) -> int:
         raise ConfigError(f"camera {file}: no such file; expected a raw file")
     to, sensor = Path(call.values["to"]), Path(call.values["sensor"]) if "sensor" in call.values else None
     check_options(to, sensor)
-    options, chosen = camera_options(file, to.stem), ""
-    for path, group, text in ((to, "camera", options.camera), (sensor, "sensor", options.sensor)):
-        if path is not None:
-            with machine_errors(path):
-                LocalPath(path).write(text.encode(), str(path.parent))
-            chosen += f" {group}={path.stem}"
-    print_results(options.sources)
-    where = f"--config-dir {shlex.quote(str(to.parent.parent))}"
-    if to.absolute().parent.name != "camera":
-        where = "the file in a folder camera of --config-dir, and"
-    print_result(f"{to}: use it with {where}{chosen}")
+    options, sources = camera_options(file, to.stem)
+    paths = {"camera": to} | ({"sensor": sensor} if sensor else {})
+    for group, path in paths.items():
+        with machine_errors(path):
+            LocalPath(path).write(options[group].encode(), str(path.parent))
+    chosen = " ".join(f"{group}={path.stem}" for group, path in paths.items())
+    print_results(sources)
+    print_result(f"{to}: use it with --config-dir {shlex.quote(str(to.parent.parent))} {chosen}")
     return 0

@@ -112,17 +112,6 @@ def text(what: str) -> Limit:
     return Limit(what, bool, repr)
 
 
-class NumberOrFour(Limit):
-    """A number, or one for red, green of the red rows, green of the blue rows, and blue."""
-
-    def __init__(self, numbers: Numbers) -> None:
-        four = NumberList(4, numbers)
-        super().__init__(
-            f"{numbers}, or a list of four by colour: R, G of the red rows, G of the blue rows, B",
-            lambda value: numbers.allows(value) or (isinstance(value, list | tuple) and four.allows(value)),
-        )
-
-
 class LevelRange(Limit):
     """An integer whose range follows from other keys of its group; ``ends`` computes it."""
 

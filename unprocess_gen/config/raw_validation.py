@@ -26,9 +26,10 @@ def check_raw_source(config: Config) -> None:
     if is_raw:
         _check_raw_levels(config)
         _check_own_noise(config)
-        _check_targets(config)
-        return
-    if config.sensor.levels == "source":
+        if config.output.targets and source.shrink == 1:
+            problem = "linear_rgb needs all colours at each site; set source.shrink=2, or remove it"
+            raise refusal("output.targets", config.output.targets, problem)
+    elif config.sensor.levels == "source":
         raise refusal("sensor.levels", "source", "photographs state no levels; choose a sensor, or set source.kind=raw")
 
 
@@ -43,18 +44,11 @@ def _check_raw_levels(config: Config) -> None:
     raw = config.source.raw
     if config.sensor.pattern == MONO:
         raise refusal("sensor.pattern", MONO, "raw sources have the light behind filters; choose a Bayer pattern")
-    if raw.black_dn is not None and raw.white_dn is not None:
-        for black, white in zip(by_plane(raw.black_dn), by_plane(raw.white_dn), strict=True):
-            if not black < white:
-                raise refusal("source.raw.black_dn", raw.black_dn, f"expected less than white_dn={raw.white_dn}")
+    if raw.black_dn is not None and raw.white_dn is not None and not raw.black_dn < raw.white_dn:
+        raise refusal("source.raw.black_dn", raw.black_dn, f"expected less than white_dn={raw.white_dn}")
     if config.sensor.levels == "source" and uses_dark_frames(config.noise):
         problem = "dark frames are converted to the levels of one sensor; choose a sensor"
         raise refusal("sensor.levels", "source", problem)
-
-
-def by_plane(level: float | tuple[float, ...]) -> tuple[float, ...]:
-    """Return a level for each packed plane."""
-    return tuple(map(float, level)) if isinstance(level, list | tuple) else (float(level),) * 4
 
 
 def _check_own_noise(config: Config) -> None:
@@ -69,9 +63,3 @@ def _check_own_noise(config: Config) -> None:
     if source.shrink != 1:
         problem = "means of green have less noise than those of red and blue; expected source.shrink=1, or keep"
         raise refusal("source.own_noise", "subtract", problem)
-
-
-def _check_targets(config: Config) -> None:
-    if config.output.targets and config.source.shrink == 1:
-        problem = "linear_rgb needs all colours at each site; set source.shrink=2, or remove it"
-        raise refusal("output.targets", config.output.targets, problem)

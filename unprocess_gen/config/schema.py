@@ -72,8 +72,8 @@ class RawConfig(Group):
     """
 
     pattern: Optional[str] = key(None, PATTERN, null="that of the file", since="0.3")
-    black_dn: Any = key(None, limits.NumberOrFour(Numbers(0, 65534)), unit="DN", null="that of the file", since="0.3")
-    white_dn: Any = key(None, limits.NumberOrFour(Numbers(1, 65535)), unit="DN", null="that of the file", since="0.3")
+    black_dn: Optional[float] = key(None, Numbers(0, 65534), unit="DN", null="that of the file", since="0.3")
+    white_dn: Optional[float] = key(None, Numbers(1, 65535), unit="DN", null="that of the file", since="0.3")
     a_dn: Optional[float] = key(
         None, Numbers(0, 65535), unit="DN", null="that of the tag NoiseProfile of a DNG", since="0.3"
     )
@@ -125,8 +125,8 @@ class SourceConfig(Group):
     patch
         cut images into square patches, after downscaling
     shrink
-        of raw sources, side of the cells whose sites of one colour become the mean in one pixel of camera RGB, from
-        which a new mosaic is sampled; 1 keeps the mosaic; X-Trans files need 2 or 4, and have cells of 6
+        of raw sources: 2 takes the mean of the sites of each colour in cells of 2 x 2 sites, one pixel of camera RGB
+        from which a new mosaic is sampled; 1 keeps the mosaic
     own_noise
         noise of raw sources themselves: subtract lowers the variance that a profile with two numbers adds by that of
         the source, down to 0; the column zero_variance counts the sites where the source has as much or more
@@ -152,7 +152,7 @@ class SourceConfig(Group):
     downscale: int = key(1, Integers(1, 64), unit="pixels")
     dequantize: str = key("off", limits.DEQUANTIZE)
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
-    shrink: int = key(1, Limit("1, 2 or 4", lambda value: value in (1, 2, 4)), unit="sites", since="0.3")
+    shrink: int = key(1, Integers(1, 2), unit="sites", since="0.3")
     own_noise: str = key("keep", Choice("keep", "subtract"), since="0.3")
     raw: RawConfig = field(default_factory=RawConfig)
 

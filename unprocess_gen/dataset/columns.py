@@ -424,8 +424,8 @@ COLUMNS = (
     Column("cct_k", "correlated colour temperature of the light", Range(1000, 25000), CameraPlan, unit="K", since="0.3",
            in_json=False, empty_if="the gains follow from no light (gains.light=null), or the source failed"),
     Column("shrink", "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
-           integers(1, 4), SourcePlan, since="0.3", empty_if=NO_RAW),
-    Column("raw_pattern", "CFA pattern of the raw file", OneOf(("RGGB", "BGGR", "GRBG", "GBRG", "XTRANS")), SourcePlan,
+           integers(1, 2), SourcePlan, since="0.3", empty_if=NO_RAW),
+    Column("raw_pattern", "CFA pattern of the raw file", OneOf(("RGGB", "BGGR", "GRBG", "GBRG")), SourcePlan,
            since="0.3", empty_if=NO_RAW),
     *(
         Column(f"raw_{level}_dn", f"{level} levels of the raw file: R, G of the red rows, G of the blue rows, B, "

@@ -299,7 +299,8 @@ def recorded_source(root: str | None, source: Source, prepared: SourcePlan) -> S
     if not prepared.is_raw:
         return config
     pattern = None if PurePosixPath(source.path).suffix.lower() in RAW_FILES else prepared.raw_pattern
-    raw = RawConfig(pattern, prepared.raw_black_dn, prepared.raw_white_dn)
+    black = set(prepared.raw_black_dn)  # several are those of the file
+    raw = RawConfig(pattern, black.pop() if len(black) == 1 else None, prepared.raw_white_dn[0])
     return replace(config, kind="raw", shrink=prepared.shrink, raw=raw)
 
 

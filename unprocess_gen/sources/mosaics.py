@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, SourceChangedError, SourceError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.sources.raw.decode import decode_raw
+from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.sources.raw.decode import RawFrame, decode_raw
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,26 @@ class Mosaic:
     pattern: str | None = None
 
 
+def mosaic_pixels(content: bytes, suffix: str, max_pixels: int = 2**30) -> NDArray[Any]:
+    """Decode the array of an NPY file, or a gray picture by the decoder of photographs, which finds missing parts.
+
+    Raises SourceError.
+    """
+    if suffix == ".npy":
+        try:
+            pixels: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
+            return np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
+        except (ValueError, EOFError, AttributeError) as error:
+            text = str(error).splitlines()[0] if str(error) else "no array"
+            raise SourceError("corrupt", f"cannot be decoded ({text})") from error
+    picture = decode(content, max_pixels=max_pixels, icc="ignore")
+    gray = picture.srgb[..., 0]
+    if picture.orientation != 1 or (picture.srgb != gray[..., None]).any():
+        problem = "is rotated" if picture.orientation != 1 else "has colours"
+        raise SourceError("unsupported", f"{problem}; expected a gray picture of 16 bits: the mosaic")
+    return np.ascontiguousarray(gray)
+
+
 def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
     """Read a mosaic of 16-bit integers, or with ``numbers`` of integers or floats.
 
@@ -35,19 +55,14 @@ def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
     suffix = path.suffix.lower()
     with machine_errors(path):
         content = path.read_bytes()
-    if suffix in RAW_FILES:
-        return _read_raw(path, key, content)
     try:
-        if suffix == ".npy":
-            pixels: Any = np.load(io.BytesIO(content), allow_pickle=False)
-        else:
-            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (ValueError, EOFError, cv2.error) as error:
-        raise ConfigError(f"{key}: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
-    if pixels is None:
-        raise ConfigError(f"{key}: {path} cannot be decoded; expected {suffix[1:].upper()}")
+        if suffix in RAW_FILES:
+            return _bayer(path, key, decode_raw(content))
+        pixels = mosaic_pixels(content, suffix)
+    except SourceError as error:
+        raise ConfigError(f"{key}: {path} {error.text}") from error
     _check_numbers(path, key, pixels, numbers)
-    return Mosaic(np.ascontiguousarray(pixels))
+    return Mosaic(pixels)
 
 
 def map_mosaic(path: Path, key: str) -> NDArray[Any]:
@@ -82,22 +97,15 @@ def _check_numbers(path: Path, key: str, pixels: NDArray[Any], numbers: bool = F
         )
 
 
-def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
-    """Decode a raw file: the visible part of the mosaic."""
-    try:
-        frame = decode_raw(content)
-    except SourceError as error:
-        raise ConfigError(f"{key}: {path} {error.text}") from error
-    facts = frame.metadata
-    blacks = set(facts.black_dn or ())
-    if frame.xtrans is not None or not blacks:
-        raise ConfigError(f"{key}: {path} holds no Bayer mosaic; expected one")
-    if len(blacks) > 1:
+def _bayer(path: Path, key: str, frame: RawFrame) -> Mosaic:
+    blacks = set(frame.metadata.black_dn or ())
+    if len(blacks) != 1:
+        levels = ", ".join(f"{black:g}" for black in sorted(blacks)) or "none"
         raise ConfigError(
-            f"{key}: {path} states the black levels {', '.join(f'{black:g}' for black in sorted(blacks))}; "
-            "expected one; convert the frames to NPY, and set noise.dark_frames_black_dn"
+            f"{key}: {path} states the black levels {levels}; expected one; convert the frames to NPY, and set "
+            "noise.dark_frames_black_dn"
         )
-    return Mosaic(frame.pixels, blacks.pop(), facts.pattern)
+    return Mosaic(frame.pixels, blacks.pop(), frame.metadata.pattern)
 
 
 # ------------------------------------------------------------------------------------------------------------ digests

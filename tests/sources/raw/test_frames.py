@@ -15,7 +15,7 @@ import unprocess_gen as ug
 from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.types import Photograph, RawParts
-from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites
+from unprocess_gen.simulation.reference.cfa import plane_sites
 from unprocess_gen.sources.raw.frames import read_raw_source
 
 BLACK = {"R": 500, "G": 509, "B": 523}
@@ -70,7 +70,7 @@ def read(content: bytes, name: str = "a.dng", **settings: Any) -> tuple[Photogra
     return photograph, photograph.raw
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
 def test_mosaic_is_the_visible_part_with_its_phase(pattern: str) -> None:
     visible, content = framed(pattern)
     photograph, raw = read(content)
@@ -91,20 +91,16 @@ def test_colours_are_those_of_the_white_point() -> None:
     assert raw.camera.rgb2cam == pytest.approx((native / native.sum(axis=1, keepdims=True)).ravel(), abs=1e-4)
 
 
-@pytest.mark.parametrize("shrink", [2, 4])
-def test_cells_have_the_mean_light_of_each_colour(shrink: int) -> None:
+def test_cells_have_the_mean_light_of_each_colour() -> None:
     visible, content = framed("GBRG")
-    photograph, raw = read(content, shrink=shrink)
-    light, number = np.zeros((40 // shrink, 48 // shrink, 3)), [0, 0, 0]
+    photograph, raw = read(content, shrink=2)
+    light = np.zeros((20, 24, 3))
     for (y, x), colour in zip(plane_sites("GBRG"), "RGGB", strict=True):
         plane = (visible[y::2, x::2].astype(float) - BLACK[colour]) / (WHITE - BLACK[colour])
-        half = shrink // 2
-        cells = plane.reshape(light.shape[0], half, light.shape[1], half).mean(axis=(1, 3))
-        light[..., "RGB".index(colour)] += cells
-        number["RGB".index(colour)] += 1
+        light[..., "RGB".index(colour)] += plane / (2 if colour == "G" else 1)
     (black, *_), (white, *_) = raw.source.code_levels
     found = (photograph.srgb - black) / (white - black)
-    assert np.abs(found - light / number).max() <= 0.5 / (white - black) + 1e-12
+    assert np.abs(found - light).max() <= 0.5 / (white - black) + 1e-12
 
 
 def test_means_of_a_mosaic_of_equal_levels_are_exact() -> None:
@@ -127,14 +123,14 @@ def test_formats_of_mosaics_are_equal(tmp_path: Path) -> None:
     import cv2
 
     pixels = np.random.default_rng(2).integers(0, 65536, (24, 30)).astype(np.uint16)
-    raw, found = RawConfig("BGGR", (1, 2, 3, 4), 65535), [npy(pixels)]
+    raw, found = RawConfig("BGGR", 4, 65535), [npy(pixels)]
     for suffix in (".png", ".tiff"):
         assert cv2.imwrite(str(tmp_path / f"a{suffix}"), pixels)
         found.append((tmp_path / f"a{suffix}").read_bytes())
     for content, name in zip(found, ("a.npy", "a.png", "a.tiff"), strict=True):
         photograph, parts = read(content, name, raw=raw)
         assert (photograph.srgb == pixels[..., None]).all()
-        assert parts.source.raw_black_dn == (1.0, 2.0, 3.0, 4.0)
+        assert parts.source.raw_black_dn == (4.0,) * 4
 
 
 def test_stated_noise_is_averaged_over_the_planes() -> None:
@@ -165,19 +161,6 @@ def test_camera_of_a_file_is_used_unedited(third: bool, run_main: RunMain, tmp_p
     assert (pair.row["camera"], pair.row["white_level_dn"]) == ("phone", WHITE)
 
 
-def test_lossy_files_are_named_in_a_warning(run_main: RunMain, tmp_path: Path) -> None:
-    pytest.importorskip("imagecodecs")
-    visible, _ = framed()
-    (tmp_path / "frames").mkdir()
-    stored = np.pad(visible, ((3, 0), (5, 0)))
-    (tmp_path / "frames" / "a.dng").write_bytes(dng(stored, compression=52546))
-    done = run_main("source.kind=raw", "source.root=frames", "noise=none", "n_jobs=1", "out=ds")
-    assert (done.code, "a.dng is compressed with JPEG XL, which removes noise and detail" in done.err) == (0, True), (
-        done
-    )
-    assert np.abs(ug.RawPairs(tmp_path / "ds")[0].clean.astype(int) - visible).mean() < 20
-
-
 REFUSED = {
     "cut DNG": (lambda: framed()[1][:-100], "a.dng", {}, "truncated"),
     "linear DNG": (lambda: dng(np.zeros((32, 32, 3), np.uint16), photometric=34892), "a.dng", {}, "unsupported"),
@@ -186,10 +169,11 @@ REFUSED = {
     "no raw file": (lambda: b"II*\0nothing", "a.dng", {}, "corrupt"),
     "empty": (lambda: b"", "a.nef", {}, "empty"),
     "too large": (lambda: framed()[1], "a.dng", {"max_pixels": 99}, "too_large"),
+    "JPEG XL": (lambda: dng(np.zeros((43, 53), np.uint16), compression=52546), "a.dng", {}, "unsupported"),
     "another pattern": (lambda: framed()[1], "a.dng", {"raw": RawConfig("BGGR")}, "unsupported"),
     "levels in the wrong order": (lambda: framed()[1], "a.dng", {"raw": RawConfig(white_dn=400)}, "corrupt"),
     "no levels": (lambda: npy(np.zeros((4, 4), np.uint16)), "a.npy", {}, "unsupported"),
-    "cut NPY": (lambda: npy(np.zeros((4, 4), np.uint16))[:-3], "a.npy", {"raw": RawConfig("RGGB", 0, 9)}, "truncated"),
+    "cut NPY": (lambda: npy(np.zeros((4, 4), np.uint16))[:-3], "a.npy", {"raw": RawConfig("RGGB", 0, 9)}, "corrupt"),
     "8 bits": (lambda: npy(np.zeros((4, 4), np.uint8)), "a.npy", {"raw": RawConfig("RGGB", 0, 9)}, "unsupported"),
     "colours": (lambda: npy(np.zeros((4, 4, 3), np.uint16)), "a.npy", {"raw": RawConfig("RGGB", 0, 9)}, "unsupported"),
 }
@@ -201,23 +185,3 @@ def test_unusable_files_have_a_reason(case: str) -> None:
     with pytest.raises(SourceError) as error:
         read(content(), name, **settings)
     assert error.value.reason == reason, error.value.text
-
-
-def test_xtrans_needs_cells() -> None:
-    from unprocess_gen.sources.raw.decode import RawFrame
-    from unprocess_gen.sources.raw.frames import _photograph
-    from unprocess_gen.sources.raw.metadata import RawMetadata
-
-    tile = np.array(["GBGGRG", "RGRBGB", "GBGGRG", "GRGGBG", "BGBRGR", "GRGGBG"])
-    colours = np.array([["RGB".index(one) for one in row] for row in tile], np.uint8)
-    pixels = np.random.default_rng(4).integers(1024, 16000, (18, 24)).astype(np.uint16)
-    frame = RawFrame(pixels, RawMetadata(black_dn=(1022.0,) * 4, white_dn=16383.0), colours)
-    with pytest.raises(SourceError, match="X-Trans"):
-        _photograph(SourceConfig(kind="raw"), frame)
-    photograph = _photograph(SourceConfig(kind="raw", shrink=2), frame)
-    assert photograph.srgb.shape == (3, 4, 3) and photograph.raw is not None
-    (black, *_), (white, *_) = photograph.raw.source.code_levels
-    cells = pixels.reshape(3, 6, 4, 6).transpose(0, 2, 1, 3)
-    for channel in range(3):
-        mean = (cells[:, :, colours == channel].mean(axis=-1) - 1022) / (16383 - 1022)
-        assert (photograph.srgb[..., channel] - black) / (white - black) == pytest.approx(mean, abs=1 / (white - black))

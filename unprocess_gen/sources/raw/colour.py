@@ -1,14 +1,12 @@
 """Compute the matrix and the gains of a camera at the white point of a frame, as the DNG specification describes it.
 
 DNG Specification 1.4, chapter 6: XYZ → camera is AnalogBalance · CameraCalibration · ColorMatrix, in which the last two
-are interpolated between two lights by the reciprocal of the colour temperature. Where it is silent (temperature of a
-chromaticity, order of the search), Adobe's DNG SDK 1.4 is followed. Only + − × ÷ and √ are used: rows have the result.
+are interpolated between two lights by the reciprocal of the colour temperature. Where it is silent about the
+search for the white point, Adobe's DNG SDK 1.4 is followed. Only + − × ÷ are used: rows have the result.
 """
 
 from __future__ import annotations
 
-import itertools
-import math
 from dataclasses import dataclass
 
 from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert, matrix, multiply, transform
@@ -28,22 +26,6 @@ LIGHT_K = {
     **dict.fromkeys((2, 14), 4150.0), 15: 3525.0, 16: 2925.0,
 }  # fmt: skip
 """Colour temperature of each EXIF LightSource (dng_camera_profile::IlluminantToTemperature)."""
-
-_ISOTHERMS = (
-    (0, 0.18006, 0.26352, -0.24341), (10, 0.18066, 0.26589, -0.25479), (20, 0.18133, 0.26846, -0.26876),
-    (30, 0.18208, 0.27119, -0.28539), (40, 0.18293, 0.27407, -0.30470), (50, 0.18388, 0.27709, -0.32675),
-    (60, 0.18494, 0.28021, -0.35156), (70, 0.18611, 0.28342, -0.37915), (80, 0.18740, 0.28668, -0.40955),
-    (90, 0.18880, 0.28997, -0.44278), (100, 0.19032, 0.29326, -0.47888), (125, 0.19462, 0.30141, -0.58204),
-    (150, 0.19962, 0.30921, -0.70471), (175, 0.20525, 0.31647, -0.84901), (200, 0.21142, 0.32312, -1.0182),
-    (225, 0.21807, 0.32909, -1.2168), (250, 0.22511, 0.33439, -1.4512), (275, 0.23247, 0.33904, -1.7298),
-    (300, 0.24010, 0.34308, -2.0637), (325, 0.24702, 0.34655, -2.4681), (350, 0.25591, 0.34951, -2.9641),
-    (375, 0.26400, 0.35200, -3.5814), (400, 0.27218, 0.35407, -4.3633), (425, 0.28039, 0.35577, -5.3762),
-    (450, 0.28863, 0.35714, -6.7262), (475, 0.29685, 0.35823, -8.5955), (500, 0.30505, 0.35907, -11.324),
-    (525, 0.31320, 0.35968, -15.628), (550, 0.32129, 0.36011, -23.325), (575, 0.32931, 0.36038, -40.770),
-    (600, 0.33724, 0.36051, -116.45),
-)  # fmt: skip
-"""Mired, u, v (CIE 1960) and slope of isotemperature lines (Robertson 1968; Wyszecki and Stiles, 2nd edition, p. 228).
-The u of 325 mired is 0.24702, as printed and as in the DNG SDK, so that readers agree."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,21 +93,9 @@ class DngColour:
 
 
 def temperature(white: XY) -> float:
-    """Return the correlated colour temperature of a chromaticity, kelvin, between 1667 and 100,000.
-
-    The reciprocal is interpolated between two isotemperature lines by the distances from them.
-    """
-    scale = 1.5 - white[0] + 6.0 * white[1]
-    u, v = 2.0 * white[0] / scale, 3.0 * white[1] / scale
-    distance = math.inf
-    for (lower, *_), (upper, u0, v0, slope) in itertools.pairwise(_ISOTHERMS):
-        ends = lower, upper
-        above, distance = distance, ((v - v0) - slope * (u - u0)) / math.sqrt(1.0 + slope * slope)
-        if distance <= 0.0:
-            break
-    below = -min(distance, 0.0)
-    share = below / (above + below)
-    return 1e6 / max(ends[0] * share + ends[1] * (1 - share), 10.0)
+    """Return the correlated colour temperature of a chromaticity, kelvin, between 1667 and 100,000 (McCamy 1992)."""
+    n = (white[0] - 0.3320) / (0.1858 - white[1])
+    return min(max(((449.0 * n + 3525.0) * n + 6823.3) * n + 5520.33, 1667.0), 100_000.0)
 
 
 def _chromaticity(xyz: Neutral) -> XY:

@@ -25,9 +25,8 @@ FLOATING_POINT = 3
 """Value of SampleFormat."""
 RATIONALS = (5, 10)
 """Types of fractions (TIFF 6.0, section 2)."""
-LOSSY = {34892: "lossy JPEG", 52546: "JPEG XL"}
-"""Compressions of DNG that remove noise (a few JPEG XL files are lossless, which no tag states)."""
-JPEG_XL = 52546
+LOSSY_JPEG, JPEG_XL = 34892, 52546
+"""Values of Compression: a DNG without its finest noise, and one that is refused."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +85,6 @@ def read_metadata(path: Path, key: str) -> RawMetadata:
     _require("rawpy", path, key)
     try:
         with machine_errors(path), opened_by_libraw(path.read_bytes()) as raw:
-            if raw.raw_pattern.shape != (2, 2):
-                raise SourceError("unsupported", "contains no Bayer mosaic; expected a CFA pattern of 2x2 sites")
             return tags.completed(decoder_facts(raw))
     except SourceError as error:
         raise ConfigError(f"{key}: {path} {error.text}") from error
@@ -112,7 +109,7 @@ def tags_of(content: bytes, check: bool = True) -> RawMetadata:
 
     try:
         with tifffile.TiffFile(io.BytesIO(content)) as file:
-            pages = list(tiff_pages(file))
+            pages = [page for first in file.pages for page in (first, *(getattr(first, "pages", ()) or ()))]
             raw = next((page for page in pages if page.tags.valueof(262) in (CFA, LINEAR)), pages[0])
             if check:
                 _check_mosaic(raw, len(content))
@@ -124,23 +121,20 @@ def tags_of(content: bytes, check: bool = True) -> RawMetadata:
         return RawMetadata()
 
 
-def tiff_pages(file: Any) -> Iterator[Any]:
-    """Yield the images of a TIFF: of its first directories, and of their SubIFDs."""
-    for first in file.pages:
-        yield from (first, *(getattr(first, "pages", ()) or ()))
-
-
 def _check_mosaic(page: Any, size: int) -> None:
     """Raise SourceError unless a page is a complete mosaic of integers."""
-    ends = [start + count for start, count in zip(page.dataoffsets, page.databytecounts, strict=False)]
-    if max(ends, default=0) > size:
-        raise SourceError("truncated", f"its pixels end at byte {max(ends)}, the file at byte {size}")
-    if page.tags.valueof(262) == LINEAR:
-        raise SourceError("unsupported", "is a linear DNG, whose pixels are demosaicked; expected a mosaic")
-    if page.tags.valueof(262) == CFA and page.tags.valueof(339) == FLOATING_POINT:
-        raise SourceError("unsupported", "has floating-point pixels; expected a mosaic of integers")
-    if page.tags.valueof(262) == 1 and 50706 in page.parent.pages[0].tags:
-        raise SourceError("unsupported", "is monochrome; expected a mosaic of red, green and blue sites")
+    end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=False)), default=0)
+    if end > size:
+        raise SourceError("truncated", f"its pixels end at byte {end}, the file at byte {size}")
+    photometric = page.tags.valueof(262)
+    refusals = {
+        "is a linear DNG, whose pixels are demosaicked": photometric == LINEAR,
+        "has floating-point pixels": photometric == CFA and page.tags.valueof(339) == FLOATING_POINT,
+        "is monochrome": photometric == 1 and 50706 in page.parent.pages[0].tags,
+    }
+    for what, is_refused in refusals.items():
+        if is_refused:
+            raise SourceError("unsupported", f"{what}; expected a mosaic of integers")
 
 
 def _require(library: str, path: Path, key: str) -> None:
@@ -206,13 +200,16 @@ def _tag_values(tag: Any) -> tuple[float, ...]:
 
 @contextmanager
 def opened_by_libraw(content: bytes) -> Iterator[Any]:
-    """Open the bytes of a raw file with LibRaw; SourceError unless they are one, and contain a mosaic."""
+    """Open the bytes of a raw file with LibRaw; SourceError unless they are one, and contain a Bayer mosaic."""
     import rawpy
 
     try:
         with rawpy.imread(io.BytesIO(content)) as raw:
             if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
                 raise SourceError("unsupported", "contains no mosaic (LibRaw); expected red, green and blue sites")
+            if raw.raw_pattern.shape != (2, 2) or raw.num_colors != 3:
+                kind = "an X-Trans mosaic" if len(raw.raw_pattern) == 6 else f"a mosaic of {raw.num_colors} colours"
+                raise SourceError("unsupported", f"has {kind}; expected a Bayer mosaic")
             yield raw
     except rawpy.LibRawError as error:
         message = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
