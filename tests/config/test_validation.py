@@ -300,7 +300,7 @@ def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> N
         "": ("out", "n_jobs", "self_test", "check_disk"),
         "source": ("root", "list", "max_failed"),
         "noise": ("dark_frames", "provenance"),
-        "executor": ("kind", "address", "chunk_s", "window", "no_workers_s", "lost_worker_s"),
+        "executor": ("kind", "address", "no_workers_s"),
         "body": ("name", "missing", "replaced"),
     }
     assert "executor" not in loaded

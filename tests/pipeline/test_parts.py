@@ -26,10 +26,8 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import parts, run_records
 from unprocess_gen.pipeline.parts import left_text, shards_of_part
-from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.verify import verify
-from unprocess_gen.simulation import self_test
 
 COUNT = 12
 ROOT = "source.root=p"
@@ -98,16 +96,6 @@ def edit_json(path: Path, **values: Any) -> None:
 
 def replace_text(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
-
-
-def test_prepare_and_part_report_compiling(
-    photographs: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Both compile before the first image, where a user would wait for up to a minute."""
-    monkeypatch.setattr(self_test, "are_compiled", lambda kernels: False)
-    for arguments in (("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds"), ("part", "ds", 0)):
-        done = run_main(*arguments)
-        assert (done.code, COMPILING in done.err) == (0, True), done.err
 
 
 # Same bytes -----------------------------------------------------------------------------------------------------------
@@ -300,7 +288,6 @@ def test_ranges_are_written_as_batch_systems_read_them(numbers: list[int], text:
          "out=ds: was begun with other settings: seed=1 (there: 0); choose another out, or finish it with its "
          "own settings: gen-dataset again ds out=ds source.root=p"),
         (("part", "ds", "6"), "part 6: ds has 6 parts; expected 0 to 5"),
-        (("part", "ds", "-1"), "part: -1: expected an integer of 0 or more"),
         (("part", "ds", "0", "n_jobs=0"), "n_jobs=0: expected 1 to 1024 or -1 for one per core"),
         (("part", "ds", "0", "source.root=none"), "source.root=none: no such folder or file; expected an "
          "existing folder of photographs"),
@@ -343,23 +330,6 @@ def test_other_version_settings_or_listing_is_refused_with_2(
     done = run_main(*(("part", "ds", "0") if verb == "part" else ("merge", "ds")))
     assert (done.code, len(messages(done.err)), message in done.err) == (2, 1, True), done.err
     assert files(ds) == before
-
-
-def test_host_that_makes_another_canary_makes_no_shard(ds: Path, run_main: RunMain) -> None:
-    edit_json(ds / ".work/plan.json", canary_sha256="0" * 64)
-    done = run_main("part", "ds", 0)
-    assert (done.code, done.out) == (5, "")
-    assert "makes other bytes from source" in done.err and len(messages(done.err)) == 1
-    assert not (ds / ".work/rows").exists()
-
-
-def test_canary_is_the_smallest_readable_photograph(photographs: Path, run_main: RunMain, tmp_path: Path) -> None:
-    for name in ("a.png", "b.png"):
-        (photographs / name).write_bytes(b"not a photograph")
-    done = run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds", "source.max_failed=2")
-    assert done.code == 0, done.err
-    smallest = min(range(COUNT), key=lambda index: (photographs / f"{index:03d}.png").stat().st_size)
-    assert json.loads((tmp_path / "ds/.work/plan.json").read_text())["canary_source"] == smallest
 
 
 def test_source_that_changed_ends_with_5_and_its_name(ds: Path, photographs: Path, run_main: RunMain) -> None:

@@ -620,14 +620,8 @@ class ExecutorConfig(Group):
         what runs the workers: local is processes of this machine, dask a Dask cluster (extra dask)
     address
         address of a running Dask scheduler, such as tcp://10.0.0.1:8786, used if kind is dask
-    chunk_s
-        work in one Dask task; the first tasks contain less, because the time of a shard must be measured first
-    window
-        Dask tasks that are submitted for each worker at a time
     no_workers_s
         time without any Dask worker after which the run ends with exit code 5
-    lost_worker_s
-        time without progress after which the shards of a Dask worker are given to another one
     """
 
     kind: str = key("local", Choice("local", "dask"), decides_data=False)
@@ -637,10 +631,7 @@ class ExecutorConfig(Group):
         null="start a scheduler and n_jobs workers on this machine",
         decides_data=False,
     )
-    chunk_s: float = key(30.0, Numbers(0, 86400, open_low=True), unit="seconds", decides_data=False)
-    window: int = key(2, Integers(1, 1000), decides_data=False)
     no_workers_s: float = key(300.0, Numbers(0, 86400, open_low=True), unit="seconds", decides_data=False)
-    lost_worker_s: float = key(60.0, Numbers(1, 86400), unit="seconds", decides_data=False)
 
 
 @documented

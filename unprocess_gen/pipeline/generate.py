@@ -24,15 +24,13 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
-from unprocess_gen.pipeline.frozen_run import freeze_run
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.run import Run, resolve
-from unprocess_gen.pipeline.run_records import text_sha256
 from unprocess_gen.pipeline.sizes import check_free_space
 from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, RunContext, ShardReport, ShardTask, StageTimes, Tally
 from unprocess_gen.pipeline.workspace import Workspace
@@ -190,7 +188,7 @@ def images_in(tasks: Iterable[ShardTask]) -> int:
 
 @dataclass(slots=True)
 class Made:
-    """Count what executors made: rows, shards, processor time of the stages, and the most workers at a time."""
+    """Count what executors made: rows, shards, processor time of the stages, and workers."""
 
     rows: int = 0
     shards: int = 0
@@ -208,17 +206,15 @@ def execute_locally(workspace: Workspace, run: Run, todo: list[ShardTask], progr
 
 def execute_on_dask(workspace: Workspace, run: Run, todo: list[ShardTask], progress: Progress) -> Made:
     """Make shards on a Dask cluster."""
-    from unprocess_gen.pipeline.executors.dask import REPORTS, ChunkRequest, DaskRun, connected
+    from unprocess_gen.pipeline.executors.dask import connected, make_shards
 
     config = run.config
-    out, root = absolute_text(config.out), absolute_text(config.source.place)
-    assert out is not None
-    with connected(config.executor, effective_jobs(config.n_jobs, len(todo)), workspace.storage) as client:
-        plan = freeze_run(workspace, run, progress.report_compiling)
-        request = ChunkRequest(out, root, text_sha256(plan.text), config.executor.chunk_s / REPORTS)
-        on_dask = DaskRun(client, config.executor, request, workspace.records, [task.shard for task in todo])
-        made = follow(on_dask.reports(), progress)
-        made.n_jobs = on_dask.workers.most
+    places = {"out": absolute_text(config.out), "noise.dark_frames": absolute_text(config.noise.dark_frames)}
+    places |= {"source.root": absolute_text(config.source.place)}
+    context = RunContext(PairSettings.read(replaced(config, places)), "", None)
+    with connected(config.executor, effective_jobs(config.n_jobs, len(todo))) as client:
+        made = follow(make_shards(client, context, todo), progress)
+        made.n_jobs = client.scheduler_info(n_workers=0)["n_workers"]
         return made
 
 

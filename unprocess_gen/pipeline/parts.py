@@ -1,6 +1,6 @@
 """Generate a dataset in parts that share only the output folder: prepare, part, status and merge.
 
-    prepare    records settings, listing, canary (`frozen_run`) and the number of parts; takes the lock
+    prepare    records settings, listing and the number of parts (`frozen_run`); takes the lock
     part       generates and commits the shards of one part; takes no lock, so parts can run at the same time
     status     lists the parts that are left
     merge      writes manifest and dataset.json when all parts are done; takes the lock
@@ -15,7 +15,6 @@ import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 from unprocess_gen.config.schema import Config
@@ -25,10 +24,10 @@ from unprocess_gen.core.errors import RESUME, ConfigError, MachineError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
-from unprocess_gen.pipeline.frozen_run import FrozenPlan, FrozenRun, freeze_run, read_plan, recorded_plan
+from unprocess_gen.pipeline.frozen_run import FrozenRun, freeze_run, read_plan, recorded_plan
 from unprocess_gen.pipeline.generate import Summary, begin, dataset_json_facts, follow, images_in
 from unprocess_gen.pipeline.pairs import PairSettings
-from unprocess_gen.pipeline.progress import COMPILING, LOGGER, Progress
+from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.run_records import ShardRecords
 from unprocess_gen.pipeline.storage import Storage
@@ -104,13 +103,13 @@ def prepare(config: Config, parts: int) -> Run | None:
             workspace.check_complete(run.sources)
             return None
         plan = recorded_plan(workspace.storage)
-        if plan is not None and plan.parts not in (None, parts):
+        if plan is not None and plan.parts != parts:
             raise ConfigError(
                 f"parts={parts}: {config.out} was prepared with parts={plan.parts}; expected that number; choose "
                 "another out"
             )
         begin(workspace, run)
-        freeze_run(workspace, run, partial(LOGGER.info, COMPILING), parts)
+        freeze_run(workspace, run, parts)
     return run
 
 
@@ -118,8 +117,8 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
     """Make and commit the shards of one part that are not committed yet.
 
     Raises ConfigError if ``out`` was not prepared, or by another version or with other settings; if there is no such
-    part, or ``n_jobs`` is not allowed; CanaryError if this host makes other bytes than the host that prepared the run;
-    MachineError if the self-test fails, a file cannot be read or written, or a source was changed or deleted.
+    part, or ``n_jobs`` is not allowed; MachineError if the self-test fails, a file cannot be read or written, or a
+    source was changed or deleted.
     """
     started = time.monotonic()
     if n_jobs is not None:
@@ -127,7 +126,7 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
     if _is_complete(out):
         return None
     run = FrozenRun(out, root)
-    parts = _parts(run.plan, out)
+    parts = run.plan.parts
     if not 0 <= part < parts:
         raise ConfigError(f"part {part}: {out} has {parts} parts; expected 0 to {parts - 1}")
     wanted = shards_of_part(part, parts, run.plan.shards)
@@ -137,7 +136,6 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
         jobs = effective_jobs(run.plan.n_jobs if n_jobs is None else n_jobs, len(todo))
         scratch, spare = str(run.storage.scratch), jobs < own_cores()
         with Progress(images_in(todo), 0, f"part {part} of {parts}") as progress:
-            run.check_host(progress.report_compiling)
             context = RunContext(run.settings, scratch, os.getpid(), core_to_spare=spare, counts_deaths=True)
             progress.watch(context)
             rows = follow(run_tasks(context, todo, jobs), progress).rows
@@ -153,7 +151,7 @@ def parts_status(out: str) -> PartsStatus:
     if _is_complete(out):
         return PartsStatus(0, 0, 0, (), complete=True)
     plan = read_plan(storage)
-    parts = _parts(plan, out)
+    parts = plan.parts
     recorded = ShardRecords(storage).recorded(range(plan.shards))
     left = (part for part in range(parts) if not recorded.issuperset(shards_of_part(part, parts, plan.shards)))
     return PartsStatus(parts, plan.shards, len(recorded), tuple(left))
@@ -184,7 +182,7 @@ def merge(out: str) -> tuple[Summary, int]:
         settings = run.settings
     with Workspace(out, run.storage.read("config.yaml")) as workspace:
         workspace.storage.hold()
-        plan, parts = run.plan, _parts(run.plan, out)
+        plan, parts = run.plan, run.plan.parts
         facts = workspace.finish(
             plan.shards,
             lambda tally: dataset_json_facts(settings, plan.not_matched, plan.skipped_links, tally, {"parts": parts}),
@@ -206,9 +204,3 @@ def left_text(parts: Sequence[int]) -> str:
 
 def _is_complete(out: str) -> bool:
     return Workspace(out, "").is_complete()
-
-
-def _parts(plan: FrozenPlan, out: str) -> int:
-    if plan.parts is None:
-        raise ConfigError(f"out={out}: has no parts; expected a folder that gen-dataset prepare has begun; prepare it")
-    return plan.parts

@@ -299,9 +299,3 @@ class Deaths:
         """Remove the files of earlier attempts."""
         for name in self._names:
             (self._storage / name).delete()
-
-
-def forget_deaths(storage: Storage) -> None:
-    """Remove the files of all shards."""
-    for name in (storage / DEATHS_FOLDER).entries():
-        (storage / f"{DEATHS_FOLDER}/{name}").delete()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -101,8 +101,6 @@ class RunContext:
         Whether each worker hashes and writes in a second thread (more cores than workers).
     counts_deaths : bool
         Whether the deaths of workers at a shard are counted below ``out`` (`deaths`), because nothing else sees them.
-    on_compiling : callable or None
-        Called before kernels are compiled; None for contexts that travel to workers, which write `compiling_path`.
     """
 
     settings: PairSettings
@@ -110,7 +108,6 @@ class RunContext:
     coordinator_pid: int | None
     core_to_spare: bool = False
     counts_deaths: bool = False
-    on_compiling: Callable[[], object] | None = None
 
     @property
     def config(self) -> Config:
@@ -120,8 +117,6 @@ class RunContext:
     def report_compiling(self) -> None:
         """Report that this process is about to compile kernels."""
         self.compiling_path.touch()
-        if self.on_compiling is not None:
-            self.on_compiling()
 
     @property
     def compiling_path(self) -> Path:
