@@ -7,7 +7,6 @@ import pickle
 import cv2
 import numpy as np
 import pytest
-from helpers.cases import slow_except
 
 import unprocess_gen as ug
 from unprocess_gen.simulation.pair import make_pair
@@ -31,7 +30,7 @@ def all_codes(top: int, count: int, seed: int = 0) -> np.ndarray:
     return colours
 
 
-def largest_error(overrides: list[str], dtype: type, count: int, demosaic: str = "bilinear") -> int:
+def largest_error(overrides: list[str], dtype: type, count: int, demosaic: str = "malvar") -> int:
     """Return the largest difference of codes in the middle of flat squares that no clip touches."""
     picture, overrides = cells(all_codes(np.iinfo(dtype).max, count), dtype), [*overrides, "noise=none"]
     clean, noisy = ug.CameraNoise(overrides, demosaic)(picture, index=3)
@@ -69,11 +68,8 @@ def test_codes_return_for_every_camera(camera: str, gains: str, isp: str) -> Non
             )
 
 
-@pytest.mark.parametrize("demosaic", ["edge_aware", *slow_except((), ("malvar", "menon"))])
-@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("demosaic", ["malvar", "bilinear"])
 def test_every_demosaicking_restores_flat_colours(demosaic: str) -> None:
-    if demosaic != "edge_aware":
-        pytest.importorskip("colour_demosaicing")
     for pattern in ("RGGB", "BGGR", "GRBG", "GBRG"):
         picture = np.empty((12, 15, 3), np.uint8)
         picture[:] = 40, 130, 90
@@ -107,16 +103,15 @@ def test_raw_pair_is_that_of_make_pair(picture: np.ndarray) -> None:
     raw = ug.make_pair(picture, config, seed=2, key=9)
     noisy = ug.CameraNoise(config, seed=2)(picture, index=9)[1]
     difference = noisy.astype(float) - ug.develop(raw.noisy, raw.row)
-    assert abs(difference.mean()) < 1
-    assert np.corrcoef(noisy.ravel(), ug.develop(raw.noisy, raw.row).ravel())[0, 1] > 0.95  # other demosaicking
+    assert np.abs(difference).max() <= 1
 
 
-@pytest.mark.parametrize("noise", ["imx385_iso12800", "sony_a7s2"])
-@pytest.mark.parametrize("shape", [(65, 97), (2, 3), (64, 64)])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_pictures_keep_shape_and_dtype(noise: str, shape: tuple[int, int], dtype: type) -> None:
+@pytest.mark.parametrize(
+    ("overrides", "shape", "dtype"),
+    [(["noise=imx385_iso12800"], (65, 97), np.uint8), (["noise=sony_a7s2", "scene=low_light"], (2, 3), np.uint16)],
+)
+def test_pictures_keep_shape_and_dtype(overrides: list[str], shape: tuple[int, int], dtype: type) -> None:
     flat = np.full((*shape, 3), np.iinfo(dtype).max // 3, dtype)
-    overrides = [f"noise={noise}", *(["scene=low_light"] if noise == "sony_a7s2" else [])]
     clean, noisy = ug.CameraNoise(overrides)(flat)
     assert clean.shape == noisy.shape == flat.shape
     assert clean.dtype == noisy.dtype == flat.dtype
@@ -144,7 +139,7 @@ def test_clean_can_be_the_picture_and_noisy_a_jpeg(picture: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        ({"demosaic": "ahd"}, "demosaic='ahd': unknown; expected one of bilinear, edge_aware, malvar, menon"),
+        ({"demosaic": "ahd"}, "demosaic='ahd': unknown; expected one of malvar, bilinear"),
         ({"clean": "none"}, "clean='none': unknown; expected one of developed, source"),
         ({"jpeg": 0}, "jpeg=0: no quality; expected an integer from 1 to 100, or None"),
         ({"jpeg": True}, "jpeg=True: no quality"),
@@ -168,7 +163,6 @@ def test_wrong_arguments_are_refused(arguments: dict, problem: str) -> None:
     ("wrong", "kind", "problem"),
     [
         (np.zeros((8, 8), np.uint8), ValueError, "expected uint8 or uint16 [H, W, 3]"),
-        (np.zeros((8, 8, 3), np.float32), ValueError, "expected uint8 or uint16 [H, W, 3]"),
         (np.zeros((1, 8, 3), np.uint8), ValueError, "at least 2 x 2"),
         (np.zeros((8, 8, 3), np.uint16), ValueError, "expected uint8 with jpeg=90"),
     ],

@@ -98,13 +98,18 @@ def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) ->
     Gains are applied before demosaicking, so that saturated highlights get no coloured rim. With
     ``highlight="gray_mean"`` the gains depend on all three channels, so there demosaicking follows the plain gains.
     """
-    light = to_light(raw, plan)
-    k = np.broadcast_to(plan.camera.inverse_gains, (*light.shape, 3))
-    site_k = mosaic(k, plan.sensor.pattern, origin)
-    if plan.camera.highlight == "gray_mean":
-        return process(demosaic(light / site_k, plan.sensor.pattern, origin) * k, plan)
-    balanced = HIGHLIGHTS[plan.camera.highlight](light, site_k, plan.camera.highlight_threshold)
-    return render(demosaic(balanced, plan.sensor.pattern, origin), plan)
+    return render(white_balanced(to_light(raw, plan), plan, origin), plan)
+
+
+def white_balanced(light: Float, plan: Plan, origin: tuple[int, int] = (0, 0), method: str = "malvar") -> Float:
+    """Apply the gains to a mosaic of light and interpolate it, in its own precision; returns camera RGB, [H, W, 3]."""
+    pattern, camera, k = plan.sensor.pattern, plan.camera, np.array(plan.camera.inverse_gains, light.dtype)
+    site_k = mosaic(np.broadcast_to(k, (*light.shape, 3)), pattern, origin).astype(light.dtype)
+    if camera.highlight == "gray_mean":
+        image = demosaic(light / site_k, pattern, origin, method) * k
+        return apply_gains_gray_mean(image, k, camera.highlight_threshold)
+    balanced = HIGHLIGHTS[camera.highlight](light, site_k, camera.highlight_threshold)
+    return demosaic(balanced, pattern, origin, method)
 
 
 def to_light(dn: Frame | Float, plan: Plan) -> Float:
@@ -144,7 +149,9 @@ def to_codes(srgb: Float, codes: int = 256) -> Float:
     return np.rint(srgb * (codes - 1))
 
 
-KERNELS = {
+Filters = dict[str, tuple[tuple[int, ...], ...]]
+
+KERNELS: Filters = {
     "green": ((0, 0, -2, 0, 0), (0, 0, 4, 0, 0), (-2, 4, 8, 4, -2), (0, 0, 4, 0, 0), (0, 0, -2, 0, 0)),
     "row": ((0, 0, 1, 0, 0), (0, -2, 0, -2, 0), (-2, 8, 10, 8, -2), (0, -2, 0, -2, 0), (0, 0, 1, 0, 0)),
     "column": ((0, 0, -2, 0, 0), (0, -2, 8, -2, 0), (1, 0, 10, 0, 1), (0, -2, 8, -2, 0), (0, 0, -2, 0, 0)),
@@ -157,24 +164,37 @@ channel. The neighbours are next to the site (green at red and blue), in its row
 blue, blue at red). Each filter is symmetric and sums to 16, so that flat colours and ramps are exact.
 """
 
+BILINEAR: Filters = {
+    "green": ((0, 4, 0), (4, 0, 4), (0, 4, 0)),
+    "row": ((0, 0, 0), (8, 0, 8), (0, 0, 0)),
+    "column": ((0, 8, 0), (0, 0, 0), (0, 8, 0)),
+    "diagonal": ((4, 0, 4), (0, 0, 0), (4, 0, 4)),
+}
+"""Means of the neighbours of the wanted channel, in sixteenths."""
+
+DEMOSAICS = {"malvar": KERNELS, "bilinear": BILINEAR}
+"""Filters of each method."""
+
 GREEN = 1
 
 
-def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> Float:
-    """Interpolate the missing channels of a mosaic (Malvar, He and Cutler, ICASSP 2004).
+def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0), method: str = "malvar") -> Float:
+    """Interpolate the missing channels of a mosaic.
 
     Parameters
     ----------
-    values : ndarray of float64, [H, W]
+    values : ndarray of float64 or float32, [H, W]
         Mosaic of at least 2 x 2 sites.
     pattern : str
         One of `cfa.PATTERNS`, or `cfa.MONO`, whose channels are all equal to the values.
     origin : (int, int)
         Row and column of ``values[0, 0]`` in the full frame.
+    method : str
+        One of `DEMOSAICS`.
 
     Returns
     -------
-    ndarray of float64, [H, W, 3]
+    ndarray of the dtype of ``values``, [H, W, 3]
         All channels; recorded values are unchanged. Flat colours are exact up to rounding. Linear ramps are too, except
         in the two outermost rows and columns, where the frame is mirrored about its edge sites (which preserves the
         phase of the pattern).
@@ -188,8 +208,8 @@ def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> F
         raise ValueError(f"mosaic={list(values.shape)}: channels are missing; expected at least 2 x 2 sites")
     if pattern == MONO:
         return np.repeat(values[..., np.newaxis], 3, axis=2)
-    interpolated = {name: _filter(values, kernel) for name, kernel in KERNELS.items()}
-    image = np.empty((*values.shape, 3))
+    interpolated = {name: _filter(values, kernel) for name, kernel in DEMOSAICS[method].items()}
+    image = np.empty((*values.shape, 3), values.dtype)
     sites = tile(pattern, origin)
     for y in (0, 1):
         for x in (0, 1):
@@ -204,7 +224,7 @@ def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> F
 def _filter(values: Float, sixteenths: tuple[tuple[int, ...], ...]) -> Float:
     """Filter a mosaic with a kernel given in sixteenths."""
     kernel = np.array(sixteenths) / 16
-    return np.asarray(cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_REFLECT_101))
+    return np.asarray(cv2.filter2D(values, -1, kernel, borderType=cv2.BORDER_REFLECT_101))
 
 
 def smoothstep(y: Float) -> Float:
