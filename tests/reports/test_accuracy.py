@@ -103,7 +103,6 @@ def test_every_stage_of_every_tier_has_time_and_error(
         assert any(row[4:] != (0,) * 5 for row in stages.values()) == (tier == FAST and not overrides)
         figure("tiers", f"{tier}: error of the noisy frame at most {stages['run'].max_dn:.2g} DN")
     assert measured.photographs == "2 photographs (0.0 megapixels)"
-    assert measured.conditions["photographs"].startswith("001.png, 002.png, of ")
     assert list(folder.iterdir()) == []
 
 
@@ -216,10 +215,9 @@ def rows_of(tier: str, ratio: float | None, changed: float) -> list[Measurement]
     return [Measurement(tier, stage, ratio, ratio, changed, 2.0, 0.1, 0.3, 0.004) for stage in STAGES]
 
 
-def measured(fast: float, ratios: list[float], reference: float | None = 31.0) -> AccuracyReport:
+def measured(fast: float, reference: float | None = 31.0) -> AccuracyReport:
     rows = [*rows_of(REFERENCE, reference, 0), *rows_of(EXACT, 1.0, 0), *rows_of(FAST, fast, 0.02)]
-    by_tier = {FAST: ratios, EXACT: [1.0], REFERENCE: [] if reference is None else [reference]}
-    return AccuracyReport(tuple(rows), by_tier, "2 photographs (5.2 megapixels)", "imx385_iso3200", {})
+    return AccuracyReport(tuple(rows), "2 photographs (5.2 megapixels)", "imx385_iso3200", {})
 
 
 TIME = "the processor time of exact"
@@ -229,9 +227,9 @@ MOVES = "moves 2 % of the noisy DN by at most 2 DN or 0.3 standard deviations of
 @pytest.mark.parametrize(
     ("given", "fast", "reference"),
     [
-        (measured(0.9, [0.89, 0.91]), f"0.9 of {TIME}", f"takes 31 times {TIME}"),
-        (measured(0.96, [0.9, 1.1]), "about as long as exact (ratio 0.96)", f"takes 31 times {TIME}"),
-        (measured(0.9, [0.89], None), f"0.9 of {TIME}", "was too slow to be timed"),
+        (measured(0.9), f"0.9 of {TIME}", f"takes 31 times {TIME}"),
+        (measured(0.96), "about as long as exact (ratio 0.96)", f"takes 31 times {TIME}"),
+        (measured(0.9, None), f"0.9 of {TIME}", "was too slow to be timed"),
     ],
 )  # fmt: skip
 def test_conclusion_is_true_for_any_result(given: AccuracyReport, fast: str, reference: str) -> None:

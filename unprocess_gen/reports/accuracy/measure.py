@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import platform
 import shutil
 import tempfile
@@ -28,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import is_physical, noise_levels
+from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.files import machine_error
@@ -102,10 +101,9 @@ class RunTimes(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AccuracyReport:
-    """Rows of all tiers, the ratios of their runs to `EXACT` by round, and what was measured."""
+    """Rows of all tiers, and what was measured."""
 
     rows: tuple[Measurement, ...]
-    ratios: dict[str, list[float]]
     photographs: str
     noise: str
     conditions: dict[str, str]
@@ -156,10 +154,8 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
             ns, exact_ns = (stage_ns[name][stage] if name in stage_ns else None for name in (tier, EXACT))
             ratio = ns / exact_ns if ns is not None and exact_ns else None  # a stage can be too short to be measured
             rows.append(Measurement(tier, stage, ns, ratio, *errors[stage]))
-    totals = {tier: [sum(run) for run in runs] for tier, runs in times.items()}
-    ratios = {tier: [run / exact for run, exact in zip(totals[tier], totals[EXACT], strict=False)] for tier in TIERS}
     photographs = f"{counted(inputs.count, 'photograph')} ({inputs.pixels / 1e6:.1f} megapixels)"
-    return AccuracyReport(tuple(rows), ratios, photographs, noise_text(config), _conditions(config, inputs, command))
+    return AccuracyReport(tuple(rows), photographs, config.noise.name, _conditions(config, command))
 
 
 # -------------------------------------------------------------------------------------------------------------- inputs
@@ -294,33 +290,13 @@ def _deviation(in_dn: Float, in_std: Float) -> Deviation:
 # ----------------------------------------------------------------------------------------------------------- conditions
 
 
-def _conditions(config: Config, inputs: Inputs, command: str) -> dict[str, str]:
+def _conditions(config: Config, command: str) -> dict[str, str]:
     """Facts about the measurement that differ between reports."""
-    names = ", ".join(sample.source.name for sample in inputs.samples)
-    sites = sum(sample.photograph.srgb[..., 0].size for sample in inputs.samples)
-    versions = (f"{name} {version(name)}" for name in ("unprocess_gen", "numpy", "numba", "llvmlite"))
     return {
         "command": command,
         "date": time.strftime("%Y-%m-%d %H:%M %Z"),
-        "machine": f"{processor()}; one thread of {os.cpu_count()}; {platform.system()} {platform.machine()}",
-        "versions": f"Python {platform.python_version()}, {', '.join(versions)}",
-        "photographs": f"{names}, of {config.source.place or 'the built-in scenes'}; errors on {sites:,} sites",
-        "settings": f"{config.sensor.bits} bits, noise {noise_text(config)}",
+        "machine": platform.platform(),
+        "versions": ", ".join(f"{name} {version(name)}" for name in ("unprocess_gen", "numpy", "numba", "llvmlite")),
+        "photographs": str(config.source.place or "built-in scenes"),
+        "settings": f"{config.sensor.bits} bits, noise {config.noise.name}, scene {config.scene.name}",
     }
-
-
-def noise_text(config: Config) -> str:
-    """The noise profile; scene and ISO if it is physical."""
-    if not is_physical(config.noise):
-        return config.noise.name
-    iso = config.scene.iso if config.noise.iso is None else config.noise.iso
-    return f"{config.noise.name}, scene {config.scene.name}, ISO {iso}"
-
-
-def processor() -> str:
-    """The model name of the processor."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import statistics
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -93,6 +92,10 @@ def csv_text(rows: Sequence[Measurement]) -> str:
 # ---------------------------------------------------------------------------------------------------------- conclusion
 
 
+NOISE_OF_TIMES = 0.05
+"""Difference of a ratio from 1 that says nothing."""
+
+
 def conclude(report: AccuracyReport) -> str:
     """One sentence: what the other tiers cost or save in a run, and what they change."""
     clauses = (f"{tier} {_time_clause(report, tier)} and {_error_clause(report, tier)}" for tier in (FAST, REFERENCE))
@@ -100,14 +103,10 @@ def conclude(report: AccuracyReport) -> str:
 
 
 def _time_clause(report: AccuracyReport, tier: str) -> str:
-    """The time of a tier; a difference counts only if both quartiles of the ratios within rounds agree with it."""
-    ratios = report.ratios[tier]
-    if not ratios:
-        return "was too slow to be timed"
-    quartiles = statistics.quantiles(ratios, method="inclusive") if len(ratios) > 1 else ratios
     ratio = _run(report, tier).ratio_to_exact
-    assert ratio is not None
-    if min(*quartiles, ratio) <= 1 <= max(*quartiles, ratio):
+    if ratio is None:
+        return "was too slow to be timed"
+    if abs(ratio - 1) < NOISE_OF_TIMES:
         return f"takes about as long as {EXACT} (ratio {three_digits(ratio)})"
     return f"takes {three_digits(ratio)} {'of' if ratio < 1 else 'times'} the processor time of {EXACT}"
 
