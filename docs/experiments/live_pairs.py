@@ -15,7 +15,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ import numpy as np
 from live_pairs_numpy import NumpyPairs, brooks_colours
 
 import unprocess_gen as ug
-from unprocess_gen.reports.timing import measure_in_turns, median_ratio
+from unprocess_gen.reports.timing import measure_in_turns
 from unprocess_gen.simulation.reference.colour import CAMERAS, RGB2XYZ
 from unprocess_gen.sources.scenes import synthetic
 
@@ -40,6 +40,11 @@ GOALS = {
 }
 """Settings, ``redraw``, and the least ratio of the time of plain NumPy to that of live pairs."""
 DECODE_GOAL = 1.2
+
+
+def median_ratio(times: Sequence[float], reference: Sequence[float]) -> float:
+    """Return the median of the ratios within rounds."""
+    return statistics.median(time / other for time, other in zip(times, reference, strict=True))
 
 
 def write_scenes(folder: Path, count: int = 16) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,35 +43,24 @@ def _plan(config: Config, label: str = "", *, read_all: bool, with_numbers: bool
 
 
 def accuracy(call: Call) -> int:
-    """Measure error and time of every tier, stage by stage, and write a report."""
-    return _compose_report(call, _accuracy)
+    """Measure error and time of every tier, stage by stage, and write a report, never into a dataset."""
+    if not any(override.startswith("out=") for override in call.overrides):
+        call = replace(call, overrides=[*call.overrides, "out=accuracy"])
+    command = shlex.join(["gen-dataset", "accuracy", *call.hydra_arguments, *call.overrides])
+    return compose(call, partial(_accuracy, command=command))
 
 
 def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
     from unprocess_gen.reports.accuracy.measure import measure_accuracy
     from unprocess_gen.reports.accuracy.report import REPORT_FILES, report_text, write_accuracy
+    from unprocess_gen.reports.report_files import check_report_folder
 
     require_photographs(config.source, "accuracy")
-    out = _report_folder(config, "accuracy")
+    out = local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
+    check_report_folder(out, "accuracy")
     report = measure_accuracy(config, command)
     write_accuracy(report, out)
     return 0, None, [report_text(report), f"{out}: {', '.join(REPORT_FILES)}"]
-
-
-def _compose_report(call: Call, task: Callable[..., tuple[int, None, list[str]]]) -> int:
-    """Run a task that writes a report; its default ``out`` is the verb, so that no report goes into a dataset."""
-    if not any(override.startswith("out=") for override in call.overrides):
-        call = replace(call, overrides=[*call.overrides, f"out={call.verb.name}"])
-    command = shlex.join(["gen-dataset", call.verb.name, *call.hydra_arguments, *call.overrides])
-    return compose(call, partial(task, command=command))
-
-
-def _report_folder(config: Config, verb: str) -> Path:
-    from unprocess_gen.reports.report_files import check_report_folder
-
-    out = local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
-    check_report_folder(out, verb)
-    return out
 
 
 def report(call: Call) -> int:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import statistics
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar
 
 _Key = TypeVar("_Key", bound=Hashable)
@@ -28,8 +27,3 @@ def measure_in_turns(measurements: Mapping[_Key, Callable[[int], _Time]], rounds
         for key in list(measurements)[:: -1 if number % 2 else 1]:
             results[key].append(measurements[key](number))
     return results
-
-
-def median_ratio(times: Sequence[float], reference: Sequence[float]) -> float:
-    """Median of the ratios within rounds."""
-    return statistics.median(time / other for time, other in zip(times, reference, strict=True))
