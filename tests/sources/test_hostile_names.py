@@ -17,24 +17,19 @@ import re
 import shutil
 import tarfile
 import unicodedata
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import Make, text_rows
 from helpers.promise_report import Figure
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen.core.types import Source
-from unprocess_gen.sources.listing import list_folder
 from unprocess_gen.sources.names import decode_name, encode_name
-from unprocess_gen.sources.reading import read_bytes
 
 FORMULA_STARTS = tuple("=+-@\t\r")
 UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
@@ -42,43 +37,56 @@ UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u
 
 NAMES: tuple[bytes, ...] = (
     # ends of lines, separators, quotes
-    *(b"line\nfeed.jpg", b"carriage\rreturn.jpg", b"both\r\n.jpg", b"tab\t.jpg", b"\n.jpg"),
-    b"\x0b\x0c\x1c\x1d\x1e.jpg",
-    *(b"com,ma.jpg", b'quo"te.jpg', b'"quoted".jpg', b'".jpg', b'"".jpg', b"semi;colon.jpg", b"pipe|.jpg"),
-    *(b"'single'.jpg", b",.jpg"),
-    "next\u0085line.jpg".encode(),
-    "line\u2028and\u2029paragraph.jpg".encode(),
-    # formulas
-    *(b"=1+1.jpg", b"+1.jpg", b"-1.jpg", b"@SUM(1).jpg", b"\t=1.jpg", b"\r=1.jpg", b"=cmd|' C'!A0.jpg"),
-    *(b"==.jpg", b"=.jpg", b"-.jpg"),
-    # what a shell, Hydra or a glob would take for its own
-    *(b"-rf.jpg", b"--help.jpg", b"${x}.jpg", b"$(id).jpg", b"`id`.jpg", b"[x]*.jpg", b"?.jpg", b"{a,b}.jpg", b"~.jpg"),
-    *(b"back\\slash.jpg", b"n\\n.jpg", b"a&b.jpg", b"#.jpg", b"null.jpg", b"a=b.jpg", b"<a>.jpg"),
+    *(
+        b"line\nfeed.jpg",
+        b"both\r\n.jpg",
+        b"tab\t.jpg",
+        b"\x0b\x0c\x1c\x1d\x1e.jpg",
+        b"com,ma.jpg",
+        b'quo"te.jpg',
+        b'"".jpg',
+    ),
+    *("next\u0085line.jpg".encode(), "line\u2028and\u2029paragraph.jpg".encode()),
+    # formulas, and what a shell, Hydra or a glob would take for its own
+    *(
+        b"=1+1.jpg",
+        b"@SUM(1).jpg",
+        b"\t=1.jpg",
+        b"=cmd|' C'!A0.jpg",
+        b"-.jpg",
+        b"--help.jpg",
+        b"${x}.jpg",
+        b"$(id).jpg",
+    ),
+    *(b"[x]*.jpg", b"{a,b}.jpg", b"back\\slash.jpg", b"a&b.jpg", b"#.jpg", b"null.jpg", b"a=b.jpg", b"<a>.jpg"),
     # dots, blanks, percent signs
-    *(b".jpg", b"..jpg", b"...jpg", b". .jpg", b" lead.jpg", b"trail .jpg", b" .jpg", b"%.jpg", b"%25.jpg"),
-    *(b"%2F.jpg", b"a%2Fb.jpg", b"..%2f..%2fb.jpg", b"%0A.jpg", b"%FF.jpg", b"%%.jpg", b"%s%n.jpg", b"%u202E.jpg"),
-    # bytes that are not UTF-8
-    *(b"\xff.jpg", b"\xc3.jpg", b"\xc3(.jpg", b"\xed\xa0\x80.jpg", b"\xc0\xaf.jpg", b"\xf5\x80\x80\x80.jpg"),
-    b"\x80=.jpg",
-    # directions, widths, looks
-    *("\u202egpj.jpg".encode(), "a\u202bb\u202c.jpg".encode(), "\u2066\u2067\u2068\u2069.jpg".encode()),
-    *("\u061c\u200e\u200f.jpg".encode(), "zero\u200bwidth.jpg".encode(), "zero\u200dwidth.jpg".encode()),
-    *(b"zerowidth.jpg", "\ufeffbom.jpg".encode(), b"bom.jpg", "soft\u00adhyphen.jpg".encode()),
-    *("שלום.jpg".encode(), "مرحبا.jpg".encode(), "日本語.jpg".encode(), "👩‍👩‍👧‍👦.jpg".encode()),
-    "\U000e0041.jpg".encode(),
+    *(
+        b"..jpg",
+        b". .jpg",
+        b" lead.jpg",
+        b"trail .jpg",
+        b"%.jpg",
+        b"%25.jpg",
+        b"%2F.jpg",
+        b"..%2f..%2fb.jpg",
+        b"%0A.jpg",
+    ),
+    # bytes that are not UTF-8, directions, widths
+    *(b"\xff.jpg", b"\xc3(.jpg", b"\xed\xa0\x80.jpg", b"\xc0\xaf.jpg", b"\x80=.jpg", "\u202egpj.jpg".encode()),
+    *("\u061c\u200e\u200f.jpg".encode(), "zero\u200bwidth.jpg".encode(), "\ufeffbom.jpg".encode(), b"bom.jpg"),
     # alike: by case, by normal form, by look
-    *(b"case.jpg", b"CASE.jpg", b"Case.JPG", "ß.jpg".encode(), b"ss.jpg", "ı.jpg".encode(), b"i.jpg", b"I.jpg"),
+    *(b"case.jpg", b"CASE.jpg", b"Case.JPG", "\u0430.jpg".encode(), b"a.jpg"),
     *(unicodedata.normalize(form, "é.jpg").encode() for form in ("NFC", "NFD")),
-    *(unicodedata.normalize(form, "각Å.jpg").encode() for form in ("NFC", "NFD")),
-    *("\u0430.jpg".encode(), b"a.jpg"),
-    # control characters, names of devices elsewhere, and the longest there are
-    *(b"\x1b[31m.jpg", b"\x1b]0;title\x07.jpg", b"\x7f.jpg", b"\x01.jpg", b"con.jpg", b"NUL.jpg"),
-    *(b"aux.h.png", b"COM1.jpg"),
-    *(b"x" * 251 + b".jpg", b"\xff" * 251 + b".jpg", b"%" * 251 + b".jpg", "\u202e".encode() * 83 + b".jpg"),
+    # control characters, and the longest there are
+    *(b"\x1b[31m.jpg", b"\x1b]0;title\x07.jpg", b"\x7f.jpg", b"x" * 251 + b".jpg", b"\xff" * 251 + b".jpg"),
 )
 FOLDERS: tuple[bytes, ...] = (
-    *(b"=dir", b"new\nline", b"\xff", b"...", b"  ", b"--", b"%2e%2e", b"a\tb", b'"d', b",,", b"~", b"$x", b"\\"),
-    *("\u202e".encode(), "\u0065\u0301".encode(), "\u00e9".encode(), b"\xff" * 255),
+    b"=dir",
+    b"new\nline",
+    b"\xff",
+    b"...",
+    b"  ",
+    b"%2e%2e",
     b"\xff" * 255 + b"/" + b"\xfe" * 255,
 )
 
@@ -189,11 +197,6 @@ def test_verify_regenerates_every_pair(made: HostileDataset, run_main: RunMain) 
     assert (done.code, done.out) == (0, f"{made.out} is intact; {count} pairs regenerated, bit for bit\n")
 
 
-def test_rerun_on_a_finished_dataset_does_nothing(made: HostileDataset, run_main: RunMain) -> None:
-    done = run_main(f"source.root={made.root}", f"out={made.out}", "output.pairs_per_shard=16")
-    assert (done.code, "nothing to do" in done.out) == (0, True)
-
-
 # On the terminal ------------------------------------------------------------------------------------------------------
 
 
@@ -207,11 +210,8 @@ def broken(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("verb", [(), ("plan", "--all")], ids=["a run", "plan"])
-def test_control_characters_of_names_do_not_reach_the_terminal(
-    verb: tuple[str, ...], broken: Path, run_main: RunMain
-) -> None:
-    done = run_main(*verb, f"source.root={broken}", "out=made", "n_jobs=1")
+def test_control_characters_of_names_do_not_reach_the_terminal(broken: Path, run_main: RunMain) -> None:
+    done = run_main(f"source.root={broken}", "out=made", "n_jobs=1")
     shown = (done.out + done.err).replace("\n", "")
     assert done.code in (0, 3)
     assert UNSEEN.findall(shown) == []
@@ -220,19 +220,12 @@ def test_control_characters_of_names_do_not_reach_the_terminal(
 # Folders on the command line ------------------------------------------------------------------------------------------
 
 FOLDER_NAMES = (
-    *(" a b ", "apo's", 'quo"te', "a'b\"c'", "=", "eq=ual", "a,b", "[1,2]", "{a:1}", "(x)", "$HOME", "${oc.env:HOME}"),
-    *("$(id)", "back\\slash", "trail\\", "\\'", "new\nline", "\x1b[31m", "a #b", "%41", "a: b", "-x", "true", "1e3"),
-    *("e\u0301te\u0301", "日本 😀", "\u202egnp", "\u2028", "\udcff\udcfe", "x" * 255),
-)
-
-
-QUICK_NAMES = (
-    *(" a b ", "a'b\"c'", "a,b", "[1,2]", "${oc.env:HOME}", "back\\slash", "new\nline", "-x", "true", "\udcff\udcfe"),
+    *(" a b ", "a'b\"c'", "a,b", "[1,2]", "${oc.env:HOME}", "trail\\", "new\nline", "-x", "1e3", "\udcff\udcfe"),
     "x" * 255,
 )
 
 
-@pytest.mark.parametrize("name", slow_except(QUICK_NAMES, FOLDER_NAMES), ids=ascii)
+@pytest.mark.parametrize("name", FOLDER_NAMES, ids=ascii)
 def test_folder_of_any_name_is_used_or_refused(name: str, run_main: RunMain, tmp_path: Path) -> None:
     root, out = tmp_path / name, tmp_path / f"{name[:254]}2"
     root.mkdir()
@@ -264,7 +257,7 @@ VERB_ARGUMENTS = {
     "dng": ["--keys", "0", "--clean", "--to", "dngs"],
     "again": ["out=copy", "n_jobs=1", "source.root=SOURCE"],
 }
-DATASET_NAMES = ("camera=sony_a7r,seed=1", "source.root=x", "out=2", "-x", "--to", "a b", "verify", "~x")
+DATASET_NAMES = ("camera=sony_a7r,seed=1", "-x", "verify")
 
 
 @pytest.mark.parametrize(
@@ -320,27 +313,3 @@ def check_spelling(path: str) -> None:
 @settings(max_examples=200, deadline=None)
 def test_random_names_are_encoded_harmlessly_and_decoded(path: str) -> None:
     check_spelling(path)
-
-
-@pytest.fixture(scope="module")
-def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[bytes], Path]]:
-    """Return a function that creates a folder with one file of the given name."""
-    top = tmp_path_factory.mktemp("playground")
-    count = iter(range(10**6))
-
-    def created(name: bytes) -> Path:
-        folder = top / str(next(count))
-        folder.mkdir()
-        Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).write_bytes(name)
-        return folder
-
-    yield created
-
-
-@given(PARTS.map(lambda raw: raw[:255]).filter(lambda raw: raw not in (b"", b".", b"..")))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_files_of_any_name_are_listed_and_read(playground: Callable[[bytes], Path], name: bytes) -> None:
-    root = playground(name)
-    (source,) = list_folder(str(root), ["*"], True, None).sources
-    found_again = Source(0, source.name, decode_name(source.name), source.size_bytes)
-    assert read_bytes(str(root), found_again) == name

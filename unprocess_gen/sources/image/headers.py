@@ -74,9 +74,19 @@ def probe(data: bytes) -> Header:
 
     Raises SourceError: ``empty``, ``unsupported``, ``truncated`` (within the header itself) or ``corrupt``.
     """
-    header = _header(data)
+    if not data:
+        raise SourceError("empty", "the file has 0 bytes")
+    name = next((name for name, (magic, _) in _FORMATS.items() if data.startswith(magic)), None)
+    if name is None and (heif := _HEIF.match(data)):
+        raise SourceError("unsupported", f"{'AVIF' if heif['avif'] else 'HEIC'}; convert it to JPEG, PNG or TIFF")
+    if name is None:
+        raise _unsupported(f"a file that begins with {data[:8].hex(' ')}")
+    try:
+        header = _FORMATS[name][1](data)
+    except struct.error:
+        raise SourceError("truncated", f"the {name} header points past the end of the file") from None
     if header.width < 1 or header.height < 1:
-        raise _corrupt(f"the {header.format} header declares {header.width} x {header.height} pixels")
+        raise _corrupt(f"the {name} header declares {header.width} x {header.height} pixels")
     return header
 
 
@@ -166,9 +176,7 @@ def _png(data: bytes) -> Header:
     chunks: dict[bytes, bytes] = {}
     for kind, content in _bounded(_png_chunks(data)):
         chunks.setdefault(kind, content)
-    first, width, height, bits, colour = struct.unpack_from(">4sIIBB", data, _PNG_HEAD + 4)
-    if first != b"IHDR":
-        raise _corrupt(f"the PNG file begins with {first!r}")
+    width, height, bits, colour = struct.unpack_from(">IIBB", data, _PNG_HEAD + 8)
     cicp = chunks.get(b"cICP")
     if cicp is not None and len(cicp) != 4:
         raise _corrupt(f"the cICP chunk has {len(cicp)} bytes, expected 4")
@@ -419,17 +427,3 @@ _FORMATS: dict[str, tuple[tuple[bytes, ...], Callable[[bytes], Header]]] = {
 
 _HEIF = re.compile(rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1|(?P<avif>avi[fs]))", re.DOTALL)
 """First bytes of photographs of telephones, which often have the suffix of a JPEG."""
-
-
-def _header(data: bytes) -> Header:
-    if not data:
-        raise SourceError("empty", "the file has 0 bytes")
-    name = next((name for name, (magic, _) in _FORMATS.items() if data.startswith(magic)), None)
-    if name is None and (heif := _HEIF.match(data)):
-        raise SourceError("unsupported", f"{'AVIF' if heif['avif'] else 'HEIC'}; convert it to JPEG, PNG or TIFF")
-    if name is None:
-        raise _unsupported(f"a file that begins with {data[:8].hex(' ')}")
-    try:
-        return _FORMATS[name][1](data)
-    except struct.error:
-        raise SourceError("truncated", f"the {name} header points past the end of the file") from None
