@@ -25,16 +25,13 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts,
     fill_counts_of_one_rate,
 )
-from unprocess_gen.simulation.kernels.readout import Unrounded, _normalise
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, pointer_to, pointers_of, store
 from unprocess_gen.simulation.kernels.strips import (
     SIZE,
-    STRIP,
     Buffers,
     Float32,
     Scratch,
     buffers_in,
-    locate,
     scratch_of_thread,
 )
 
@@ -106,30 +103,6 @@ def _fill_coarse(words: Words, depths: Float32, out: Float32) -> None:
     for n in range(words.size // VECTOR_WIDTH):
         x = np.uint64(n) * _WIDTH
         store(target, x, apply_signs(coarse_normal(load(depth, x)), load(given, x)))
-
-
-# Frames ---------------------------------------------------------------------------------------------------------------
-
-
-def normalised_values(values_dn: Float, black_dn: float, span_dn: float, limits_dn: tuple[float, float]) -> Float32:
-    """Return DN as the read-out of float32 frames clips and normalises them."""
-    out, padded = np.empty(values_dn.size, dtype=np.float32), np.resize(values_dn, -(-values_dn.size // STRIP) * STRIP)
-    limits, planes = np.array([[*limits_dn, np.inf, np.inf]]), np.zeros(4, dtype=np.int64)
-    readout = Unrounded(limits, np.zeros((1, 2)), False, black_dn, span_dn, 1.0, False, planes)
-    _fill_normalised(padded, readout, limits_dn, scratch_of_thread(), out)
-    return out
-
-
-@kernel
-def _fill_normalised(
-    values_dn: Float, readout: Unrounded, limits_dn: tuple[float, float], scratch: Scratch, out: Float32
-) -> None:
-    buffers, of, values = buffers_in(scratch), pointers_of(readout), pointer_to(values_dn, 0)
-    strip = locate((0, 0), 0, 0, STRIP)
-    for start in range(0, out.size, STRIP):
-        _normalise(of, pointer_to(values, start), limits_dn[0], limits_dn[1], strip, buffers.normalised)
-        for x in range(min(STRIP, out.size - start)):
-            out[start + x] = buffers.normalised[x]
 
 
 # Counts ---------------------------------------------------------------------------------------------------------------

@@ -22,7 +22,6 @@ from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.accuracy import measure, report
 from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
-from unprocess_gen.reports.timing import measure_in_turns
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.pair import make_pair, reference_pair
@@ -69,14 +68,6 @@ def test_reference_tier_uses_the_exact_table_of_the_curve(settings: Settings, mo
 
 
 # Measurement ----------------------------------------------------------------------------------------------------------
-
-
-def test_measurements_take_turns() -> None:
-    called: list[tuple[str, int]] = []
-    calls = {name: lambda number, name=name: called.append((name, number)) for name in "ab"}
-
-    assert measure_in_turns(calls, 3) == {"a": [None] * 3, "b": [None] * 3}
-    assert called == [("a", 0), ("b", 0), ("b", 1), ("a", 1), ("a", 2), ("b", 2)]
 
 
 OVERRIDES = (

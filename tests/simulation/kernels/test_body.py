@@ -80,19 +80,6 @@ def test_response_of_a_crop_equals_the_reference(
     np.testing.assert_array_equal(ours.astype(np.float64), response(physics, shape, origin))
 
 
-@pytest.mark.parametrize(
-    "patterns",
-    [Patterns(), fixed_patterns(plan_with("hot_pixels", "dead_pixels", body_key=1))],
-    ids=["effects are off", "shares are 0"],
-)
-def test_a_body_without_patterns_is_empty(patterns: Patterns) -> None:
-    found = body_of(patterns, (5, 1100), (0, 3))
-    assert found.response.steps == found.sites_dn.steps == found.defects.steps == (0, 0)
-    assert (found.response.values == 1).all()
-    assert not found.sites_dn.values.any()
-    assert not found.defects.values.any()
-
-
 def test_patterns_are_computed_once_for_all_frames_of_a_body() -> None:
     pattern = NormalPattern(5, "prnu", 0.1, 1.0, 0.0)
     first = body_of(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values
