@@ -111,8 +111,8 @@ def settings_page() -> str:
             ]
         if group == "effects":
             blocks += [EFFECTS_INTRODUCTION, _effect_numbers()]
-    for group, added in ADDED_GROUPS.items():
-        text = f"Options for {added.contents}. They are added with a plus: `+{group}=OPTION`."
+    for group, contents in ADDED_GROUPS.items():
+        text = f"Options for {contents}. They are added with a plus: `+{group}=OPTION`."
         blocks += [f"## `{group}`", text, _options(group, group_options(group), "")]
     blocks += [DISTRIBUTIONS_INTRODUCTION, _forms(DISTRIBUTION_FORMS), _not_data()]
     return page(*blocks)

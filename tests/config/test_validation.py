@@ -301,7 +301,7 @@ def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> N
         "source": ("root", "list", "max_failed"),
         "noise": ("dark_frames", "provenance"),
         "executor": ("kind", "address", "no_workers_s"),
-        "body": ("name", "missing", "replaced"),
+        "body": ("name", "missing"),
     }
     assert "executor" not in loaded
     assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)

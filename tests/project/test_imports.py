@@ -17,13 +17,12 @@ ONLY_IN = {
     "omegaconf": {
         *(
             "cli.hydra_app",
-            "config.body_composition",
             "config.composition",
             "config.composition_errors",
             "config.raw_composition",
             "config.serialization",
         ),
-        *("config.recomposition", "config.sweep_expansion"),
+        *("config.overrides", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},

@@ -19,7 +19,7 @@ import pytest
 
 import unprocess_gen as ug
 from unprocess_gen.config.composition import OptionFolders
-from unprocess_gen.config.recomposition import Recomposition, overrides_of
+from unprocess_gen.config.overrides import overrides_of
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.reports.explorer.exploration import Exploration
@@ -89,14 +89,6 @@ def test_row_of_a_dataset_opens_with_its_parameters(photos: Path, tmp_path: Path
         assert again["noisy_xxh3"] == shown.row["noisy_xxh3"]
 
 
-@pytest.fixture(scope="module")
-def composition() -> Recomposition:
-    """Settings that have been composed before, as those of a page when a control changes."""
-    composition = Recomposition()
-    composition.config([])
-    return composition
-
-
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -104,20 +96,10 @@ def composition() -> Recomposition:
         ["camera.weights=[1,2,3,4]", "split={a: 0.5, b: 0.5}", "+experiment=crvd_like", "source.clips=false"],
     ],
 )
-def test_recomposition_equals_composition(overrides: list[str], composition: Recomposition) -> None:
+def test_overrides_of_a_config_give_it_again(overrides: list[str]) -> None:
     composed = ug.load_config(overrides)
-    assert composition.config(overrides) == composed
-    if not overrides[0].startswith(("gains", "noise")):  # Hydra parses each setting: a second
-        texts = [f"{key}={text}" for key, text in overrides_of(composed).items()]
-        assert overrides_of(ug.load_config(texts)) == overrides_of(composed)
-
-
-@pytest.mark.parametrize("override", ["gains.red=-1", "camera=foo"])
-def test_recomposition_has_the_sentence_of_the_command_line(override: str, composition: Recomposition) -> None:
-    with pytest.raises(ug.ConfigError) as direct:
-        ug.load_config([override])
-    with pytest.raises(ug.ConfigError, match=re.escape(str(direct.value))):
-        composition.config([override])
+    texts = [f"{key}={text}" for key, text in overrides_of(composed).items()]
+    assert overrides_of(ug.load_config(texts)) == overrides_of(composed)
 
 
 # ------------------------------------------------------------------------------------------------------------ browser

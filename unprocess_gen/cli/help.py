@@ -69,10 +69,10 @@ def group_lines(conf: Path) -> list[tuple[str, str]]:
     for group in re.findall(r"^  - (\w+): ", (conf / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE):
         options = [name for name in group_options(group, conf) if name != "default"]
         lines.append((group, " ".join(options) or option_summary(group, "default", conf)))
-    for group, added in ADDED_GROUPS.items():
+    for group, contents in ADDED_GROUPS.items():
         options = group_options(group, conf)
         if options:
-            lines.append((group, f"{' '.join(options)} ({added.contents}; added with a plus: +{group}={options[0]})"))
+            lines.append((group, f"{' '.join(options)} ({contents}; added with a plus: +{group}={options[0]})"))
     return lines
 
 

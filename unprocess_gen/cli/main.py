@@ -11,14 +11,13 @@ import itertools
 import logging
 import os
 import re
-import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from unprocess_gen import __version__
-from unprocess_gen.cli.arguments import Verb, flag_parser, parse, path_hint
+from unprocess_gen.cli.arguments import Verb, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
 from unprocess_gen.cli.help import global_help, group_help, key_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
@@ -54,8 +53,6 @@ def run(arguments: Sequence[str]) -> int:
         print(f"unprocess_gen {__version__}")
         return 0
     prepare_libraries()
-    if len(rest) == len(arguments):
-        _refuse_late_verb(arguments)
     call = parse(verb, rest)
     values = call.values
     with logging_to("quiet" in values, "verbose" in values, values.get("log_file")):
@@ -104,17 +101,6 @@ def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:
         hint = path_hint(name) or did_you_mean(name, VERBS)
         raise ConfigError(f"{name}: no such verb; expected {', '.join(VERBS)} or settings key=value{hint}")
     return VERBS[name], rest
-
-
-def _refuse_late_verb(arguments: Sequence[str]) -> None:
-    """Refuse a verb behind settings or flags, with the order that is expected."""
-    before = arguments[: arguments.index("--")] if "--" in arguments else arguments
-    _, words = flag_parser(VERBS["generate"]).parse_known_args(before)
-    verb = next((word for word in words if word in VERBS), None)
-    if verb is not None:
-        others = list(arguments)
-        others.remove(verb)
-        raise ConfigError(f"{verb}: the verb must be the first word: {shlex.join(['gen-dataset', verb, *others])}")
 
 
 def _exit_code(step: Callable[[], int | None], arguments: Sequence[str]) -> int:

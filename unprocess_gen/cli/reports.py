@@ -15,7 +15,7 @@ from unprocess_gen.cli.hydra_app import compose
 from unprocess_gen.cli.messages import print_result
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
-from unprocess_gen.cli.sweep import plan_totals, read_table, swept_keys
+from unprocess_gen.cli.sweep import plan_totals, swept_keys
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.paths import any_path, local_path
@@ -81,11 +81,12 @@ def report(call: Call) -> int:
 
 
 def _report_sweep(folder: Path, to: Path | None, call: Call) -> int:
+    from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
     from unprocess_gen.reports.sweep_page import write_sweep_page
 
     if others := sorted(call.values.keys() & {"source.root", "noise.dark_frames"}):
         raise ConfigError(f"report: {folder}: is a sweep; {others[0]} is for one of its datasets; leave it out")
-    jobs = read_table(folder / "sweep.csv")
+    jobs = read_sweep_table(folder / SWEEP_TABLE)
     print_result(write_sweep_page(folder, jobs, swept_keys(jobs), to))
     return 0
 

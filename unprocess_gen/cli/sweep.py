@@ -10,11 +10,12 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unprocess_gen.core.errors import RESUME, DamageError
+from unprocess_gen.core.errors import RESUME
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.core.output_paths import enclosing_dataset
 from unprocess_gen.core.paths import LocalPath, local_path
+from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -112,12 +113,12 @@ def write_row(out: Path, row: Mapping[str, str]) -> None:
     """
     if not out.is_dir() or enclosing_dataset(out) is not None:  # the job was refused
         return
-    path = out / "sweep.csv"
+    path = out / SWEEP_TABLE
     with machine_errors(out, RESUME):
         lock = LockFile(out / "sweep.csv.lock")
         lock.acquire(wait=True)  # several processes may sweep into one folder
         try:
-            rows = {other["folder"]: other for other in read_table(path)}
+            rows = {other["folder"]: other for other in (read_sweep_table(path) if path.exists() else ())}
             rows[row["folder"]] = {"seconds": rows.get(row["folder"], {}).get("seconds", ""), **row}
             table = io.StringIO()
             columns = [*FIRST_COLUMNS, *swept_keys(rows.values()), *LAST_COLUMNS]
@@ -127,20 +128,6 @@ def write_row(out: Path, row: Mapping[str, str]) -> None:
             LocalPath(path).write(table.getvalue().encode(), str(out))
         finally:
             lock.release()
-
-
-def read_table(path: Path) -> list[dict[str, str]]:
-    """Read the rows of ``sweep.csv``; none if the file does not exist."""
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream, restval=""))
-    except FileNotFoundError:
-        return []
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DamageError(
-            f"{path}: no table of a sweep ({error}); expected CSV in UTF-8; move the file away and rerun"
-        ) from error
-    return [{column: text for column, text in row.items() if column} for row in rows if row.get("folder")]
 
 
 def swept_keys(rows: Iterable[Mapping[str, str]]) -> list[str]:

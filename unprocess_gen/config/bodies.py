@@ -1,4 +1,4 @@
-"""Describe what a config takes from its body, a real camera whose options fit together."""
+"""Describe what a body, a real camera whose options fit together, leaves to other options."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ NOUNS = {"camera": "colour matrix", "sensor": "set of raw levels", "noise": "noi
 
 
 def body_sentence(config: Config) -> str:
-    """Return a sentence about what a config does not take from its body; empty if it has all, or there is none."""
+    """Return a sentence about the groups for which no numbers of the body are published; empty without any."""
     body = config.body
     missing = [group for group in body.missing if group != "camera" or config.source.kind != "raw"]
     sentences = [f"no {NOUNS[group]} of it is published, so {_chosen(config, group)} applies" for group in missing]
-    if body.replaced:
-        sentences.append(f"settings that take precedence over it: {', '.join(body.replaced)}")
     return f"body={body.name}: {'; '.join(sentences)}" if body.name is not None and sentences else ""
 
 

@@ -20,7 +20,6 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
 from hydra.version import VersionBase
@@ -28,7 +27,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from unprocess_gen.config.body_composition import replaced_parts
 from unprocess_gen.config.composition_errors import explain, unknown_key
 from unprocess_gen.config.option_files import OPTIONAL_GROUPS, check_override, conf_dir
 from unprocess_gen.config.raw_composition import source_overrides
@@ -152,9 +150,7 @@ def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
     ConfigError if a key is not in the schema, an interpolation fails or a value is out of range.
     """
     with open_dict(node):
-        settings = node.pop("hydra", None) or HydraConfig.get()
-        if "body" in node:
-            node.body.replaced = replaced_parts(node, settings)
+        node.pop("hydra", None)
     config = typed_config(node, overrides)
     validate_config(config)
     return config

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
 
@@ -15,18 +14,8 @@ MAX_BRACKETS = 1000
 """Most opening brackets of one override; Hydra's parser recurses once for each level of nesting."""
 
 
-class AddedGroup(NamedTuple):
-    """Name an option of a group without settings of its own, and describe what its options contain."""
-
-    noun: str
-    contents: str
-
-
-ADDED_GROUPS = {
-    "experiment": AddedGroup("a recipe", "settings of published work"),
-    "sweep": AddedGroup("a sweep", "prepared sweeps"),
-}
-"""Groups without settings of their own: their options are added with ``+`` and are in no defaults list."""
+ADDED_GROUPS = {"experiment": "settings of published work", "sweep": "prepared sweeps"}
+"""Groups without settings of their own, with what they contain: options are added with ``+``."""
 
 OPTIONAL_GROUPS = ("body",)
 """Groups that may have no option: ``body=null``."""
@@ -85,7 +74,7 @@ def check_override(override: str) -> None:
     if len(key) > MAX_KEY_CHARACTERS:
         raise ConfigError(f"{key[:60]}…: no such key; see gen-dataset --help")
     if key in ADDED_GROUPS and not override.startswith("+"):
-        raise ConfigError(f"{override}: {ADDED_GROUPS[key].noun} is added to the settings; write +{override}")
+        raise ConfigError(f"{override}: is added to the settings; write +{override}")
     options = group_options(key) if key.isalpha() else []
     word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
     if key in OPTIONAL_GROUPS and value == "null":

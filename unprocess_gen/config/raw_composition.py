@@ -7,7 +7,6 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from unprocess_gen.config.body_composition import SENSOR_KEYS
 from unprocess_gen.config.defaults import default_options, default_values
 from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import ConfigError
@@ -23,7 +22,7 @@ NOT_APPLIED = {
 FILE_SENSOR = "sensor=source"
 """Override that takes the sensor of raw sources from their files."""
 
-SENSOR_LEVELS = tuple(f"sensor.{name}" for name in SENSOR_KEYS)
+SENSOR_LEVELS = tuple(f"sensor.{name}" for name in ("bits", "black_level_dn", "white_level_dn", "pattern"))
 
 
 def source_overrides(node: DictConfig, overrides: Sequence[str]) -> list[str]:

@@ -645,13 +645,10 @@ class BodyConfig(Group):
         name of the body
     missing
         groups for which no numbers of the body are published
-    replaced
-        settings that take precedence over those of the body, as composition finds them
     """
 
     name: Optional[str] = key(None, limits.NAME, null="no body", decides_data=False)
     missing: tuple[str, ...] = key((), limits.BODY_GROUPS, decides_data=False)
-    replaced: tuple[str, ...] = key((), Limit("a list of settings"), decides_data=False)
 
 
 @documented

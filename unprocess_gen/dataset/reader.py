@@ -316,20 +316,21 @@ def dataset_folders(path: AnyPath) -> list[AnyPath]:
 
 def sweep_folders(table: AnyPath) -> list[str]:
     """Return the names of the folders of the finished datasets of a sweep; raise as `read_sweep_table`."""
-    return [folder for folder, exit_code in read_sweep_table(table) if exit_code in FINISHED]
+    return [job["folder"] for job in read_sweep_table(table) if job["exit"] in FINISHED]
 
 
-def read_sweep_table(table: AnyPath) -> list[tuple[str, str]]:
-    """Return folder and exit code of every job of a ``sweep.csv``, of this or an older version.
+def read_sweep_table(table: AnyPath) -> list[dict[str, str]]:
+    """Return the row of every job of a ``sweep.csv``.
 
     Raises DamageError if the file cannot be read, lacks a column, or names a folder elsewhere.
     """
     try:
         with open_text(table) as stream:
-            jobs = [(row["folder"] or "", row["exit"] or "") for row in csv.DictReader(stream, strict=True)]
+            rows = csv.DictReader(stream, strict=True, restval="")
+            jobs = [{column: text for column, text in row.items() if column} for row in rows]
+        for folder in [job["folder"] for job in jobs if job["exit"] or job["folder"]]:
+            if folder in ("", "..") or Path(folder).name != folder or "\0" in folder:
+                raise ValueError(f"folder={folder[:60]!r}: expected the name of a folder next to the table")
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise DamageError(f"{table}: not the table of a sweep ({error})") from error
-    for folder, _ in jobs:
-        if folder in ("", "..") or Path(folder).name != folder or "\0" in folder:
-            raise DamageError(f"{table}: folder={folder[:60]!r}: expected the name of a folder next to the table")
     return jobs

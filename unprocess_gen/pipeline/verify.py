@@ -101,17 +101,16 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
 
     Raises DamageError if ``sweep.csv`` cannot be read or names a folder elsewhere.
     """
-    jobs = read_sweep_table(folder / SWEEP_TABLE)
-    for name, exit_code in jobs:
+    jobs = {job["folder"]: job["exit"] for job in read_sweep_table(folder / SWEEP_TABLE)}
+    for name, exit_code in jobs.items():
         dataset = folder / name
         if (dataset / "dataset.json").exists() or (dataset / "manifest.csv").exists():
             yield SweepVerification(name, tuple(verify(dataset)))
         else:
             what = f"is missing: the job ended with exit code {exit_code}; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage("dataset.json", what),))
-    listed = {name for name, _ in jobs}
     for name in sorted(path.name for path in folder.iterdir() if (path / ".work").exists()):
-        if name not in listed and not (folder / name / "dataset.json").exists():
+        if name not in jobs and not (folder / name / "dataset.json").exists():
             what = "is missing: the sweep ended before this job; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage("dataset.json", what),))
 

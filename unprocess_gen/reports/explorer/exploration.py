@@ -10,8 +10,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from unprocess_gen.config.composition import OptionFolders, composed_config
 from unprocess_gen.config.raw_validation import require_photographs
-from unprocess_gen.config.recomposition import Recomposition
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import PACKED, DarkPixels, Pair, Photograph, Plan, Row, Source, Srgb
@@ -37,11 +37,13 @@ PAIR_FOLDER = "pair"
 class Shown:
     """The pair of the settings, and what they follow from.
 
-    ``srgb`` are the pixels of its patch, ``clean`` and ``noisy`` its frames as mosaics in DN, ``saturated`` marks
-    sites of the clean one. ``keys`` identify all pairs of the image, ``lines`` are lines of ``plan`` about the noise.
+    ``choices`` are the options by group, ``srgb`` the pixels of the patch, ``clean`` and ``noisy`` the frames as
+    mosaics in DN, ``saturated`` marks sites of the clean one. ``keys`` identify all pairs of the image, ``lines`` are
+    lines of ``plan`` about the noise.
     """
 
     config: Config
+    choices: dict[str, str | None]
     srgb: Srgb
     plan: Plan
     pair: Pair
@@ -62,7 +64,7 @@ class Exploration:
     number of the source in the listing, ``part`` the rest of the key of the pair. ``digests`` are recorded by a row.
     """
 
-    composition: Recomposition
+    folders: OptionFolders
     settings: dict[str, str] = field(default_factory=dict)
     others: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
@@ -101,7 +103,7 @@ class Exploration:
 
     def shown(self) -> Shown:
         """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
-        config = self.composition.config(self.overrides)
+        config, choices = composed_config(self.overrides, self.folders)
         require_photographs(config.source, "explore")
         source = listed_sources(config.source)[self.index]
         sha256, photograph = _loaded_source(config.source, source, config.output.layout)
@@ -127,7 +129,7 @@ class Exploration:
             saturated = unpack(saturated, plan.sensor.pattern)
         lines = tuple(_plan_lines(settings, source, sha256, image, plan, pair))
         keys = tuple(parts)
-        return Shown(config, srgb, plan, pair, *frames, saturated, row, keys, lines, image.dark_folder)
+        return Shown(config, choices, srgb, plan, pair, *frames, saturated, row, keys, lines, image.dark_folder)
 
 
 def _plan_lines(

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from unprocess_gen.config.composition import OptionFolders
+from unprocess_gen.config.composition import OptionFolders, composed_config
+from unprocess_gen.config.overrides import override_text, overrides_of
 from unprocess_gen.config.raw_validation import require_photographs
-from unprocess_gen.config.recomposition import Recomposition, override_text, overrides_of
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError
@@ -34,7 +34,7 @@ def open_place(
 
     ConfigError if the place or a setting is wrong; DamageError if a manifest cannot be read.
     """
-    start = Exploration(Recomposition(folders), flags=tuple(flags))
+    start = Exploration(folders, flags=tuple(flags))
     start.add(overrides)
     if place is not None and is_dataset(place):
         return _open_rows(place, keys, start)
@@ -55,9 +55,9 @@ def _path_text(path: str) -> str:
 
 
 def _source_config(state: Exploration) -> SourceConfig:
-    config = state.composition.config(state.overrides).source
-    require_photographs(config, "explore")
-    return config
+    config, _ = composed_config(state.overrides, state.folders)
+    require_photographs(config.source, "explore")
+    return config.source
 
 
 def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Exploration:

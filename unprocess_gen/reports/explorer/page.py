@@ -69,7 +69,8 @@ class Page:
         self._other = TextInput(
             name="other", title="other settings", placeholder="source.downscale=2 output.dtype=float32"
         )
-        folders, names = self._state.composition.own_folders, itertools.chain(*SECTIONS.values())
+        names = itertools.chain(*SECTIONS.values())
+        folders = [folder for folder in (self._state.folders.own, self._state.folders.main) if folder is not None]
         self._widgets: dict[str, Any] = {name: widget(name, folders) for name in names}
 
     # -------------------------------------------------------------------------------------------------------- figures
@@ -190,7 +191,7 @@ class Page:
         self._syncing = True
         self._document.hold("combine")
         for name, control in self._widgets.items():
-            value = shown_value(name, self._state.settings, self._state.composition.choices, shown.config, shown.plan)
+            value = shown_value(name, self._state.settings, shown.choices, shown.config, shown.plan)
             if isinstance(control, Select) and value not in control.options:
                 control.options = [*control.options, value]
             if isinstance(value, float) and not control.start <= value <= control.end:

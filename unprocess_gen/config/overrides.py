@@ -1,43 +1,20 @@
-"""Compose configs one after the other, and write a config as overrides."""
+"""Write a config as the overrides from which it is composed again."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 from omegaconf import open_dict
 
-from unprocess_gen.config.composition import OptionFolders, compose_node, composed_config, load_config, typed_config
+from unprocess_gen.config.composition import compose_node, load_config, typed_config
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.serialization import recorded
 from unprocess_gen.config.values import is_number
 from unprocess_gen.core.errors import ConfigError
-
-
-class Recomposition:
-    """Compose configs one after the other from the same folders of options.
-
-    ``choices`` names the options of the last config by group.
-    """
-
-    def __init__(self, folders: OptionFolders | None = None) -> None:
-        self._folders = folders or OptionFolders()
-        self.choices: dict[str, str | None] = {}
-
-    @property
-    def own_folders(self) -> list[Path]:
-        """The user's folder of options, if there is one."""
-        return [folder for folder in (self._folders.own, self._folders.main) if folder is not None]
-
-    def config(self, overrides: Sequence[str]) -> Config:
-        """Return the config that `load_config` returns; ConfigError with the sentence of `load_config`."""
-        config, self.choices = composed_config(overrides, self._folders)
-        return config
-
 
 NAMED_GROUPS = ("camera", "noise", "scene")
 """Groups whose config contains the name of its option."""
