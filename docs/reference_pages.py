@@ -21,8 +21,8 @@ from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, 
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import REASONS
-from unprocess_gen.dataset.columns import COLUMNS, FIRST
-from unprocess_gen.simulation.effects import EFFECTS, Physics
+from unprocess_gen.dataset.columns import COLUMNS
+from unprocess_gen.simulation.effects import EFFECTS
 
 GENERATED_NOTE = "<!-- from the code: python docs/update_reference.py -->"
 
@@ -132,7 +132,7 @@ def _options(group: str, options: Iterable[str], default: str) -> str:
 def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
     """Return the table of a group's keys; ``None`` stands for the branches, which have no defaults."""
     values = {} if group is None else default_values(group)
-    head = ["key", "meaning", "default", "unit", "allowed", "since"]
+    head = ["key", "meaning", "default", "unit", "allowed"]
     rows = [
         [
             code(name),
@@ -140,7 +140,6 @@ def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
             code(value_text(values[name])) if name in values else "",
             setting.unit,
             str(setting.limit),
-            setting.since,
         ]
         for name, setting in settings.items()
     ]
@@ -177,12 +176,11 @@ def _not_data() -> str:
 COLUMNS_INTRODUCTION = """\
 # Manifest columns
 
-`manifest.csv` has one row for each pair, and one for each source that failed. The columns are in this order; later
-versions append columns. `KEY.json` in the shards contains the same values, typed, without `detail`, `source_noise_dn`
-and empty values of columns that were added after version 0.1.
+`manifest.csv` has one row for each pair, and one for each source that failed. The columns are in this order. A manifest
+lacks the columns that its settings cannot fill. `KEY.json` in the shards contains the same values, typed, without empty
+ones.
 
-An empty cell means that there is no value. Numbers are written so that they read back exactly. Columns with an asterisk
-belong to physical profiles; in rows of other profiles they are 0 or `none`."""
+An empty cell means that there is no value. Numbers are written so that they read back exactly."""
 
 REASONS_INTRODUCTION = """\
 ## Reasons for failures
@@ -195,20 +193,19 @@ def columns_page() -> str:
     """Return the page of manifest columns and reasons for failures."""
     rows = [
         [
-            code(column.name) + ("\\*" if column.of is Physics else ""),
+            code(column.name),
             column.meaning,
             column.type_name,
             column.unit,
             column.empty_if,
-            "" if column.since == FIRST else column.since,
+            column.needs.unless,
         ]
         for column in COLUMNS
     ]
     reasons = [[code(reason), meaning] for reason, meaning in REASONS.items()]
     return page(
         COLUMNS_INTRODUCTION,
-        table(["column", "meaning", "type", "unit", "empty if", "since"], rows),
-        f'A column without an entry under "since" is in datasets of version {FIRST} too.',
+        table(["column", "meaning", "type", "unit", "empty if", "left out if"], rows),
         REASONS_INTRODUCTION,
         table(["reason", "meaning"], reasons),
     )

@@ -28,7 +28,8 @@ from unprocess_gen.cli.main import run
 from unprocess_gen.config.option_files import build_names
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.types import Frame, Row
-from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.dataset.columns import COLUMN_NAMES
+from unprocess_gen.dataset.manifest import read_columns, read_rows, write_rows
 from unprocess_gen.pipeline.builds import MANIFEST, Build, read_build
 from unprocess_gen.simulation.reference.cfa import unpack
 
@@ -55,7 +56,7 @@ def non_local_means(noisy: Frame, row: Row) -> Frame:
     The transformation takes gain and variance without light from the row, so that all noise has a standard deviation
     near 1. The inverse is the closed form of Mäkitalo and Foi (IEEE Transactions on Image Processing 22, 2013).
     """
-    dark = row["b_dn2"] if row["dark_variance_dn2"] is None else row["dark_variance_dn2"]
+    dark = row["dark_variance_dn2"]
     gain, black, white = float(row["a_dn"]), int(row["black_level_dn"]), int(row["white_level_dn"])
     variance = max(float(dark or 0), 0.0) / gain**2
     light = (ug.pack(noisy, str(row["pattern"])).astype(np.float64) - black) / gain
@@ -116,13 +117,16 @@ def make(build: Build, folder: Path, pin: bool) -> None:
             raise SystemExit(code)
         return
     with rows.open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, [])  # no photograph is compared
+        write_rows(stream, [], COLUMN_NAMES)  # no photograph is compared
     if code := make_build(build, folder):
         raise SystemExit(code)
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in UNRECORDED)
     digests.write_text("".join(f"{file_sha256(path)}  {path.relative_to(folder).as_posix()}\n" for path in files))
     with rows.open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, (row for path in files if path.name == MANIFEST for row in read_rows(path)))
+        manifests = [path for path in files if path.name == MANIFEST]
+        used = set().union(*map(read_columns, manifests))
+        columns = [name for name in COLUMN_NAMES if name in used]
+        write_rows(stream, (row for path in manifests for row in read_rows(path)), columns)
 
 
 def scores_of(build: Build, folder: Path) -> list[dict[str, str]]:

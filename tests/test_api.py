@@ -184,7 +184,7 @@ def test_patches_are_refused(config: ug.Config) -> None:
 
 @pytest.mark.parametrize("call", [lambda config: ug.plan_image(SRGB, config), ug.generate])
 def test_incomplete_config_is_refused_with_advice(call: Callable[[ug.Config], object]) -> None:
-    with pytest.raises(ug.ConfigError, match=r"gains\.red=null: .*unprocess_gen\.load_config"):
+    with pytest.raises(ug.ConfigError, match=r"noise\.units=null: .*unprocess_gen\.load_config"):
         call(ug.Config())
 
 

@@ -463,18 +463,17 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
 
 
 def _check_complete(config: Config) -> None:
-    """Raise TypeError for another type, and ConfigError for ``Config()``, whose gains are in the option files."""
+    """Raise TypeError for another type, and ConfigError for ``Config()``, whose noise is in the option files."""
     if not isinstance(config, Config):
         raise TypeError(
             f"config={repr(config)[:60]}: is of type {type(config).__name__}; expected a Config; "
             "make it with unprocess_gen.load_config([…])"
         )
-    for name in ("red", "blue", "inverse_rgb"):
-        if getattr(config.gains, name) is None:
-            raise ConfigError(
-                f"gains.{name}=null: Config() lacks the values of the option files; expected a complete config; "
-                "make it with unprocess_gen.load_config(['camera=sony_a7r', 'noise=imx385_iso3200'])"
-            )
+    if config.noise.units is None:
+        raise ConfigError(
+            "noise.units=null: Config() lacks the values of a noise profile; expected a complete config; "
+            "make it with unprocess_gen.load_config(['camera=sony_a7r', 'noise=imx385_iso3200'])"
+        )
 
 
 def _downscaled(pixels: Srgb, downscale: int) -> Srgb:

@@ -17,23 +17,18 @@ from helpers.datasets import Make
 from helpers.photographs import fill
 
 from unprocess_gen import DamageError, RawPairs
-from unprocess_gen.dataset.columns import COLUMN_NAMES, HEADERS
 from unprocess_gen.dataset.dataset_json import check_dataset_json
 from unprocess_gen.dataset.manifest import (
     MAX_DETAIL,
     MAX_LINE_BYTES,
     detail_text,
     plan_from_row,
-    read_columns,
     read_row,
     read_rows,
-    row_of_values,
-    rows_of_json,
-    write_rows,
 )
 from unprocess_gen.dataset.reader import sweep_folders
 from unprocess_gen.dataset.selection import select_rows
-from unprocess_gen.dataset.shards import json_inside, read_index
+from unprocess_gen.dataset.shards import read_index
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import dataset_text, fingerprint, read_dataset
@@ -78,31 +73,17 @@ def rehash(folder: Path, **facts: Any) -> None:
     (folder / "dataset.json").write_text(dataset_text(known))
 
 
-def as_version_0_1(folder: Path) -> Path:
-    """Rewrite a dataset as version 0.1 would have written it: without the columns added since."""
-    rows = list(read_rows(folder / "manifest.csv"))
-    with (folder / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, rows, HEADERS[0])
-    rehash(folder)
-    return folder
-
-
 # Values of a manifest -------------------------------------------------------------------------------------------------
 
 HOSTILE = [
-    ("width", "-5"), ("width", "0"), ("height", "99999999999999999999"), ("height", "9" * 5000), ("width", "1.5"),
-    ("bits", "0"), ("bits", "-1"), ("bits", "64"), ("black_level_dn", "-1"), ("white_level_dn", "99999"),
-    ("white_level_dn", "240"), ("red_gain", "nan"), ("blue_gain", "inf"), ("inverse_rgb_gain", "0"),
-    ("red_gain", "-2"), ("a_dn", "nan"), ("b_dn2", "-inf"), ("gamma", "nan"), ("gamma", "0"), ("gamma", "steep"),
-    ("highlight_threshold", "1"), ("rgb2cam_00", "1e300"), ("w_sony_a7r", "2"), ("stream_key", "-1"),
-    ("stream_key", "0x1f"), ("stream_key", "1" * 17), ("seed", "9223372036854775808"), ("shard", "-1"),
-    ("shard", "1e9"),
-    ("shard", ""), ("level", "100"), ("draw", "-1"), ("frame", "4294967296"), ("patch_y", "-2"),
-    ("patch_x", "4294967296"), ("orientation", "9"), ("downscale", "0"), ("downscale", "100000"), ("tone", "steep"),
-    ("pattern", "RGBG"), ("pattern", ""), ("dtype", "object"), ("layout", "tiled"), ("status", "fine"), ("status", ""),
+    ("width", "-5"), ("height", "9" * 5000), ("width", "1.5"), ("bits", "64"), ("white_level_dn", "240"),
+    ("red_gain", "nan"), ("blue_gain", "inf"), ("a_dn", "nan"), ("b_dn2", "-inf"), ("gamma", "steep"),
+    ("rgb2cam_00", "1e300"), ("w_sony_a7r", "2"), ("stream_key", "0x1f"), ("seed", "9223372036854775808"),
+    ("shard", "1e9"), ("shard", ""), ("orientation", "9"), ("downscale", "100000"), ("pattern", "RGBG"),
+    ("pattern", ""), ("dtype", "object"), ("layout", "tiled"), ("status", "fine"), ("status", ""),
     ("exposure_ratio", "0"), ("source", "../../etc/passwd"), ("source", "/etc/passwd"), ("source", "a/../../b.png"),
     ("source", "%2E%2E/x.png"), ("source", "%2Fetc/passwd"), ("source", "a%00.png"), ("clean_xxh3", "0"),
-    ("source_bytes", "-1"), ("read_law", "cauchy"), ("body_key", "zz"), ("fixed_pattern_in_clean", "7"),
+    ("source_bytes", "-1"),
 ]  # fmt: skip
 
 
@@ -157,41 +138,7 @@ def test_offset_without_a_row_is_damage(at: int, copy: Path) -> None:
         read_row(copy / "manifest.csv", at)
 
 
-# KEY.json -------------------------------------------------------------------------------------------------------------
-
-
-def sample_json(folder: Path, **values: Any) -> bytes:
-    content = json.loads(json_inside(folder / "shards" / "shard-00000.tar")[0]) | values
-    return json.dumps({key: value for key, value in content.items() if value is not ...}).encode()
-
-
-@pytest.mark.parametrize(
-    ("values", "problem"),
-    [
-        ({"width": -1}, "width=-1: expected"), ({"width": "12"}, "width='12': expected"),
-        ({"width": 12.0}, r"width=12\.0: expected"), ({"seed": True}, "seed=True: expected"),
-        ({"red_gain": float("nan")}, "red_gain=nan: expected"), ({"red_gain": [1]}, "red_gain=list: expected"),
-        ({"source": "../x"}, r"source='\.\./x': expected"), ({"camera": None}, "camera=NoneType: expected"),
-        ({"bits": ...}, "bits is missing"), ({"others": 5}, "expected an object"),
-        ({"others": [5]}, "expected an object"),
-        ({"others": [{}]}, "key is missing"),
-    ],
-)  # fmt: skip
-def test_value_of_sample_json_is_checked(values: dict[str, Any], problem: str, original: Path) -> None:
-    with pytest.raises(DamageError, match=problem):
-        rows_of_json(sample_json(original, **values))
-
-
-@pytest.mark.parametrize("content", [b"", b"[]", b"7", b"{", b"\xff", b"[" * 200_000, b'{"key":' * 200_000])
-def test_malformed_sample_json_is_damage(content: bytes) -> None:
-    with pytest.raises(DamageError, match="the JSON of a sample cannot be read"):
-        rows_of_json(content)
-
-
-def test_sample_json_gives_the_rows_of_the_manifest(original: Path) -> None:
-    inside = [row for shard in (0, 1) for text in json_inside(original / f"shards/shard-{shard:05d}.tar")
-              for row in rows_of_json(text)]  # fmt: skip
-    assert inside == [row for row in read_rows(original / "manifest.csv") if row["status"] == "ok"]
+# Shards ---------------------------------------------------------------------------------------------------------------
 
 
 def test_member_of_negative_size_does_not_loop(tmp_path: Path) -> None:
@@ -211,6 +158,7 @@ def test_member_of_negative_size_does_not_loop(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
+        ({"format": 2}, "format: "),
         ({"pairs": -1}, "pairs: expected `int` >= 0"), ({"pairs": "3"}, "pairs: expected `int`, got `str`"),
         ({"shards": {}}, "shards: expected `array`"), ({"shards": [7]}, r"shards\[0\]: expected `object`"),
         ({"shards": [{}]}, r"shards\[0\]: object missing required field `file`"), ({"failed": []}, "failed: expected"),
@@ -257,28 +205,6 @@ def test_malformed_sweep_table_is_damage_or_empty(content: bytes, tmp_path: Path
         return
     with pytest.raises(DamageError, match="not the table of a sweep"):
         RawPairs(tmp_path)
-
-
-# Datasets of version 0.1 ----------------------------------------------------------------------------------------------
-
-
-def test_dataset_of_0_1_is_read_verified_and_replayed(copy: Path, original: Path) -> None:
-    old = as_version_0_1(copy)
-    assert read_columns(old / "manifest.csv") == HEADERS[0]
-    assert verify(old) == []
-    rows = list(read_rows(old / "manifest.csv"))
-    assert [row["detail"] for row in rows] == [""] * 4
-    assert [sample.row["key"] for sample in RawPairs(old)] == ["00000000", "00000001", "00000002"]
-    replayed = list(replay(select_rows(old / "manifest.csv", None, "0-3"), str(original.parent / "p")))
-    assert [one.complaint for one in replayed] == ["", "", ""]
-
-
-def test_committed_rows_of_0_1_are_completed(original: Path) -> None:
-    (row, *_) = read_rows(original / "manifest.csv")
-    assert row_of_values([row[name] for name in HEADERS[0]]) == row
-    assert row_of_values([row[name] for name in COLUMN_NAMES]) == row
-    with pytest.raises(ValueError, match="a row of 3 values"):
-        row_of_values([1, 2, 3])
 
 
 # Explanations of failures ---------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from helpers.records import PAIR, PATCH, PLAN, SHA256, SOURCE
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Row
+from unprocess_gen.dataset.columns import COLUMN_NAMES
 from unprocess_gen.dataset.manifest import failed_row, pair_row, write_rows
 from unprocess_gen.dataset.selection import parse_keys, select_pairs, select_rows
 
@@ -33,7 +34,7 @@ def rows() -> list[Row]:
 @pytest.fixture
 def manifest(tmp_path: Path) -> Path:
     with (tmp_path / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, rows())
+        write_rows(stream, rows(), COLUMN_NAMES)
     return tmp_path / "manifest.csv"
 
 

@@ -11,7 +11,6 @@ import subprocess
 import tarfile
 import threading
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Counts, Pair
 from unprocess_gen.dataset import shards
-from unprocess_gen.dataset.columns import COLUMNS
+from unprocess_gen.dataset.manifest import without_empty
 from unprocess_gen.dataset.shards import (
     ArrayFormat,
     Member,
@@ -47,15 +46,6 @@ def add(writer: ShardWriter, key: str, one: Pair, row_json: bytes) -> None:
 def pair(height: int, width: int, seed: int = 0) -> Pair:
     clean, noisy = np.random.default_rng(seed).integers(0, 65536, (2, height, width), dtype=np.uint16)
     return Pair(clean, noisy, COUNTS)
-
-
-def in_json(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what ``KEY.json`` holds of a row: columns that were added after 0.1 only if they are not empty."""
-    return {
-        column.name: row[column.name]
-        for column in COLUMNS
-        if column.in_json and (column.since == "0.1" or row[column.name] != column.empty)
-    }
 
 
 def written(path: Path, *pairs: Pair, json_bytes: int = 512) -> ShardWriter:
@@ -267,4 +257,4 @@ def test_the_webdataset_library_loads_a_dataset_as_it_is(dataset: Path) -> None:
         assert sample["clean.npy"].dtype == sample["noisy.npy"].dtype == np.uint16
         assert np.array_equal(sample["clean.npy"], sample_of_reader.clean)
         assert np.array_equal(sample["noisy.npy"], sample_of_reader.noisy)
-        assert sample["json"] == in_json(sample_of_reader.row)
+        assert sample["json"] == without_empty(sample_of_reader.row)

@@ -10,7 +10,7 @@ import pytest
 import unprocess_gen as ug
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
 
-ROW = {"pattern": "RGGB", "black_level_dn": 240, "white_level_dn": 4095, "a_dn": 5.0, "b_dn2": 30.0}
+ROW = {"pattern": "RGGB", "black_level_dn": 240, "white_level_dn": 4095, "a_dn": 5.0, "dark_variance_dn2": 30.0}
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -40,14 +40,8 @@ def test_noise_map_is_the_std_of_simulated_noise() -> None:
     assert measured == pytest.approx(expected, rel=5 / np.sqrt(2 * 128 * 128))  # five standard errors
 
 
-def test_noise_map_prefers_the_variance_of_all_effects_at_black() -> None:
-    assert ug.noise_std([240], ROW) == pytest.approx(np.sqrt(30))
-    assert ug.noise_std([240], ROW | {"dark_variance_dn2": 238.0}) == pytest.approx(np.sqrt(238))
-    assert ug.noise_std([240], ROW | {"dark_variance_dn2": None}) == pytest.approx(np.sqrt(30))
-
-
 def test_noise_map_is_zero_where_a_fitted_variance_is_negative() -> None:
-    assert ug.noise_std([240, 250], ROW | {"b_dn2": -30.0}).tolist() == pytest.approx([0, np.sqrt(20)])
+    assert ug.noise_std([240, 250], ROW | {"dark_variance_dn2": -30.0}).tolist() == pytest.approx([0, np.sqrt(20)])
 
 
 def test_crops_begin_at_even_sites_and_reach_both_ends() -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 import functools
+import json
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.pipeline import generate as runner
@@ -15,6 +18,18 @@ def text_rows(out: Path, name: str = "manifest.csv") -> list[dict[str, str]]:
     """Return the rows of a manifest, or of another table, as Python's csv module reads them."""
     with (out / name).open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream, strict=True))
+
+
+def samples_json(out: Path) -> dict[str, Any]:
+    """Return the JSON of every sample in the shards by key."""
+    samples: dict[str, Any] = {}
+    for path in sorted((out / "shards").iterdir()):
+        with tarfile.open(path) as shard:
+            for member in shard:
+                key, _, name = member.name.partition(".")
+                if name == "json":
+                    samples[key] = json.load(shard.extractfile(member))  # type: ignore[arg-type]
+    return samples
 
 
 sweep_rows = functools.partial(text_rows, name="sweep.csv")

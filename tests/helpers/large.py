@@ -12,7 +12,7 @@ from unprocess_gen import RawPairs
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.keys import key_text
-from unprocess_gen.dataset.manifest import row_json, write_rows
+from unprocess_gen.dataset.manifest import read_columns, row_json, write_rows
 from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.dataset.shards import ShardWriter, member_of, shard_name
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text
@@ -32,7 +32,7 @@ def write_copies(original: Path, folder: Path, pairs: int, per_shard: int) -> Pa
     (folder / "config.yaml").write_text(config, encoding="utf-8")
     shards: list[dict[str, Any]] = []
     with (folder / "manifest.csv").open("w", encoding="utf-8", newline="") as manifest:
-        write_rows(manifest, _rows(sample, folder, pairs, per_shard, shards))
+        write_rows(manifest, _rows(sample, folder, pairs, per_shard, shards), read_columns(original / "manifest.csv"))
     facts = {"pairs": pairs, "failed": {}, "sites": {}, "source": {"kind": "folder", "root": None}}
     dataset = dataset_facts(config, file_sha256(folder / "manifest.csv"), shards, facts)
     (folder / "dataset.json").write_text(dataset_text(dataset), encoding="ascii")

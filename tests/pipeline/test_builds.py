@@ -96,15 +96,6 @@ def test_difference_is_named_by_file_key_and_column(run_main: RunMain, tmp_path:
     assert "config.yaml: its SHA-256 is " in differing.err
 
 
-def test_newer_columns_of_a_manifest_are_no_difference(run_main: RunMain, recorded: Path) -> None:
-    edited(
-        recorded / f"{SMALL}.csv", lambda text: "".join(line.rpartition(",")[0] + "\n" for line in text.splitlines())
-    )
-    done = run_main("build", SMALL, "--to", "here", "n_jobs=1")
-    assert done.code == 0
-    assert "bit for bit; its manifests have columns of a later version too: " in done.out
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "complaint"),
     [

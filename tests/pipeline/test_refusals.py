@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import errno
-import hashlib
-import json
 import logging
 import os
 import resource
@@ -29,16 +27,15 @@ from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineE
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.limits import LEAST_ADDRESS_SPACE
 from unprocess_gen.core.paths import LocalPath
-from unprocess_gen.dataset.columns import HEADERS
-from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import progress as progress_module
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.tasks import RunContext
-from unprocess_gen.pipeline.verify import have_same_rows, verify, verify_sweep
-from unprocess_gen.pipeline.workspace import Workspace, dataset_facts, dataset_text, read_dataset
+from unprocess_gen.pipeline.verify import verify, verify_sweep
+from unprocess_gen.pipeline.workspace import Workspace
 
 
 @pytest.fixture(scope="module")
@@ -168,57 +165,6 @@ def test_edited_row_is_damage_and_no_changed_source(copy: Path) -> None:
     row = dict(next(read_rows(copy / "ds/manifest.csv")))
     (result,) = replay([row | {"red_gain": 1.0}], str(copy / "p"))
     assert (result.exit_code, result.source_changed) == (4, False)
-
-
-# Version 0.1 ----------------------------------------------------------------------------------------------------------
-
-
-def as_version_01(folder: Path) -> dict[str, bytes]:
-    """Rewrite a dataset as version 0.1 wrote it, without newer columns; return its files."""
-    rows = list(read_rows(folder / "manifest.csv"))
-    with (folder / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, rows, HEADERS[0])
-    facts = read_dataset(folder / "dataset.json")
-    digest = hashlib.sha256((folder / "manifest.csv").read_bytes()).hexdigest()
-    known = dataset_facts((folder / "config.yaml").read_text(), digest, facts["shards"], {})
-    (folder / "dataset.json").write_text(dataset_text(facts | known))
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_finished_01_dataset_is_complete(copy: Path, make: Make) -> None:
-    as_version_01(copy / "ds")
-    assert make(copy / "p", copy / "ds", ONE, "source.max_failed=1").made == 0
-
-
-def test_unfinished_01_run_is_resumed(
-    made: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The records of committed shards lack the newer columns; the failure was not committed yet."""
-    with monkeypatch.context() as patch:
-        patch.setattr(Workspace, "finish", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            make(made / "p", tmp_path / "ds", ONE)
-    (tmp_path / "ds/.work/rows/00003.json").unlink()
-    for path in (tmp_path / "ds/.work/rows").iterdir():
-        record = json.loads(path.read_text().partition("\n")[0])
-        rows = [row for row in read_rows(made / "ds/manifest.csv") if row["shard"] == int(path.stem)]
-        old = {"entry": record["entry"], "rows": [[row[name] for name in HEADERS[0]] for row in rows]}
-        path.write_text(json.dumps(old))
-    assert make(made / "p", tmp_path / "ds", ONE).made == 1
-    assert tree_hash(tmp_path / "ds") == tree_hash(made / "ds")
-
-
-def test_manifests_of_two_versions_have_the_same_rows(copy: Path) -> None:
-    new = copy / "new.csv"
-    shutil.copy(copy / "ds/manifest.csv", new)
-    as_version_01(copy / "ds")
-    assert have_same_rows(copy / "ds/manifest.csv", new)
-    assert not have_same_rows(new, copy / "ds/manifest.csv")
-    text = new.read_text()
-    new.write_text(text.replace(",ok,", ",failed,", 1))
-    assert not have_same_rows(copy / "ds/manifest.csv", new)
-    new.write_text(text + text.splitlines(keepends=True)[-1])
-    assert not have_same_rows(copy / "ds/manifest.csv", new)
 
 
 # Failures -------------------------------------------------------------------------------------------------------------

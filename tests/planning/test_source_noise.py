@@ -13,7 +13,6 @@ from PIL import Image
 
 from unprocess_gen.core.types import Plan, Srgb
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.shards import json_inside
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.planning.source_noise import noise_ratio, source_noise_dn, tile_noise
 from unprocess_gen.simulation.pair import reference_pair
@@ -120,11 +119,6 @@ def test_rows_of_an_image_share_its_estimate(made: Path) -> None:
     assert len(values) == 12
     assert values[:4] == values[:1] * 4 and values[4:8] == values[4:5] * 4 and values[8:] == [None] * 4
     assert float(values[4] or 0) > 4 * float(values[0] or 0) > 0
-
-
-def test_estimate_is_not_in_the_shards(made: Path) -> None:
-    for content in json_inside(made / "shards/shard-00000.tar"):
-        assert "source_noise_dn" not in json.loads(content)
 
 
 def test_scenes_have_no_estimate(make: Make, tmp_path: Path) -> None:

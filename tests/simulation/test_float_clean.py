@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make, Settings
+from helpers.datasets import Make, Settings, samples_json
 
 import unprocess_gen as ug
 from unprocess_gen import RawPairs
-from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.dataset.shards import json_inside
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 
@@ -63,8 +60,8 @@ def test_clean_frames_are_those_of_a_float32_dataset_in_every_tier(mixed: Path, 
 
 
 def test_json_names_the_dtype_of_the_clean_frame(mixed: Path, rounded: Path) -> None:
-    assert json.loads(json_inside(mixed / "shards/shard-00000.tar")[0])["clean_dtype"] == "float32"
-    assert "clean_dtype" not in json.loads(json_inside(rounded / "shards/shard-00000.tar")[0])
+    assert {sample["clean_dtype"] for sample in samples_json(mixed).values()} == {"float32"}
+    assert not any("clean_dtype" in sample for sample in samples_json(rounded).values())
 
 
 def test_every_byte_is_verified_and_every_pair_regenerated(mixed: Path, photos: Path) -> None:
@@ -92,13 +89,6 @@ def test_frames_are_developed_and_converted_to_dn(mixed: Path) -> None:
 def test_rounded_clean_frame_next_to_float32_is_refused(settings: Settings) -> None:
     with pytest.raises(ConfigError, match=r"output\.clean_dtype=uint16: .* expected float32 or null"):
         validate_config(settings("output.dtype=float32", "output.clean_dtype=uint16"))
-
-
-def test_config_yaml_omits_the_dtype_of_equal_frames(settings: Settings) -> None:
-    assert dataset_yaml(settings("output.clean_dtype=uint16")) == dataset_yaml(settings())
-    floats = "output.dtype=float32"
-    assert dataset_yaml(settings(floats, "output.clean_dtype=float32")) == dataset_yaml(settings(floats))
-    assert "clean_dtype: float32" in dataset_yaml(settings("output.clean_dtype=float32"))
 
 
 def test_patches_and_packed_planes_have_float32_clean_frames(

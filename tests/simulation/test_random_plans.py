@@ -34,8 +34,8 @@ from unprocess_gen.core.types import (
     Plan,
     Srgb,
 )
-from unprocess_gen.simulation.effects import BY_NAME, REPLACED, Physics
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
+from unprocess_gen.simulation.effects import REPLACED, Physics
 from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
@@ -43,8 +43,8 @@ from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN
 from unprocess_gen.sources.scenes import synthetic
 
-LATER = tuple(name for name, effect in BY_NAME.items() if effect.since)
-"""Effects that version 0.1 did not have."""
+SPECIAL = ("lens_shading", "gain_by_colour", "column_temporal", "dsnu")
+"""Effects whose numbers few profiles have."""
 
 T = TypeVar("T")
 
@@ -52,8 +52,8 @@ KINDS = ("gaussian", "poisson", "shot and read", "physical", "averaged")
 """Noise of a case: two numbers as one normal or as counts, a physical profile without and with all effects, and fixed
 patterns in the clean frame."""
 
-WITH_LATER_EFFECTS = ("later effects", "later effects averaged")
-"""Kinds with the effects that version 0.1 did not have; `KINDS` keep the digests of its frames."""
+WITH_SPECIAL_EFFECTS = ("special effects", "special effects averaged")
+"""Kinds with those effects too."""
 
 WITH_DARK_FRAMES = "dark frames"
 """Kind of a physical profile whose read-out noise is sampled from dark frames."""
@@ -140,8 +140,10 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
     plan = with_noise(plan, kind, dice)
     origin = dice.pick(((0, 0), *((int(dice.power(0, 13)), int(dice.power(0, 13))) for _ in range(3)), (2**20 + 1, 63)))
     srgb = drawn_image(dice, even=layout == PACKED)
-    if kind in WITH_LATER_EFFECTS:
-        plan = with_later_effects(plan, origin, (srgb.shape[0], srgb.shape[1]), Dice(f"later {kind} {dtype} {number}"))
+    if kind in WITH_SPECIAL_EFFECTS:
+        plan = with_special_effects(
+            plan, origin, (srgb.shape[0], srgb.shape[1]), Dice(f"special {kind} {dtype} {number}")
+        )
     if kind == WITH_DARK_FRAMES:
         return with_dark_frame(Case(srgb, plan, origin), Dice(f"dark {dtype} {number}"))
     return Case(srgb, plan, origin)
@@ -164,7 +166,7 @@ def with_dark_frame(one: Case, dice: Dice) -> Case:
     return replace(one, plan=plan, dark_pixels=DarkPixelsInMemory({"d" * 64: drawn.astype(np.uint16)}))
 
 
-def with_later_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:
+def with_special_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:
     """Add lens shading, gains by colour, temporal column noise and correlated rows to a plan of a physical profile."""
     assert plan.noise.physics is not None
     few_rows = origin[0] < 2**14  # correlated offsets are computed from row 0
@@ -177,7 +179,7 @@ def with_later_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, in
         dsnu_std_e=dice.at_most(40),
         frame_size=tuple(start + side + int(dice.power(0, 8)) for start, side in zip(origin, shape, strict=True)),
     )
-    on = {*plan.noise.effects, *(one for one in LATER if not dice.chance(0.3))}
+    on = {*plan.noise.effects, *(one for one in SPECIAL if not dice.chance(0.3))}
     return plan.replace(physics=physics, effects=tuple(one for one in EFFECTS if one in on))
 
 
@@ -220,7 +222,7 @@ def with_noise(plan: Plan, kind: str, dice: Dice) -> Plan:
         on = tuple(one for one in on if one != omitted)
     else:
         share = dice.pick((0.0, 0.2, 0.5))
-        on = tuple(one for one in EFFECTS if one not in LATER and not dice.chance(share))
+        on = tuple(one for one in EFFECTS if one not in SPECIAL and not dice.chance(share))
     physics = replace(physics, fixed_pattern_in_clean=kind.endswith("averaged"))
     return plan.replace(a_dn=dn_per_e, b_dn2=physics.read_std_dn * physics.read_std_dn, effects=on, physics=physics)
 
@@ -317,7 +319,7 @@ COUNTS = [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)]
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
-@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS, WITH_DARK_FRAMES))
+@pytest.mark.parametrize("kind", (*KINDS, *WITH_SPECIAL_EFFECTS, WITH_DARK_FRAMES))
 def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count: int, figure: Figure) -> None:
     failed = {}
     for number in range(count):
@@ -351,7 +353,7 @@ def mosaics(pair: Pair, one: Case) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
-@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS, WITH_DARK_FRAMES))
+@pytest.mark.parametrize("kind", (*KINDS, *WITH_SPECIAL_EFFECTS, WITH_DARK_FRAMES))
 def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, count: int) -> None:
     failed = []
     for number in range(count):

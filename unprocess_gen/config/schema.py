@@ -71,15 +71,11 @@ class RawConfig(Group):
         noise of the files themselves: variance at black
     """
 
-    pattern: Optional[str] = key(None, PATTERN, null="that of the file", since="0.3")
-    black_dn: Optional[float] = key(None, Numbers(0, 65534), unit="DN", null="that of the file", since="0.3")
-    white_dn: Optional[float] = key(None, Numbers(1, 65535), unit="DN", null="that of the file", since="0.3")
-    a_dn: Optional[float] = key(
-        None, Numbers(0, 65535), unit="DN", null="that of the tag NoiseProfile of a DNG", since="0.3"
-    )
-    b_dn2: Optional[float] = key(
-        None, Numbers(0, 65535**2), unit="DN²", null="that of the tag NoiseProfile of a DNG", since="0.3"
-    )
+    pattern: Optional[str] = key(None, PATTERN, null="that of the file")
+    black_dn: Optional[float] = key(None, Numbers(0, 65534), unit="DN", null="that of the file")
+    white_dn: Optional[float] = key(None, Numbers(1, 65535), unit="DN", null="that of the file")
+    a_dn: Optional[float] = key(None, Numbers(0, 65535), unit="DN", null="that of the tag NoiseProfile of a DNG")
+    b_dn2: Optional[float] = key(None, Numbers(0, 65535**2), unit="DN²", null="that of the tag NoiseProfile of a DNG")
 
 
 @documented
@@ -135,25 +131,27 @@ class SourceConfig(Group):
     root: Optional[str] = key(
         None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
     )
-    kind: str = key("srgb", Choice("srgb", "raw"), since="0.3")
+    kind: str = key("srgb", Choice("srgb", "raw"))
     list: Optional[str] = key(
-        None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False, since="0.3"
+        None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False
     )
     include: Optional[tuple[str, ...]] = key(
-        (), Limit("a list of at least one pattern such as '*.jpg'"), null="the suffixes of files that kind reads"
+        ("*.jpg", "*.jpeg", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
+        Limit("a list of at least one pattern such as '*.jpg'"),
+        null="the suffixes of files that kind reads",
     )
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
-    min_side: Optional[int] = key(None, Integers(1, 2**20), unit="pixels", null="images of any size", since="0.3")
+    min_side: Optional[int] = key(None, Integers(1, 2**20), unit="pixels", null="images of any size")
     max_failed: int = key(0, Integers(0, 10**9), decides_data=False)
     icc: str = key("ignore", Choice("ignore", "refuse"))
     clips: bool = key(False, limits.BOOLEAN)
     downscale: int = key(1, Integers(1, 64), unit="pixels")
     dequantize: str = key("off", limits.DEQUANTIZE)
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
-    shrink: int = key(1, Integers(1, 2), unit="sites", since="0.3")
-    own_noise: str = key("keep", Choice("keep", "subtract"), since="0.3")
+    shrink: int = key(1, Integers(1, 2), unit="sites")
+    own_noise: str = key("keep", Choice("keep", "subtract"))
     raw: RawConfig = field(default_factory=RawConfig)
 
     @property
@@ -187,9 +185,7 @@ class CameraConfig(Group):
     xyz2cam: Optional[tuple[float, ...]] = key(
         None, Limit("nine numbers of an invertible matrix"), null="a law other than custom"
     )
-    weights: Optional[tuple[float, ...]] = key(
-        None, NumberList(4, Numbers(0)), null="drawn for each image", since="0.3"
-    )
+    weights: Optional[tuple[float, ...]] = key(None, NumberList(4, Numbers(0)), null="drawn for each image")
 
 
 @documented
@@ -214,12 +210,12 @@ class GainsConfig(Group):
         light from which the gains of red and blue follow, by the matrix of the camera; scene is scene.light
     """
 
-    red: Any = key(None, limits.GAIN, null="the gain that follows from light")
-    blue: Any = key(None, limits.GAIN, null="the gain that follows from light")
-    inverse_rgb: Any = key(None, limits.INVERSE_GAIN)
+    red: Any = key(("uniform", 1.9, 2.4), limits.GAIN, null="the gain that follows from light")
+    blue: Any = key(("uniform", 1.5, 1.9), limits.GAIN, null="the gain that follows from light")
+    inverse_rgb: Any = key(("truncated_normal", 0.8, 0.1, 0.5, 1.1), limits.INVERSE_GAIN)
     highlight: str = key("per_channel", Choice("per_channel", "gray_mean", "none"))
     threshold: float = key(0.9, Numbers(0, 1, open_high=True))
-    light: Optional[str] = key(None, limits.LIGHT, null="red and blue are the gains", since="0.3")
+    light: Optional[str] = key(None, limits.LIGHT, null="red and blue are the gains")
 
 
 @documented
@@ -276,10 +272,10 @@ class SensorConfig(Group):
     white_level_dn: int = key(4095, limits.WHITE_LEVEL, unit="DN")
     pattern: str = key("RGGB", Choice("RGGB", "BGGR", "GRBG", "GBRG", "MONO"))
     clip: str = key("sensor", Choice("sensor", "black", "none"))
-    saturated: str = key("noisy", Choice("noisy", "white", "auto"))
+    saturated: str = key("auto", Choice("noisy", "white", "auto"))
     dark_offset: str = key("removed", Choice("removed", "kept"))
     units: Any = key("image", NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"))
-    levels: str = key("given", Choice("given", "source"), since="0.3")
+    levels: str = key("given", Choice("given", "source"))
 
 
 CHOSEN, PROFILE = "Chosen for a run", "Every profile"
@@ -326,7 +322,7 @@ def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
         kind = str if number.words else Any
     section, meaning = "" if number.in_branch else PHYSICAL, number.key_meaning or number.meaning
     unit = number.key_unit or ("DN of the profile" if number.unit == "DN" else number.unit)
-    return kind, key(number.key_default, limit, section, meaning=meaning, unit=unit, null=null, since=number.since)
+    return kind, key(number.key_default, limit, section, meaning=meaning, unit=unit, null=null)
 
 
 def _limit(number: Number) -> Limit:
@@ -349,7 +345,7 @@ BRANCH_FIELDS = _number_fields(in_branch=True)
 SWITCH_FIELDS: Fields = {
     effect.name: (
         Optional[str],
-        key(None, limits.SWITCH, meaning=effect.meaning, null="the value of all", since=effect.since),
+        key(None, limits.SWITCH, meaning=effect.meaning, null="the value of all"),
     )
     for effect in EFFECTS
     if effect.has_switch
@@ -481,24 +477,22 @@ class NoiseConfig(EffectGroup):
         null="the noise of the profile",
         decides_data=False,
     )
-    dark_frames_sha256: Optional[str] = key(None, limits.DIGEST, CHOSEN, null="any frames", since="0.2")
+    dark_frames_sha256: Optional[str] = key(None, limits.DIGEST, CHOSEN, null="any frames")
     dark_frames_black_dn: Optional[float] = key(
         None,
         Numbers(0, 65535),
         CHOSEN,
         unit="DN of the profile",
         null="the black level in the raw files, else the mean of the pixels without 0.01 % at each end",
-        since="0.2",
     )
     branches: tuple[BranchConfig, ...] = key((), Limit("a list of mappings with the keys of a branch"), PHYSICAL)
     assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), PHYSICAL)
-    unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), PHYSICAL, since="0.3")
+    unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), PHYSICAL)
     provenance: tuple[ProvenanceConfig, ...] = key(
         (),
         Limit("a list of mappings with the keys numbers, iso, source and uncertainty"),
         PHYSICAL,
         decides_data=False,
-        since="0.2",
     )
 
 
@@ -541,7 +535,7 @@ class SceneConfig(Group):
     exposure_s: Any = key(0.001, limits.EXPOSURE_S, unit="seconds")
     temperature_c: Any = key(25, limits.TEMPERATURE_C, unit="degrees Celsius")
     exposure_ratio: Any = key(1, limits.EXPOSURE_RATIO)
-    light: Any = key(None, limits.SCENE_LIGHT, null="not stated", since="0.3")
+    light: Any = key("daylight", limits.SCENE_LIGHT, null="not stated")
 
 
 @documented
@@ -602,11 +596,11 @@ class OutputConfig(Group):
     """
 
     dtype: str = key("uint16", Choice("uint16", "float32"))
-    clean_dtype: Optional[str] = key(None, Choice("uint16", "float32"), null="the type of dtype", since="0.2")
+    clean_dtype: Optional[str] = key(None, Choice("uint16", "float32"), null="the type of dtype")
     layout: str = key("mosaic", Choice("mosaic", "packed"))
     pairs_per_shard: int = key(8, Integers(1, 10**6))
-    targets: tuple[str, ...] = key((), limits.TARGET_NAMES, since="0.3")
-    frames: bool = key(True, limits.BOOLEAN, since="0.3")
+    targets: tuple[str, ...] = key((), limits.TARGET_NAMES)
+    frames: bool = key(True, limits.BOOLEAN)
 
 
 @documented
@@ -693,7 +687,7 @@ class Config(Group):
     body: BodyConfig = field(default_factory=BodyConfig)
     seed: int = key(0, Integers(0, 2**63 - 1))
     accuracy: str = key(EXACT, Choice(*TIERS))
-    split: Any = key(None, limits.SPLIT, null="no splits", since="0.3")
+    split: Any = key(None, limits.SPLIT, null="no splits")
     out: str = key("ds", limits.OUTPUT_PLACE, decides_data=False)
     n_jobs: int = key(-1, Integers(1, 1024, other=-1, remark=" or -1 for one per core"), decides_data=False)
     self_test: str = key("stop", Choice("stop", "go_on"), decides_data=False)

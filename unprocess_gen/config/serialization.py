@@ -16,13 +16,10 @@ import yaml
 
 from unprocess_gen.config.interpretation import (
     canonical_patch,
-    has_float_clean,
-    saturated_as,
 )
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import (
     GROUPS,
-    NESTED,
     Config,
     all_settings,
 )
@@ -82,13 +79,7 @@ def dataset_yaml(config: Config) -> str:
 def _canonical_settings(config: Config) -> dict[str, Any]:
     """Return the keys that decide the bytes of a dataset, as mappings."""
     settings: dict[str, Any] = recorded(config)
-    settings["source"] = {"kind": source_kind(config)} | settings["source"]
-    settings["sensor"]["saturated"] = saturated_as(config)
-    settings["source"]["patch"] = canonical_patch(config.source)
-    if config.gains.light != "scene":
-        settings["scene"].pop("light", None)  # decides nothing
-    if not has_float_clean(config):
-        settings["output"].pop("clean_dtype", None)
+    settings["source"] |= {"kind": source_kind(config), "patch": canonical_patch(config.source)}
     for group, keys in NUMBER_KEYS.items():
         place = functools.reduce(lambda mapping, name: mapping.get(name, {}), group.split("."), settings)
         place |= {key: _canonical(value) for key, value in place.items() if key in keys}
@@ -107,17 +98,9 @@ def recorded(group: Any) -> Any:
     mapping: dict[str, Any] = {}
     for field in dataclasses.fields(group):
         setting, value = settings.get(field.name), getattr(group, field.name)
-        if setting is None:
-            omitted = field.name in NOT_RECORDED
-        else:
-            omitted = not setting.decides_data or bool(setting.since and value == field.default)
-        if not omitted and not (field.name in _NESTED_KEYS and value == type(value)()):
+        if field.name not in NOT_RECORDED if setting is None else setting.decides_data:
             mapping[field.name] = recorded(value)
     return mapping
-
-
-_NESTED_KEYS = frozenset(group.rpartition(".")[2] for group in NESTED)
-"""Keys that are groups inside of groups; ``config.yaml`` omits them at their defaults."""
 
 
 def _canonical(value: Any) -> Any:
@@ -151,8 +134,7 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
         raise ConfigError("missing key source.kind")
     kind = loaded["source"].pop("kind")
     one_of("source.kind", kind, SOURCE_KINDS)
-    if kind == "raw":
-        loaded["source"]["kind"] = kind
+    loaded["source"]["kind"] = "raw" if kind == "raw" else "srgb"
     config = _build(Config, loaded, "")
     assert isinstance(config, Config)
     return config, str(kind)
@@ -164,8 +146,7 @@ def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
     omitted = _OMITTED.get(group, ())
     fields = {field.name: field for field in dataclasses.fields(group) if field.name not in omitted}
-    later = {name for name, setting in settings_of(group).items() if setting.since} | _NESTED_KEYS
-    missing, unknown = fields.keys() - loaded.keys() - later, loaded.keys() - fields.keys()
+    missing, unknown = fields.keys() - loaded.keys(), loaded.keys() - fields.keys()
     for problem, keys in (("missing", missing), ("unknown", unknown)):
         if keys:
             raise ConfigError(f"{problem} key {', '.join(prefix + key for key in sorted(keys))[:200]}")

@@ -31,8 +31,6 @@ class Setting:
     ``meaning`` is one sentence without a period, from the docstring of the group. ``null`` says what null means, and is
     empty if null is not allowed. ``config.yaml`` omits keys that do not decide data. ``section`` is the part of the
     group that the key belongs to.
-    ``since`` is the first version that records the key: a ``config.yaml`` without it has its default in the dataclass,
-    which is what versions before did; ``config.yaml`` omits the key at that value.
     """
 
     limit: Limit
@@ -41,7 +39,6 @@ class Setting:
     null: str = ""
     decides_data: bool = True
     section: str = ""
-    since: str = ""
 
     @property
     def allowed(self) -> str:

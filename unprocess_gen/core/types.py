@@ -24,7 +24,7 @@ Array = Frame | Srgb
 Float = NDArray[np.float64]
 
 
-NO_CLIP = "none"
+NO_CLIP = ""
 """Clip name of a photograph that does not belong to a clip."""
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.types import NO_CLIP, Frame
+from unprocess_gen.core.types import Frame
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import Place, RawPairs, dataset_folders
 
@@ -92,7 +92,7 @@ class RawClips:
         pairs = ((folder, row) for folder, row in rows if row["status"] == "ok" and split in (None, row["split"]))
         clips: dict[tuple[Any, ...], list[int]] = {}
         for number, (folder, row) in enumerate(pairs):
-            if row["clip"] != NO_CLIP:
+            if row["clip"]:
                 place = str(folder), row["clip"], row["patch"], row["level"], row["draw"]
                 clips.setdefault(place, []).append(number)
         if not clips:

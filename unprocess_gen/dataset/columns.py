@@ -15,7 +15,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.core.types import (
@@ -39,13 +39,13 @@ from unprocess_gen.core.types import (
     Value,
     gamma_text,
 )
-from unprocess_gen.simulation.effects import NUMBERS, RECORDED_NUMBERS, Physics
+from unprocess_gen.simulation.effects import NUMBERS, Physics
+
+if TYPE_CHECKING:
+    from unprocess_gen.config.schema import Config
 
 MAX_PATH = 2**15
 """Characters of the percent-encoded path of a source."""
-
-FIRST = "0.1"
-"""The version of the first manifests. Every manifest has the columns of this version."""
 
 
 def number_or_text(cell: str) -> str | int | float:
@@ -139,12 +139,56 @@ TYPE_NAMES: Mapping[Any, str] = {int: "integer", float: "number", str: "text", n
 FAILED = "the source failed"
 """Condition under which the cells of most columns are empty."""
 
-NO_FRAMES = "the source failed, or output.frames is false"
 
-NO_DARK_FRAME = "there is no dark frame"
+class Condition(NamedTuple):
+    """Settings that columns depend on.
 
-NO_RAW = "the source is not raw, or it failed"
+    Attributes
+    ----------
+    unless : str
+        Settings with which manifests do not have the columns.
+    holds : callable
+        Whether a config fills the columns.
+    by_default : bool
+        Whether cells are empty at the default of their field.
+    """
 
+    unless: str
+    holds: Callable[[Config], bool]
+    by_default: bool = False
+
+
+def _noisy_frames(config: Config) -> int:
+    """Return the number of noisy frames of each clean frame."""
+    levels = config.noise.levels
+    return int(config.noise.draws * (1 if levels is None else levels if isinstance(levels, int) else len(levels)))
+
+
+ALWAYS = Condition("", lambda config: True)
+FRAMES = Condition("output.frames is false", lambda config: config.output.frames)
+DIVIDED_LIGHT = Condition(
+    "scene.exposure_ratio is 1 or output.frames is false",
+    lambda config: config.output.frames and config.scene.exposure_ratio != 1,
+)
+FOUND_FILES = Condition("the sources are built-in scenes", lambda config: config.source.place is not None)
+RAW = Condition("source.kind is not raw", lambda config: config.source.kind == "raw", by_default=True)
+CLIPS = Condition("source.clips is false", lambda config: config.source.clips)
+PATCHES = Condition("source.patch is null", lambda config: config.source.patch is not None)
+LEVELS = Condition("each image has one noisy frame", lambda config: _noisy_frames(config) > 1)
+SPLITS = Condition("split is null", lambda config: config.split is not None, by_default=True)
+LIGHTS = Condition("gains.light is null", lambda config: config.gains.light is not None, by_default=True)
+PHYSICAL = Condition("the noise profile is not physical", lambda config: bool(config.noise.branches))
+SHADING = Condition(
+    "the noise profile has no lens_shading", lambda config: config.noise.lens_shading is not None, by_default=True
+)
+DARK_FRAMES = Condition(
+    "noise.dark_frames is null",
+    lambda config: config.noise.dark_frames is not None or config.noise.dark_frames_sha256 is not None,
+)
+FLOAT_CLEAN = Condition(
+    "clean and noisy frames have one dtype", lambda config: config.output.clean_dtype == FLOAT32 != config.output.dtype
+)
+STORED_TARGETS = Condition("output.targets is empty", lambda config: bool(config.output.targets))
 
 HEXADECIMAL = Spelling("{:016x}".format, lambda text: int(text, 16))
 LIST = Spelling(";".join, lambda text: tuple(text.split(";")) if text else ())
@@ -192,14 +236,12 @@ class Column:
         Name of that field; empty if it is the name of the column. Columns that share a field hold its items in order.
     spelling : Spelling, optional
         Conversion between field and value; None if both are the same.
-    since : str
-        First version of unprocess_gen that writes the column. Older manifests do not have it; it then reads as empty.
-    in_json : bool
-        Whether ``KEY.json`` has the column.
     unit : str
         Unit of a number; empty for text and pure numbers.
     empty_if : str
-        Condition under which the cell is empty; ``""`` if it never is.
+        When the cell is empty; ``""`` if it never is.
+    needs : Condition
+        Settings without which all cells are empty; manifests with other settings do not have the column.
     """
 
     name: str
@@ -208,10 +250,9 @@ class Column:
     of: RecordType | None = None
     field: str = ""
     spelling: Spelling | None = None
-    since: str = FIRST
-    in_json: bool = True
     unit: str = ""
     empty_if: str = FAILED
+    needs: Condition = ALWAYS
 
     @property
     def type(self) -> Callable[[str], str | int | float]:
@@ -227,13 +268,6 @@ class Column:
     def empty(self) -> Value:
         """Value of an empty cell, and of a column that a manifest does not have."""
         return "" if self.type is str else None
-
-    @property
-    def not_applicable(self) -> Value:
-        """Return the value for pairs to which the column does not apply: ``none`` or 0, empty in later columns."""
-        if self.since != FIRST:
-            return self.empty
-        return "none" if self.type is str else self.type("0")
 
     def parse(self, cell: str) -> Value:
         """Return the value of a cell; ValueError for another type, and for a value that is not allowed."""
@@ -258,8 +292,10 @@ class Column:
     def to_field(self, row: Mapping[str, Value]) -> Any:
         """Return the value of the field for a row; ValueError if the row's value is missing or not allowed."""
         value = row.get(self.name)
-        if value is None or (value == "" and self.spelling is not LIST):
-            raise ValueError(f"{self.name} is empty")
+        if value in (None, ""):
+            if self.spelling is not LIST:
+                raise ValueError(f"{self.name} is empty")
+            value = ""
         self.check(value)
         return (self.spelling.read if self.spelling else self.type)(value)  # type: ignore[arg-type]
 
@@ -269,14 +305,12 @@ def _short(value: object) -> str:
     return repr(text[:40]) if isinstance(value, str) else text[:40]
 
 
-def _columns_of_numbers(*names: str) -> Iterator[Column]:
-    """Yield the columns of numbers of effects, by the fields of `Physics`."""
-    for field_name in names:
-        number = NUMBERS[field_name]
-        allowed = OneOf((*number.words, "none")) if number.words else Range(number.lowest, number.highest)
-        since, empty_if = number.since or FIRST, number.empty_if if number.since else FAILED
+def _columns_of_numbers() -> Iterator[Column]:
+    """Yield the columns of the numbers of effects, by the fields of `Physics`."""
+    for field_name, number in NUMBERS.items():
+        allowed = OneOf(number.words) if number.words else Range(number.lowest, number.highest)
         for name, meaning in (number.columns or {field_name: number.meaning}).items():
-            yield Column(name, meaning, allowed, Physics, field_name, unit=number.unit, since=since, empty_if=empty_if)
+            yield Column(name, meaning, allowed, Physics, field_name, unit=number.unit, needs=PHYSICAL)
 
 
 COLUMNS = (
@@ -292,12 +326,24 @@ COLUMNS = (
            OneOf(("ok", "failed", "filtered")), empty_if=""),
     Column("reason", "reason of the status", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt"),
            empty_if="the status is ok"),
+    Column("detail", "explanation of the reason, one line", ANY_TEXT, empty_if="the status is ok"),
     Column("width", "width of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
     Column("height", "height of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
     Column("orientation", "EXIF orientation that was applied to the source, 1 to 8", integers(1, 8)),
     Column("shard", "number of the shard", integers(0, 10**9), empty_if=""),
     Column("seed", "seed of the run", COUNT, Plan, empty_if=""),
     Column("stream_key", "key of the image's random streams, 16 hex digits", HEX_64, Plan, spelling=HEXADECIMAL),
+    Column("split", "part of the dataset that the image belongs to",
+           Text(re.compile(r"[\w-]{1,32}", re.ASCII), "up to 32 letters, digits, _ and -"), Plan, needs=SPLITS),
+    Column("clip", "name of the clip", ANY_TEXT, Source, needs=CLIPS),
+    Column("frame", "number of the frame in its clip, from 0", COORDINATE, NoisePlan, needs=CLIPS),
+    Column("patch", "number of the patch in its image, from 0", COORDINATE, Patch, "number", needs=PATCHES),
+    Column("patch_y", "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels",
+           needs=PATCHES),
+    Column("patch_x", "first column of the arrays in the full frame; even", COORDINATE, Patch, "x", unit="pixels",
+           needs=PATCHES),
+    Column("level", "number of the noise level, from 0", integers(0, 99), NoisePlan, needs=LEVELS),
+    Column("draw", "number of the draw at this level, from 0", integers(0, 99), NoisePlan, needs=LEVELS),
     Column("camera", "convex, or the name of the camera", ANY_TEXT, CameraPlan, "name"),
     *(
         Column(f"w_{camera}", "weight of this camera in the mix; 0 if it is not part of it", SHARE, CameraPlan,
@@ -309,6 +355,9 @@ COLUMNS = (
                CameraPlan, "rgb2cam")
         for i in range(3) for j in range(3)
     ),
+    Column("light", "light from which the white-balance gains follow", ANY_TEXT, CameraPlan, needs=LIGHTS),
+    Column("cct_k", "correlated colour temperature of the light", Range(1000, 25000), CameraPlan, unit="K",
+           needs=LIGHTS),
     Column("red_gain", "forward white-balance gain of red", GAINS, CameraPlan),
     Column("blue_gain", "forward white-balance gain of blue", GAINS, CameraPlan),
     Column("inverse_rgb_gain", "inverse of the brightening gain; all channels are multiplied by it", GAINS, CameraPlan),
@@ -319,6 +368,32 @@ COLUMNS = (
            OneOf(("per_channel", "gray_mean", "none")), CameraPlan),
     Column("highlight_threshold", "linear signal above which highlights are preserved, 1 is white",
            Range(0, math.nextafter(1, 0)), CameraPlan),
+    Column("downscale", "side of the squares of source pixels that were averaged", integers(1, 64), SourcePlan,
+           unit="pixels"),
+    Column("dequantize", "dequantization of 8-bit codes: off, dither or dither_all",
+           OneOf(("off", "dither", "dither_all")), SourcePlan),
+    Column("shrink", "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
+           integers(1, 2), SourcePlan, needs=RAW),
+    Column("raw_pattern", "CFA pattern of the raw file", OneOf(("RGGB", "BGGR", "GRBG", "GBRG")), SourcePlan,
+           needs=RAW),
+    *(
+        Column(f"raw_{level}_dn", f"{level} levels of the raw file: R, G of the red rows, G of the blue rows, B, "
+               "separated by ;",
+               LEVELS_TEXT, SourcePlan, spelling=LEVEL_LIST, unit="DN of the file", needs=RAW)
+        for level in ("black", "white")
+    ),
+    Column("mosaic_xxh3", "XXH3-128 of the mosaic that the raw file was decoded to", HEX_128, SourcePlan, needs=RAW),
+    *(
+        Column(name, meaning, allowed, SourcePlan, unit=unit, empty_if=f"{FAILED}, or the file does not state it",
+               needs=RAW)
+        for name, meaning, allowed, unit in (
+            ("source_iso", "ISO of the raw file", Range(0, 1e9), ""),
+            ("source_exposure_s", "exposure time of the raw file", Range(0, 1e7), "seconds"),
+            ("own_a_dn", "noise of the raw source itself in the clean frame, whose variance is own_a_dn (x - black) + "
+             "own_b_dn2", NOT_NEGATIVE, "DN"),
+            ("own_b_dn2", "variance at black of the raw source itself in the clean frame", NOT_NEGATIVE, "DN²"),
+        )
+    ),
     Column("pattern", "CFA pattern of the top-left 2x2 sites, or MONO",
            OneOf(("RGGB", "BGGR", "GRBG", "GBRG", "MONO")), SensorPlan),
     Column("bits", "bits per sample of the sensor", integers(1, 16), SensorPlan),
@@ -326,20 +401,66 @@ COLUMNS = (
     Column("white_level_dn", "white level (saturation)", integers(1, 65535), SensorPlan, unit="DN"),
     Column("sensor_clip", "clipping of the noisy frame: sensor, black or none", OneOf(("sensor", "black", "none")),
            NoisePlan),
+    Column("saturated_as", "noisy sites whose clean site is saturated: noisy, or white where the converter ends",
+           OneOf(("noisy", "white")), NoisePlan, "saturated"),
+    Column("scene", "name of the scene", ANY_TEXT, ScenePlan, "name"),
+    Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
     Column("noise", "name of the noise profile", ANY_TEXT, NoisePlan, "name"),
+    Column("noise_law", "distribution of a two-parameter profile: gaussian or poisson", OneOf(("gaussian", "poisson")),
+           NoisePlan, "law"),
     Column("a_dn", "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Range(-1e30, 1e30),
            NoisePlan, unit="DN"),
     Column("b_dn2", "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE,
            NoisePlan, unit="DN²"),
+    Column("dark_variance_dn2", "noise variance of a site at black, by all simulated effects except hot pixels, dead "
+           "pixels and rounding; ug.noise_std uses it",
+           FINITE, unit="DN²"),
     Column("effects", "simulated effects, in order, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
-           empty_if="no effect was simulated, or the source failed"),
+           empty_if=f"{FAILED}, or no effect was simulated"),
     Column("skipped", "skipped effects, each with its reason, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
-           empty_if="no effect was skipped, or the source failed"),
+           empty_if=f"{FAILED}, or no effect was skipped"),
+    Column("assumed", "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT,
+           NoisePlan, spelling=LIST, empty_if=f"{FAILED}, or no effect uses one", needs=PHYSICAL),
     Column("accuracy", "accuracy tier", OneOf(TIERS), Plan),
-    Column("clean_xxh3", "XXH3-128 of the clean array's little-endian bytes", HEX_128, empty_if=NO_FRAMES),
-    Column("noisy_xxh3", "XXH3-128 of the noisy array's little-endian bytes", HEX_128, empty_if=NO_FRAMES),
+    Column("iso", "ISO of a physical profile", Range(0, 1e9), Physics, needs=PHYSICAL),
+    Column("exposure_s", "exposure time", Range(0, 1e7), Physics, unit="seconds", needs=PHYSICAL),
+    Column("temperature_c", "temperature of the sensor", Range(-300, 1000), Physics, unit="degrees Celsius",
+           needs=PHYSICAL),
+    *_columns_of_numbers(),
+    Column("dark_offset", "mean dark current: removed or kept", OneOf(("removed", "kept")), Physics, needs=PHYSICAL),
+    Column("sensor_unit", "camera body", ANY_TEXT, Physics, needs=PHYSICAL),
+    Column("body_key", "key of the fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL,
+           needs=PHYSICAL),
+    Column("fixed_pattern_in_clean", "1 if the clean frame has the fixed patterns too", integers(0, 1), Physics,
+           spelling=FLAG, needs=PHYSICAL),
     *(
-        Column(name, meaning, COUNT, Counts, unit="sites", empty_if=NO_FRAMES)
+        Column(f"frame_{side}", f"{side} of the full frame, to which the lens shading belongs", COORDINATE, Physics,
+               "frame_size", unit="pixels", needs=SHADING)
+        for side in ("height", "width")
+    ),
+    Column("dark_frame", "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256,
+           DarkFramePlan, "sha256", needs=DARK_FRAMES),
+    *(
+        Column(f"dark_frame_{axis}", f"first {side} of the dark frame that the full frame uses; even", COORDINATE,
+               DarkFramePlan, "shift", unit="pixels", needs=DARK_FRAMES)
+        for axis, side in (("y", "row"), ("x", "column"))
+    ),
+    Column("dark_black_dn", "black level of the dark frame", Range(0, 65535), DarkFramePlan, "black_dn",
+           unit="DN of the dark frame", needs=DARK_FRAMES),
+    Column("dark_scale", "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan, "scale",
+           needs=DARK_FRAMES),
+    Column("dtype", "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", OneOf((UINT16, FLOAT32)),
+           OutputPlan),
+    Column("layout", "layout of the arrays: mosaic, or packed planes", OneOf((MOSAIC, PACKED)), OutputPlan),
+    Column("clean_dtype", "dtype of the clean array, if it is not that of dtype", OneOf((FLOAT32,)), OutputPlan,
+           empty_if=f"{FAILED}, or the clean array has the dtype of the noisy one", needs=FLOAT_CLEAN),
+    Column("clean_xxh3", "XXH3-128 of the clean array's little-endian bytes", HEX_128, needs=FRAMES),
+    Column("noisy_xxh3", "XXH3-128 of the noisy array's little-endian bytes", HEX_128, needs=FRAMES),
+    Column("targets", f"the stored target with dtype and XXH3-128: {LINEAR_RGB}:float32:…",
+           Text(re.compile(f"({LINEAR_RGB}:float32:[0-9a-f]{{32}})?"), "name:dtype:digest of a target"),
+           needs=STORED_TARGETS),
+    *(
+        Column(name, meaning, COUNT, Counts, unit="sites", needs=FRAMES)
         for name, meaning in (
             ("clean_clipped_low", "clean sites below black before clipping"),
             ("clean_clipped_high", "clean sites above white before clipping"),
@@ -349,111 +470,20 @@ COLUMNS = (
             ("zero_variance", "sites at which the noise has no variance"),
         )
     ),
-    Column("scene", "name of the scene", ANY_TEXT, ScenePlan, "name"),
-    Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
-    Column("saturated_as", "noisy sites whose clean site is saturated: noisy, or white where the converter ends",
-           OneOf(("noisy", "white")), NoisePlan, "saturated"),
-    Column("noise_law", "distribution of a two-parameter profile: gaussian or poisson", OneOf(("gaussian", "poisson")),
-           NoisePlan, "law"),
-    Column("iso", "ISO of a physical profile", Range(0, 1e9), Physics),
-    Column("exposure_s", "exposure time", Range(0, 1e7), Physics, unit="seconds"),
-    Column("temperature_c", "temperature of the sensor", Range(-300, 1000), Physics, unit="degrees Celsius"),
-    *_columns_of_numbers(*RECORDED_NUMBERS[0]),
-    Column("dark_offset", "mean dark current: removed or kept", OneOf(("removed", "kept", "none")), Physics),
-    *_columns_of_numbers(*RECORDED_NUMBERS[1]),
-    Column("sensor_unit", "camera body", ANY_TEXT, Physics),
-    Column("body_key", "key of the fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
-    Column("fixed_pattern_in_clean", "1 if the clean frame has the fixed patterns too", integers(0, 1), Physics,
-           spelling=FLAG),
-    Column("level", "number of the noise level, from 0", integers(0, 99), NoisePlan),
-    Column("draw", "number of the draw at this level, from 0", integers(0, 99), NoisePlan),
-    Column("frame", "number of the frame in its clip, from 0", COORDINATE, NoisePlan),
-    Column("clip", "name of the clip; none for single photographs", ANY_TEXT, Source),
-    Column("downscale", "side of the squares of source pixels that were averaged", integers(1, 64), SourcePlan,
-           unit="pixels"),
-    Column("dequantize", "dequantization of 8-bit codes: off, dither or dither_all",
-           OneOf(("off", "dither", "dither_all")), SourcePlan),
-    Column("patch", "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
-    Column("patch_y", "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels"),
-    Column("patch_x", "first column of the arrays in the full frame; even", COORDINATE, Patch, "x", unit="pixels"),
-    Column("dtype", "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", OneOf((UINT16, FLOAT32)),
-           OutputPlan),
-    Column("layout", "layout of the arrays: mosaic, or packed planes", OneOf((MOSAIC, PACKED)), OutputPlan),
-    Column("detail", "explanation of the reason, one line", ANY_TEXT, since="0.2", in_json=False,
-           empty_if="the status is ok"),
-    Column("assumed", "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT,
-           NoisePlan, spelling=LIST, since="0.2", empty_if="no effect uses one"),
-    Column("clean_dtype", "dtype of the clean array, if it is not that of dtype", OneOf((FLOAT32,)), OutputPlan,
-           since="0.2", empty_if="the clean array has the dtype of the noisy one, or the source failed"),
-    *_columns_of_numbers(*RECORDED_NUMBERS[2]),
-    *(
-        Column(f"frame_{side}", f"{side} of the full frame, to which the lens shading belongs", COORDINATE, Physics,
-               "frame_size", unit="pixels", since="0.2", empty_if="there is no lens shading")
-        for side in ("height", "width")
-    ),
-    Column("source_noise_dn", "estimated noise of the source itself, in the green plane of the clean frame",
-           NOT_NEGATIVE, unit="DN", since="0.2", in_json=False,
-           empty_if="the source failed, is a built-in scene or an array, or no tile of 32 x 32 pixels is free of "
-           "clipping"),
-    Column("dark_frame", "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256,
-           DarkFramePlan, "sha256", since="0.2", empty_if=NO_DARK_FRAME),
-    *(
-        Column(f"dark_frame_{axis}", f"first {side} of the dark frame that the full frame uses; even", COORDINATE,
-               DarkFramePlan, "shift", unit="pixels", since="0.2", empty_if="there is no dark frame, or both are 0")
-        for axis, side in (("y", "row"), ("x", "column"))
-    ),
-    Column("dark_black_dn", "black level of the dark frame", Range(0, 65535), DarkFramePlan, "black_dn",
-           unit="DN of the dark frame", since="0.2",
-           empty_if="there is no dark frame, or it is 0"),
-    Column("dark_scale", "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan,
-           "scale", since="0.2", empty_if="there is no dark frame, or it is 1"),
-    Column("dark_variance_dn2", "noise variance of a site at black, by all simulated effects except hot pixels, dead "
-           "pixels and rounding; ug.noise_std uses it",
-           FINITE, unit="DN²", since="0.3", in_json=False, empty_if="the source failed"),
     Column("light_clipped_high", "sites whose light is above white before the exposure ratio divides it", COUNT, Counts,
-           unit="sites", since="0.3", in_json=False, empty_if="exposure_ratio is 1, or output.frames is false"),
-    *_columns_of_numbers(*(name for name, number in NUMBERS.items() if number.since not in ("", "0.2"))),
-    Column("split", "part of the dataset that the image belongs to",
-           Text(re.compile(r"[\w-]{1,32}", re.ASCII), "up to 32 letters, digits, _ and -"), Plan, since="0.3",
-           empty_if="there are no splits, or the source failed"),
-    Column("targets", f"the stored target with dtype and XXH3-128: {LINEAR_RGB}:float32:…",
-           Text(re.compile(f"({LINEAR_RGB}:float32:[0-9a-f]{{32}})?"), "name:dtype:digest of a target"), since="0.3",
-           empty_if="output.targets is empty, output.frames is false, or the source failed"),
-    Column("light", "light from which the white-balance gains follow", ANY_TEXT, CameraPlan, since="0.3", in_json=False,
-           empty_if="the gains follow from no light (gains.light=null), or the source failed"),
-    Column("cct_k", "correlated colour temperature of the light", Range(1000, 25000), CameraPlan, unit="K", since="0.3",
-           in_json=False, empty_if="the gains follow from no light (gains.light=null), or the source failed"),
-    Column("shrink", "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
-           integers(1, 2), SourcePlan, since="0.3", empty_if=NO_RAW),
-    Column("raw_pattern", "CFA pattern of the raw file", OneOf(("RGGB", "BGGR", "GRBG", "GBRG")), SourcePlan,
-           since="0.3", empty_if=NO_RAW),
-    *(
-        Column(f"raw_{level}_dn", f"{level} levels of the raw file: R, G of the red rows, G of the blue rows, B, "
-               "separated by ;",
-               LEVELS_TEXT, SourcePlan, spelling=LEVEL_LIST, since="0.3", unit="DN of the file", empty_if=NO_RAW)
-        for level in ("black", "white")
-    ),
-    Column("mosaic_xxh3", "XXH3-128 of the mosaic that the raw file was decoded to", HEX_128, SourcePlan, since="0.3",
-           empty_if=NO_RAW),
-    Column("source_iso", "ISO of the raw file", Range(0, 1e9), SourcePlan, since="0.3",
-           empty_if="the file states none, or the source is not raw"),
-    Column("source_exposure_s", "exposure time of the raw file", Range(0, 1e7), SourcePlan, since="0.3", unit="seconds",
-           empty_if="the file states none, or the source is not raw"),
-    Column("own_a_dn", "noise of the raw source itself in the clean frame, whose variance is own_a_dn (x - black) + "
-           "own_b_dn2",
-           NOT_NEGATIVE, SourcePlan, since="0.3", unit="DN", empty_if="it is not stated, or the source is not raw"),
-    Column("own_b_dn2", "variance at black of the raw source itself in the clean frame", NOT_NEGATIVE, SourcePlan,
-           since="0.3", unit="DN²", empty_if="it is not stated, or the source is not raw"),
+           unit="sites", empty_if=f"{FAILED}, or exposure_ratio is 1", needs=DIVIDED_LIGHT),
+    Column("source_noise_dn", "estimated noise of the source itself, in the green plane of the clean frame",
+           NOT_NEGATIVE, unit="DN", empty_if=f"{FAILED}, or no tile of 32 x 32 pixels is free of clipping",
+           needs=FOUND_FILES),
 )  # fmt: skip
-"""All columns, in the order of ``manifest.csv``. New columns are appended."""
+"""All columns, in the order of ``manifest.csv``."""
 
 COLUMN_NAMES = tuple(column.name for column in COLUMNS)
 
-HEADERS = tuple(
-    COLUMN_NAMES[: max(place for place, column in enumerate(COLUMNS) if column.since == version) + 1]
-    for version in dict.fromkeys(column.since for column in COLUMNS)
-)
-"""The header that each version wrote, oldest version first; new columns are appended, so each begins with the last."""
+
+def columns_of(config: Config) -> tuple[str, ...]:
+    """Return the names of the columns of a manifest: those that the settings can fill."""
+    return tuple(column.name for column in COLUMNS if column.needs.holds(config))
 
 
 COLUMNS_OF: dict[RecordType, dict[str, tuple[Column, ...]]] = {}

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any, Literal
 
 import msgspec
 
-from unprocess_gen.core.records import Amount, Count, Digest, check_record
+from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.records import MAX_BYTES, Amount, Count, Digest, check_record, parse_json
 from unprocess_gen.dataset.shards import shard_name
 
 
@@ -53,6 +56,7 @@ class RunFacts(msgspec.Struct, frozen=True):
 class DatasetFacts(msgspec.Struct, frozen=True):
     """Hold the contents of a ``dataset.json`` that a verb reads; None is what a repair could not restore."""
 
+    format: Literal[1]
     fingerprint: Digest
     manifest_sha256: Digest
     config_sha256: Digest
@@ -71,8 +75,36 @@ class DatasetFacts(msgspec.Struct, frozen=True):
     dark_frames: DarkFrameFacts | None = None
 
 
+FORMAT = 1
+"""Format of the datasets that this version writes and reads; the first key of ``dataset.json``."""
+
+_START = f'{{\n "format": {FORMAT},'.encode()
+
+
+class FormatError(DamageError):
+    """Dataset of another format."""
+
+
+def check_format(folder: AnyPath) -> None:
+    """Raise FormatError if the ``dataset.json`` of a folder states another format, or none."""
+    path = folder / "dataset.json"
+    with contextlib.suppress(OSError, ValueError), path.open("rb") as stream:  # `verify` reports damage
+        start = stream.read(len(_START))
+        if start != _START:
+            check_format_of(path, parse_json(start + stream.read(MAX_BYTES)))
+
+
+def check_format_of(path: AnyPath, facts: Any) -> None:
+    """Raise FormatError if the contents of a ``dataset.json`` state another format, or none."""
+    if isinstance(facts, dict) and facts.get("format") != FORMAT:
+        stated = f"format={str(facts['format'])[:40]}" if "format" in facts else "has no format"
+        raise FormatError(
+            f"{path}: {stated}; expected a dataset of format {FORMAT}; regenerate it with this version of unprocess_gen"
+        )
+
+
 def check_dataset_json(facts: Any) -> DatasetFacts:
-    """Check the types and ranges of a loaded ``dataset.json`` of this or an older version; ValueError names the key."""
+    """Check the types and ranges of a loaded ``dataset.json``; ValueError names the key."""
     checked = check_record(facts, DatasetFacts)
     for number, entry in enumerate(checked.shards):
         check_shard(number, entry)

@@ -3,10 +3,10 @@
 A row maps each column of `columns.COLUMNS` to a typed value. If a column does not apply, text is empty and a number is
 None. Floats are written in Python's shortest round-trip spelling, so a row read back gives the same plan bit for bit.
 
-The shards hold each row as JSON too. It is padded with blanks to a size that depends only on the name of the source and
-the number of pairs. Therefore the size of a shard is known before the shard is written.
+A manifest has the columns that its settings can fill (`columns.columns_of`). The shards hold each row as JSON too,
+without its empty cells.
 
-Format and compatibility: ``docs/design/dataset_format.md``.
+Format: ``docs/design/dataset_format.md``.
 """
 
 from __future__ import annotations
@@ -22,22 +22,33 @@ from typing import Any, BinaryIO, NamedTuple, TextIO, TypeVar
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.types import PLAN_PARTS, Counts, DarkFramePlan, NoisePlan, Pair, Patch, Plan, Row, Source, Value
-from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS, COLUMNS_OF, FIRST, HEADERS, Column, RecordType
+from unprocess_gen.core.types import (
+    PLAN_PARTS,
+    Counts,
+    DarkFramePlan,
+    NoisePlan,
+    Pair,
+    Patch,
+    Plan,
+    Row,
+    Source,
+    Value,
+)
+from unprocess_gen.dataset.columns import (
+    ALWAYS,
+    CLIPS,
+    COLUMNS,
+    COLUMNS_OF,
+    LEVELS,
+    PATCHES,
+    Condition,
+    RecordType,
+)
+from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.simulation.effects import Physics, dark_variance_dn2
 
 RowPart = TypeVar("RowPart")
-
-JSON_BYTES = 5632
-"""Bytes of a row's JSON without the name of its source. The longest row takes 3 less, so the next number in JSON must
-shorten another. The size decides the bytes of shards."""
-
-TARGET_JSON_BYTES = 72
-"""More bytes for each stored target: its name, dtype and digest."""
-
-RAW_JSON_BYTES = 512
-"""More bytes for a pair of a raw source: its levels, the digest of its mosaic, and what the file states."""
 
 MAX_LINE_BYTES = 2**17
 """Longest line of a manifest that is read. Paths have at most 4096 bytes, three characters each if encoded."""
@@ -97,8 +108,8 @@ def pair_row(
     Row
         Value by column, in the order of `columns.COLUMNS`.
     """
+    unused = {condition for condition, is_used in _uses(key, source, patch).items() if not is_used}
     values = {
-        "key": key,
         "status": "ok",
         "orientation": orientation,
         "clean_xxh3": digests[0],
@@ -110,7 +121,16 @@ def pair_row(
         **_cells(patch),
         **({} if pair is None else _cells(pair.counts)),
     }
-    return _row(source, sha256, shard, plan.seed, values)
+    used = {name: value for name, value in values.items() if _COLUMN[name].needs not in unused}
+    return _row(source, sha256, shard, plan.seed, {"key": key, **used})
+
+
+_COLUMN = {column.name: column for column in COLUMNS}
+
+
+def _uses(key: str, source: Source, patch: Patch) -> dict[Condition, bool]:
+    """Return whether the columns of conditions apply to a pair, as its key and its source show."""
+    return {LEVELS: "-l" in key, PATCHES: "-p" in key or any(patch.origin), CLIPS: bool(source.clip)}
 
 
 def failed_row(
@@ -167,24 +187,22 @@ _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\
 
 
 def _plan_cells(plan: Plan) -> dict[str, Value]:
-    """Return the values of all columns that hold a plan."""
-    physics = plan.noise.physics
-    cells: dict[str, Value] = {}
-    for record in (plan, plan.noise.dark, *(getattr(plan, part) for part in PLAN_PARTS)):
+    """Return the values of all columns that hold a plan; without a physical profile, or a dark frame, not theirs."""
+    noise, cells = plan.noise, dict[str, Value]()
+    for record in (plan, *(getattr(plan, part) for part in PLAN_PARTS)):
         cells |= _cells(record)
-    if physics is not None:
-        return cells | _cells(physics)
-    return cells | {column.name: column.not_applicable for column in COLUMNS if column.of is Physics}
+    if noise.physics is not None:
+        cells |= _cells(noise.physics)
+    return cells | _cells(noise.dark) if noise.dark.sha256 else cells
 
 
 def _cells(record: Any) -> dict[str, Value]:
-    """Return the values of all columns that hold a record; later columns are empty at the default of their field."""
+    """Return the values of all columns that hold a record."""
     cells: dict[str, Value] = {}
     defaults = _DEFAULTS[type(record)]
     for field, columns in COLUMNS_OF[type(record)].items():
         value = getattr(record, field)
-        if columns[0].since != FIRST and value == defaults[field]:
-            cells |= {column.name: column.empty for column in columns}
+        if columns[0].needs.by_default and value == defaults[field]:
             continue
         values = value if len(columns) > 1 else (value,)
         cells |= {column.name: column.from_field(item) for column, item in zip(columns, values, strict=True)}
@@ -208,37 +226,6 @@ def _row(source: Source, sha256: str | None, shard: int, seed: int, values: Mapp
     return {column.name: known.get(column.name, column.empty) for column in COLUMNS}
 
 
-def row_of_values(values: Sequence[Value]) -> Row:
-    """Return the row of a list of values in column order.
-
-    Parameters
-    ----------
-    values : sequence of str, int, float or None
-        One value for each column of any version.
-
-    Returns
-    -------
-    Row
-        The row; columns that were added after that version are empty, or follow from the others.
-
-    Raises
-    ------
-    ValueError
-        If no version has as many columns.
-    """
-    if len(values) not in map(len, HEADERS):
-        raise ValueError(f"a row of {len(values)} values; expected {' or '.join(map(str, map(len, HEADERS)))}")
-    known = dict(zip(COLUMN_NAMES, values, strict=False))
-    return _completed({column.name: known.get(column.name, column.empty) for column in COLUMNS})
-
-
-def _completed(row: Row) -> Row:
-    """Add the column that follows from others to a row of a version, or of a file, that lacks it."""
-    if row["status"] != "ok" or row["dark_variance_dn2"] is not None:
-        return row
-    return {**row, "dark_variance_dn2": dark_variance_dn2(plan_from_row(row))}
-
-
 def plan_from_row(row: Row) -> Plan:
     """Return the plan that a row holds.
 
@@ -258,7 +245,7 @@ def plan_from_row(row: Row) -> Plan:
         If a value is missing, of another type or not allowed.
     """
     try:
-        physics = None if row.get("read_law") == "none" else _part(row, Physics)
+        physics = None if row.get("iso") is None else _part(row, Physics)
         noise = NoisePlan(**_fields(row, NoisePlan), physics=physics, dark=_part(row, DarkFramePlan))
         parts = {name: _part(row, record) for name, record in PLAN_PARTS.items() if record is not NoisePlan}
         plan = Plan(**_fields(row, Plan), **parts, noise=noise)
@@ -287,7 +274,7 @@ def patch_from_row(row: Row) -> Patch:
         If a value is missing, of another type or not allowed.
     """
     try:
-        return _part(row, Patch)
+        return _part({"patch": 0, "patch_y": 0, "patch_x": 0, **without_empty(row)}, Patch)
     except ValueError as error:
         raise DamageError(f"row {_key_of(row)}: not a patch ({error})") from error
 
@@ -300,11 +287,12 @@ def _part(row: Row, record: type[RowPart]) -> RowPart:
 def _fields(row: Row, record: RecordType) -> dict[str, Any]:
     """Return the fields of a record from the columns that hold it; ValueError names the column.
 
-    A field is omitted, and keeps its default, if its columns are newer than the row and thus empty.
+    Cells of columns that depend on settings may be empty: the field keeps its default.
     """
     fields: dict[str, Any] = {}
     for field, columns in COLUMNS_OF[record].items():
-        if all(column.since != FIRST and row.get(column.name, column.empty) == column.empty for column in columns):
+        may_be_empty = columns[0].needs is not ALWAYS and _DEFAULTS[record][field] is not dataclasses.MISSING
+        if may_be_empty and all(row.get(column.name) in (None, "") for column in columns):
             continue
         values = tuple(column.to_field(row) for column in columns)
         fields[field] = values if len(values) > 1 else values[0]
@@ -327,27 +315,6 @@ def _key_of(row: Row) -> str:
     return str(row.get("key"))[:40]
 
 
-def check_row(row: Row) -> None:
-    """Check every value of a row.
-
-    Parameters
-    ----------
-    row : Row
-        Row from a file.
-
-    Raises
-    ------
-    ValueError
-        If a value is not allowed, or a row with status ``ok`` lacks a number or a word that its arrays depend on. The
-        sentence names the column and the value.
-    """
-    for column in COLUMNS:
-        value = row[column.name]
-        if value != column.empty:
-            column.check(value)
-    _check_together(row)
-
-
 def _check_together(row: Row) -> None:
     if not row["status"]:
         raise ValueError("status is empty")
@@ -364,7 +331,7 @@ def _check_together(row: Row) -> None:
         )
 
 
-_NEEDED_TO_PLAN = "width", "height", "shard", "level", "draw", "frame", "dtype", "layout", "pattern"
+_NEEDED_TO_PLAN = "width", "height", "shard", "dtype", "layout", "pattern"
 _NEEDED = *_NEEDED_TO_PLAN, "clean_xxh3", "noisy_xxh3"
 """Columns without which the members of a pair can neither be found nor checked."""
 
@@ -398,7 +365,7 @@ class Manifest(NamedTuple):
     header: tuple[str, ...]
 
 
-def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = COLUMN_NAMES) -> None:
+def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> None:
     r"""Write rows as CSV: ``\n`` line ends, quotes only if needed, empty cells for None.
 
     Parameters
@@ -408,7 +375,7 @@ def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = COLUM
     rows : iterable of Row
         Rows in source order.
     names : sequence of str
-        Header. `read_columns` returns the one of an older manifest, whose bytes are thereby restored.
+        Names of the columns (`columns.columns_of`).
     """
     stream.write(header_text(names))
     _write_lines(stream, rows, names)
@@ -418,13 +385,15 @@ def _write_lines(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> N
     csv.writer(stream, lineterminator="\n").writerows([_cell(row[name]) for name in names] for row in rows)
 
 
-def rows_text(rows: Iterable[Row]) -> str:
+def rows_text(rows: Iterable[Row], names: Sequence[str]) -> str:
     """Return the lines that `write_rows` writes for some rows, without the header.
 
     Parameters
     ----------
     rows : iterable of Row
         Rows in source order.
+    names : sequence of str
+        Names of the columns.
 
     Returns
     -------
@@ -432,11 +401,11 @@ def rows_text(rows: Iterable[Row]) -> str:
         One line for each row.
     """
     stream = io.StringIO()
-    _write_lines(stream, rows, COLUMN_NAMES)
+    _write_lines(stream, rows, names)
     return stream.getvalue()
 
 
-def header_text(names: Sequence[str] = COLUMN_NAMES) -> str:
+def header_text(names: Sequence[str]) -> str:
     """Return the first line of a manifest.
 
     Parameters
@@ -452,34 +421,6 @@ def header_text(names: Sequence[str] = COLUMN_NAMES) -> str:
     return ",".join(names) + "\n"
 
 
-def current_lines(lines: bytes, columns: int) -> bytes:
-    """Return lines of a manifest with a cell for each column that was added later.
-
-    Parameters
-    ----------
-    lines : bytes
-        Lines of `rows_text` that any version wrote, in UTF-8.
-    columns : int
-        Number of columns of that version.
-
-    Returns
-    -------
-    bytes
-        The lines themselves if this version has no other columns.
-
-    Raises
-    ------
-    ValueError
-        If no version has as many columns.
-    """
-    if columns == len(COLUMN_NAMES):
-        return lines
-    if columns not in map(len, HEADERS):
-        raise ValueError(f"rows of {columns} columns; expected those of a known version")
-    rows = (_completed(_typed(COLUMN_NAMES[:columns], line)) for line in lines.splitlines(keepends=True))
-    return rows_text(rows).encode()
-
-
 def _cell(value: Value) -> str:
     return "" if value is None else repr(value) if isinstance(value, float) else str(value)
 
@@ -490,7 +431,7 @@ def read_rows(path: AnyPath) -> Iterator[Row]:
     Parameters
     ----------
     path : Path or ObjectPath
-        A ``manifest.csv`` of this or an older version. Unknown columns are left out; missing newer ones are empty.
+        A ``manifest.csv``. Unknown columns are left out; those that it does not have are empty.
 
     Returns
     -------
@@ -533,7 +474,7 @@ def rows_with_offsets(path: AnyPath) -> Iterator[tuple[int, Row]]:
 
 
 def read_columns(path: AnyPath) -> tuple[str, ...]:
-    """Columns of a manifest, those unknown to this version included; DamageError if the file is no manifest."""
+    """Columns of a manifest, unknown ones included; DamageError if the file is no manifest."""
     with _opened(path) as manifest:
         return manifest.header
 
@@ -545,7 +486,7 @@ def read_row(path: AnyPath, offset: int, columns: Sequence[str] = ()) -> Row:
     ----------
     path : Path or ObjectPath
         A ``manifest.csv``.
-    at : int
+    offset : int
         Byte offset from `rows_with_offsets`.
     columns : sequence of str, optional
         The result of `read_columns`, which is read from the file if it is not given.
@@ -572,12 +513,14 @@ def read_row(path: AnyPath, offset: int, columns: Sequence[str] = ()) -> Row:
 def _opened(path: AnyPath, columns: Sequence[str] = ()) -> Iterator[Manifest]:
     """Open a manifest after its header; DamageError for everything that goes wrong until it is closed.
 
-    If ``columns`` are given, the header is not read.
+    If ``columns`` are given, neither the header nor the format of the dataset is read.
     """
+    if not columns:
+        check_format(path.parent)
     try:
         with path.open("rb") as stream:
             header = tuple(columns or _cells_of(stream.readline(MAX_LINE_BYTES + 1)))
-            missing = [column.name for column in COLUMNS if column.since == FIRST and column.name not in header]
+            missing = [column.name for column in COLUMNS if column.needs is ALWAYS and column.name not in header]
             if missing:
                 raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")
             yield Manifest(stream, header)
@@ -614,33 +557,7 @@ def _typed(header: Sequence[str], line: bytes) -> Row:
 
 
 OTHERS = "others"
-"""The key under which a sample's JSON holds the rows of all its pairs except the first."""
-
-_JSON_COLUMNS = tuple(column for column in COLUMNS if column.in_json)
-
-
-def json_size(source_name: str, pairs: int = 1, targets: int = 0, is_raw: bool = False) -> int:
-    """Return the size of a sample's JSON in the shard.
-
-    Parameters
-    ----------
-    source_name : str
-        The column ``source``.
-    pairs : int
-        Noisy frames of the sample.
-    targets : int
-        Stored targets of a pair.
-    is_raw : bool
-        Whether the source is raw.
-
-    Returns
-    -------
-    int
-        Bytes, padding included; a multiple of 512.
-    """
-    named = 2 * len(json.dumps(source_name))  # the name of its clip is a part of it, or equal to it
-    more = TARGET_JSON_BYTES * targets + RAW_JSON_BYTES * is_raw
-    return -(-(JSON_BYTES + named + more) * pairs // 512) * 512
+"""The key under which a sample's JSON holds what the rows of other pairs than the first have otherwise."""
 
 
 def row_json(rows: Sequence[Row]) -> bytes:
@@ -649,87 +566,32 @@ def row_json(rows: Sequence[Row]) -> bytes:
     Parameters
     ----------
     rows : sequence of Row
-        Rows of one clean frame, in order. Columns that are not in JSON are left out, and so are empty ones that later
-        versions added: such rows have the JSON that version 0.1 wrote.
+        Rows of one clean frame, in order.
 
     Returns
     -------
     bytes
-        ASCII, one line: the first row, with the others as a list; padded to `json_size`.
-
-    Raises
-    ------
-    ValueError
-        If the text is longer than that.
+        ASCII, one line: the cells of the first row that are not empty, and in `OTHERS` the cells of each other row that
+        differ from it.
     """
-    first, *others = (without_empty(row, _JSON_COLUMNS) for row in rows)
-    content = {**first, OTHERS: others} if others else first
-    text = json.dumps(content, separators=(",", ":")).encode("ascii")
-    is_raw, stored = bool(rows[0]["raw_pattern"]), int(bool(rows[0]["targets"]))
-    size = json_size(str(first["source"]), len(rows), stored, is_raw)
-    if len(text) >= size:
-        raise ValueError(f"row {first['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")
-    return text.ljust(size - 1) + b"\n"
+    first, *others = rows
+    content: dict[str, Any] = without_empty(first)
+    if others:
+        content[OTHERS] = [{name: row[name] for name in row if row[name] != first[name]} for row in others]
+    return json.dumps(content, separators=(",", ":")).encode("ascii") + b"\n"
 
 
-def without_empty(row: Row, columns: Sequence[Column] = COLUMNS) -> dict[str, Value]:
-    """Return the cells of a row that a file of version 0.1 would have, and those of later columns that apply.
+def without_empty(row: Row) -> dict[str, Value]:
+    """Return the cells of a row that are not empty.
 
     Parameters
     ----------
     row : Row
         A row with all columns.
-    columns : sequence of Column
-        Columns to return.
 
     Returns
     -------
     dict
         Values by the names of their columns.
     """
-    return {
-        column.name: row[column.name] for column in columns if column.since == FIRST or row[column.name] != column.empty
-    }
-
-
-def rows_of_json(content: bytes) -> list[Row]:
-    """Return the rows of a sample.
-
-    Parameters
-    ----------
-    content : bytes
-        Member ``KEY.json`` of a shard.
-
-    Returns
-    -------
-    list of Row
-        One row for each pair, with all columns.
-
-    Raises
-    ------
-    DamageError
-        If the JSON is malformed, or a value is missing, of another type or not allowed.
-    """
-    try:
-        loaded = json.loads(content)
-        if not isinstance(loaded, dict) or not isinstance(others := loaded.pop(OTHERS, []), list):
-            raise ValueError("expected an object")
-        return [_row_of_json(entry) for entry in (loaded, *others)]
-    except (ValueError, RecursionError) as error:
-        raise DamageError(f"the JSON of a sample cannot be read ({str(error)[:200]})") from error
-
-
-def _row_of_json(content: Any) -> Row:
-    if not isinstance(content, dict):
-        raise ValueError("expected an object")
-    missing = [column.name for column in _JSON_COLUMNS if column.since == FIRST and column.name not in content]
-    if missing:
-        raise ValueError(f"row {_key_of(content)}: {missing[0]} is missing")
-    row = {
-        column.name: content.get(column.name, column.empty) if column.in_json else column.empty for column in COLUMNS
-    }
-    try:
-        check_row(row)
-    except ValueError as error:
-        raise ValueError(f"row {_key_of(content)}: {error}") from None
-    return _completed(row)
+    return {name: value for name, value in row.items() if value not in (None, "")}

@@ -36,9 +36,6 @@ RECORD_BYTES = 512
 END = b"\0" * (2 * RECORD_BYTES)
 ROW = "json"
 
-MAX_JSON_BYTES = 2**27
-"""Largest JSON member that is read: the rows of 99 levels with 99 draws take half of it."""
-
 
 def member_of(name: str, level: int, draw: int) -> str:
     """Return the member, without the key, of a frame or target of a pair."""
@@ -296,23 +293,6 @@ def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tup
         rest = stream.read(len(END) + 1)
         if rest != END:
             yield "", "", "the end of the archive is missing" if len(rest) < len(END) else "something follows the end"
-
-
-def json_inside(path: Path) -> list[bytes]:
-    """Return the JSON members of an intact shard.
-
-    Raises DamageError.
-    """
-    members = [member for name, member in read_index(path).items() if name.endswith(f".{ROW}")]
-    if any(member.size > MAX_JSON_BYTES for member in members):
-        raise DamageError(f"{path}: a JSON member has more than {MAX_JSON_BYTES} bytes")
-    with path.open("rb") as stream:
-        return [_read_at(stream, member) for member in members]
-
-
-def _read_at(stream: BinaryIO, member: Member) -> bytes:
-    stream.seek(member.offset)
-    return stream.read(member.size)
 
 
 def _check_bytes(stream: BinaryIO, wanted: bytes, what: str) -> Iterator[str]:

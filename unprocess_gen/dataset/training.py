@@ -75,24 +75,31 @@ def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
     noisy : array_like
         Noisy frame, crop or planes in DN.
     row : mapping
-        Manifest row: ``black_level_dn``, ``a_dn`` and ``dark_variance_dn2``, or ``b_dn2`` in rows without that column.
+        Manifest row: ``black_level_dn``, ``a_dn`` and ``dark_variance_dn2``.
 
     Returns
     -------
     ndarray of float32, same shape
         √max(0, a_dn · (noisy - black) + dark_variance_dn2), DN. Divide by white - black for the scale of `to_light`.
 
+    Raises
+    ------
+    ValueError
+        If the row has no ``dark_variance_dn2``.
+
     Examples
     --------
     >>> import unprocess_gen as ug
-    >>> ug.noise_std([240, 340], {"black_level_dn": 240, "white_level_dn": 4095, "a_dn": 2.0, "b_dn2": 25.0}).tolist()
+    >>> row = {"black_level_dn": 240, "white_level_dn": 4095, "a_dn": 2.0, "dark_variance_dn2": 25.0}
+    >>> ug.noise_std([240, 340], row).tolist()
     [5.0, 15.0]
     """
-    dark_variance = row.get("dark_variance_dn2")
-    intercept = row["b_dn2"] if dark_variance is None else dark_variance
+    intercept = row.get("dark_variance_dn2")
+    if intercept is None:
+        raise ValueError("dark_variance_dn2 is missing from the row; expected a row of a pair, with all of its columns")
     black, _ = _levels(row)
     signal = np.asarray(noisy).astype(np.float32) - np.float32(black)
-    variance = np.float32(row["a_dn"] or 0) * signal + np.float32(intercept or 0)
+    variance = np.float32(row["a_dn"] or 0) * signal + np.float32(intercept)
     return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
 
 

@@ -10,12 +10,14 @@ from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_changes, source_root
 from unprocess_gen.pipeline.verify import have_same_rows
 
 
 def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any]) -> Config:
     """Return the settings of a dataset with ``changes``, which contain another ``out`` and the dark frames."""
+    check_format(folder)
     config, kind = read_dataset_yaml(folder / "config.yaml")
     out = any_path(changes["out"])
     if out.resolve() == any_path(folder).resolve() and (out / "dataset.json").exists():
@@ -67,4 +69,4 @@ def compare(folder: AnyPath, new_folder: AnyPath) -> str:
         raise DamageError(f"{new}: differs from {old}; check that the sources are the same")
     if old.stat().st_size == new.stat().st_size:
         return f"the same as {folder}, bit for bit"
-    return f"the same rows as {folder}, in its cells; {new} has more, of frames or of a later version"
+    return f"the same rows as {folder}, in its cells; {new} has frames too"

@@ -24,8 +24,8 @@ from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.records import check_record
 from unprocess_gen.core.suggestions import did_you_mean
 from unprocess_gen.core.types import Row
-from unprocess_gen.dataset.manifest import read_columns, read_rows
-from unprocess_gen.pipeline.verify import Damage, differing_columns, verify
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline.verify import Damage, verify
 from unprocess_gen.pipeline.workspace import REPORT
 
 MANIFEST = "manifest.csv"
@@ -110,16 +110,8 @@ class Build:
             source = [f"source.root={photographs}", f"source.include=[{names}]", "source.recursive=false"]
         return [*source, *self.recipe.overrides, *self.recipe.sweep, f"out={folder}"]
 
-    def new_columns(self, folder: Path) -> list[str]:
-        """List the columns of the datasets that are newer than the build."""
-        recorded = read_columns(self.rows_file)
-        return [name for name in read_columns(folder / self.datasets[0] / MANIFEST) if name not in recorded]
-
     def differences(self, folder: Path) -> Iterator[Damage]:
-        """Yield each difference of finished datasets from the build: file, and in manifests key and column.
-
-        A manifest may have columns that are newer than the build.
-        """
+        """Yield each difference of finished datasets from the build: file, and in manifests key and column."""
         damaged = set()
         for dataset in self.datasets:
             for damage in verify(folder / dataset):
@@ -134,7 +126,7 @@ class Build:
         yield from self._differing_cells(folder)
 
     def _differing_cells(self, folder: Path) -> Iterator[Damage]:
-        columns, rows = read_columns(self.rows_file), iter(self.rows())
+        rows = iter(self.rows())
         for dataset in self.datasets:
             file = posixpath.join(dataset, MANIFEST)
             for row in read_rows(folder / file):
@@ -142,7 +134,7 @@ class Build:
                 if not recorded:
                     yield Damage(file, "is a row that the build lacks", key)
                     continue
-                for column in differing_columns(recorded, row, columns):
+                for column in (name for name in row if row[name] != recorded[name]):
                     yield Damage(file, f"is {row[column]}, that of the build is {recorded[column]}", key, column)
         for row in rows:
             yield Damage(self.rows_file.name, "is a row that the manifests lack", str(row["key"]))

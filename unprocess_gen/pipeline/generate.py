@@ -27,6 +27,7 @@ from typing import Any
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
+from unprocess_gen.dataset.columns import columns_of
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
@@ -257,6 +258,7 @@ def _finish(workspace: Workspace, run: Run, made: Made, started: float) -> dict[
     listing = run.listing
     return workspace.finish(
         len(run.tasks()),
+        columns_of(run.config),
         lambda tally: dataset_json_facts(run.settings, listing.not_matched, listing.skipped_links, tally, facts),
     )
 

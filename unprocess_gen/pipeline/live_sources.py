@@ -17,6 +17,7 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Source, SourcePlan, Srgb, Value
+from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import (
     pair_row,
@@ -96,6 +97,7 @@ class RecordedPairs:
     def __init__(self, folder: AnyPath, root: str | None, cache: PixelCache | None, split: str | None = None) -> None:
         self.path, self.name, self._cache = folder, folder_name(folder), cache
         self._manifest = folder / "manifest.csv"
+        check_format(folder)
         config, _ = read_dataset_yaml(folder / "config.yaml")
         dark_frames = dark_frames_root(self._manifest)
         self.settings = PairSettings.read(replaced(config, {"noise.dark_frames": dark_frames}))

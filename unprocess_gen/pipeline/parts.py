@@ -23,6 +23,7 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import RESUME, ConfigError, MachineError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import any_path
+from unprocess_gen.dataset.columns import columns_of
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.frozen_run import FrozenRun, freeze_run, read_plan, recorded_plan
 from unprocess_gen.pipeline.generate import Summary, begin, dataset_json_facts, follow, images_in
@@ -185,6 +186,7 @@ def merge(out: str) -> tuple[Summary, int]:
         plan, parts = run.plan, run.plan.parts
         facts = workspace.finish(
             plan.shards,
+            columns_of(run.config),
             lambda tally: dataset_json_facts(settings, plan.not_matched, plan.skipped_links, tally, {"parts": parts}),
         )
     summary = Summary.of(out, facts, started)

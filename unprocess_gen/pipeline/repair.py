@@ -22,6 +22,8 @@ from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, So
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.core.types import Array, Row
+from unprocess_gen.dataset.columns import columns_of
+from unprocess_gen.dataset.dataset_json import FormatError
 from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import has_frames, read_rows, write_rows
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, check_members, shard_name
@@ -59,6 +61,8 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
         manifest, dataset = folder / "manifest.csv", folder / "dataset.json"
         try:
             facts: dict[str, Any] = read_dataset(dataset)
+        except FormatError:
+            raise
         except DamageError:
             facts = {}
             _check_proof(folder)
@@ -113,7 +117,8 @@ def _restore_manifest(storage: Storage, config: Config, sha256: str) -> None:
     run, part = resolve(config), storage.scratch / "manifest.csv"
     context = RunContext(run.settings, str(storage.scratch), os.getpid())
     with part.open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, (row for task in run.tasks() for row in _rows_of_shard(context, task)))
+        rows = (row for task in run.tasks() for row in _rows_of_shard(context, task))
+        write_rows(stream, rows, columns_of(run.config))
     if file_sha256(part) != sha256:
         raise SourceChangedError(
             f"{storage.out}/manifest.csv: the regenerated one has another SHA-256: a source was changed, added or "

@@ -24,7 +24,7 @@ from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.core.types import NO_CLIP, Photograph, Plan, Row, Source, SourcePlan
+from unprocess_gen.core.types import Photograph, Plan, Row, Source, SourcePlan
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import (
@@ -327,5 +327,5 @@ def source_of(row: Row) -> Source:
     """Return the source that a row was made from."""
     name, size = str(row["source"]), row["source_bytes"]
     path = decode_name(name)
-    clip, frame = str(row["clip"]) or NO_CLIP, int(row["frame"] or 0)
-    return Source(int(image_key(row)), name, path, size if isinstance(size, int) else None, clip=clip, frame=frame)
+    size, frame = size if isinstance(size, int) else None, int(row["frame"] or 0)
+    return Source(int(image_key(row)), name, path, size, clip=str(row["clip"]), frame=frame)

@@ -6,7 +6,7 @@
     .work/deaths/00000-NAME     an attempt to make a shard in a run without a coordinator
 
 A process that generates some of the shards reads only the files of their sources. A resumed run compares its own
-listing with the record. Version 0.1 recorded name, size and digest of all sources in ``.work/sources.json``.
+listing with the record.
 
 A worker puts a shard in place first and its record second, so the record is the commit: a shard with a record is
 complete. Any number of writers may commit the same shard, because all of them make the same bytes.
@@ -33,9 +33,8 @@ import msgspec
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.records import Count, Digest, check_record, parse_record
 from unprocess_gen.core.types import Source
-from unprocess_gen.dataset.columns import COLUMN_NAMES
 from unprocess_gen.dataset.dataset_json import ShardFacts, check_shard
-from unprocess_gen.dataset.manifest import current_lines, row_of_values, rows_text
+from unprocess_gen.dataset.manifest import rows_text
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.storage import WORK, Storage
 from unprocess_gen.pipeline.tasks import ShardReport, ShardResult, Tally
@@ -46,10 +45,8 @@ PER_FILE = 4096
 """Sources in a file of the record."""
 
 INDEX = f"{WORK}/listing.json"
-OLD_LISTING = f"{WORK}/sources.json"
 
 _FIELDS = tuple(field.name for field in fields(Source))
-_OldSource = tuple[str, Count | None, str | None]
 
 
 class ListingIndex(msgspec.Struct, frozen=True):
@@ -124,13 +121,10 @@ class RecordedListing:
 
 
 def recorded_sources(storage: Storage) -> Iterator[Source]:
-    """Yield every recorded source, from version 0.1 with name, size and digest only; nothing without a record."""
+    """Yield every recorded source; nothing without a record."""
     if (storage / INDEX).is_listed():
         listing = RecordedListing(storage)
         yield from listing.sources(0, listing.count)
-    elif (storage / OLD_LISTING).is_listed():
-        rows = storage.record(OLD_LISTING, lambda content: parse_record(content, list[_OldSource]))
-        yield from (Source(index, name, name, size, sha256=sha256) for index, (name, size, sha256) in enumerate(rows))
 
 
 # -------------------------------------------------------------------------------------------------------------- shards
@@ -139,17 +133,19 @@ ROWS = f"{WORK}/rows"
 """Folder of the records of shards."""
 
 
-def commit_shard(storage: Storage, result: ShardResult) -> ShardReport:
-    """Put a finished shard in place, then its record, and describe it; raise OSError if the storage fails."""
+def commit_shard(storage: Storage, result: ShardResult, columns: Sequence[str]) -> ShardReport:
+    """Put a finished shard in place, then its record, and describe it; raise OSError if the storage fails.
+
+    ``columns`` are those of the manifest.
+    """
     if result.path is not None:
         (storage / f"shards/{shard_name(result.shard)}").commit(Path(result.path))
     report = result.report()
-    csv = rows_text(result.rows)
+    csv = rows_text(result.rows, columns)
     facts = {
         "entry": result.entry(),
         "report": [report.images, report.failed, report.rows, report.frame_sizes],
         "tally": Tally.of(result.rows).facts(),
-        "columns": len(COLUMN_NAMES),
         "csv_bytes": len(csv.encode()),
     }
     storage.write(record_name(result.shard), json.dumps(facts, separators=(",", ":")) + "\n" + csv)
@@ -157,14 +153,12 @@ def commit_shard(storage: Storage, result: ShardResult) -> ShardReport:
 
 
 class _ShardFacts(msgspec.Struct, frozen=True):
-    """Hold the first line of a record; version 0.1 recorded the values of rows instead of lines."""
+    """Hold the first line of a record."""
 
     entry: dict[str, Any]
-    report: tuple[Count, Count, Count, list[tuple[str, Count, Count]]] = (0, 0, 0, [])
-    tally: Tally = msgspec.field(default_factory=Tally)
-    columns: Count = 0
-    csv_bytes: Count = 0
-    rows: list[list[str | int | float | None]] | None = None
+    report: tuple[Count, Count, Count, list[tuple[str, Count, Count]]]
+    tally: Tally
+    csv_bytes: Count
 
 
 class ShardRecord(NamedTuple):
@@ -199,15 +193,11 @@ def _parse_facts(shard: int, content: bytes) -> tuple[_ShardFacts, bytes]:
 
 
 def _parse_shard(shard: int, content: bytes) -> ShardRecord:
-    """Parse a record of this or an older version; ValueError if it is none."""
+    """Parse a record; ValueError if it is none."""
     facts, csv = _parse_facts(shard, content)
-    if facts.rows is not None:
-        rows = tuple(row_of_values(values) for values in facts.rows)
-        report = ShardResult(shard, None, 0, None, rows).report()
-        return ShardRecord(facts.entry, report, Tally.of(rows), rows_text(rows).encode())
     images, failed, pairs, sizes = facts.report
     report = ShardReport(shard, images, failed, pairs, tuple(sizes))
-    return ShardRecord(facts.entry, report, facts.tally, current_lines(csv, facts.columns))
+    return ShardRecord(facts.entry, report, facts.tally, csv)
 
 
 def record_name(shard: int) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import NO_CLIP, Counts, Row, Source
+from unprocess_gen.core.types import Counts, Row, Source
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.manifest import has_frames
 from unprocess_gen.dataset.shards import shard_name
@@ -201,7 +201,7 @@ class ShardResult:
         clips = {
             (str(row["clip"]), int(row["width"] or 0), int(row["height"] or 0)): None
             for row in self.rows
-            if row["status"] == "ok" and row["clip"] != NO_CLIP and row["patch"] == 0
+            if row["status"] == "ok" and row["clip"] and not row["patch"]
         }
         failed = [row for row in images if row["status"] == "failed"]
         details = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in failed[:FAILURES_SHOWN]]

@@ -22,8 +22,9 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.types import Row, Value
+from unprocess_gen.dataset.dataset_json import FormatError
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
-from unprocess_gen.dataset.manifest import has_frames, read_columns, read_rows, row_json
+from unprocess_gen.dataset.manifest import has_frames, read_rows, row_json, without_empty
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 from unprocess_gen.dataset.shards import (
     ExpectedFrame,
@@ -79,6 +80,8 @@ def _verify(folder: AnyPath) -> list[Damage]:
             facts = read_dataset(folder / "dataset.json")
         else:
             damages.append(Damage("dataset.json", "is missing"))
+    except FormatError:
+        raise
     except DamageError as error:
         damages.append(Damage("dataset.json", _without_path(error)))
     damages += _check_files(folder, facts)
@@ -116,32 +119,16 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
 
 
 def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
-    """Check whether a new manifest has the rows of an older one, in every column that the older one has.
+    """Check whether a new manifest has the rows of an older one, in every cell that is not empty there.
 
     Raises DamageError if a manifest cannot be read.
     """
     with suppress(OSError):  # reported below
         if file_sha256(old) == file_sha256(new):
             return True
-    names, no_row = read_columns(old), dict[str, Value]()
-    if not set(names) <= set(read_columns(new)):
-        return False
-    for row, other in itertools.zip_longest(read_rows(old), read_rows(new), fillvalue=no_row):
-        if differing_columns(row, other, names):
-            return False
-    return True
-
-
-def differing_columns(old: Row, new: Row, names: Iterable[str]) -> list[str]:
-    """List the columns in which a row differs from an older one.
-
-    Empty cells of an older row without frames are not compared. The reason ``too_small`` was ``unsupported`` up to
-    version 0.2.
-    """
-    if old.get("status") == "ok" and not has_frames(old):
-        names = [name for name in names if old.get(name) not in (None, "")]
-    renamed = (old.get("reason"), new.get("reason")) == ("unsupported", "too_small")
-    return [name for name in names if old.get(name) != new.get(name) and not (name == "reason" and renamed)]
+    no_row = dict[str, Value]()
+    rows = itertools.zip_longest(read_rows(old), read_rows(new), fillvalue=no_row)
+    return all(row and without_empty(row).items() <= other.items() for row, other in rows)
 
 
 def _without_path(error: DamageError) -> str:

@@ -23,6 +23,7 @@ from unprocess_gen.core.errors import RESUME, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error, machine_errors
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Plan, Row, Source
+from unprocess_gen.dataset.columns import columns_of
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, has_frames, pair_row, row_json
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
@@ -53,16 +54,16 @@ def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
 
     If deaths are counted and `run_records.MAX_DEATHS` workers have died at the shard, commit provisional rows.
     """
-    storage = Storage(context.config.out)
+    storage, columns = Storage(context.config.out), columns_of(context.config)
     with machine_errors(any_path(context.config.out), RESUME):
         if not context.counts_deaths:
-            return commit_shard(storage, make_shard(context, task))
+            return commit_shard(storage, make_shard(context, task), columns)
         deaths = Deaths(storage, task.shard)
         if deaths.count >= MAX_DEATHS:
             report = commit_provisional(context, task, deaths.source(task.sources), MAX_DEATHS)
         else:
             with deaths.marked() as mark:
-                report = commit_shard(storage, make_shard(context, task, mark))
+                report = commit_shard(storage, make_shard(context, task, mark), columns)
         deaths.forget()
         return report
 
@@ -79,7 +80,7 @@ def commit_provisional(context: RunContext, task: ShardTask, source: Source, dea
     rows = tuple(failed_row(lost, None, task.shard, seed, "worker_died", detail) for lost in task.sources)
     result = ShardResult(task.shard, None, 0, None, rows, killer=f"{source.name}: {in_progress}")
     with machine_errors(any_path(context.config.out), RESUME):
-        return commit_shard(Storage(context.config.out), result)
+        return commit_shard(Storage(context.config.out), result, columns_of(context.config))
 
 
 def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source: None) -> ShardResult:

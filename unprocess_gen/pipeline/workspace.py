@@ -37,7 +37,7 @@ from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import MAX_BYTES, parse_json
 from unprocess_gen.core.types import Source
-from unprocess_gen.dataset.dataset_json import check_dataset_json
+from unprocess_gen.dataset.dataset_json import FORMAT, check_dataset_json, check_format, check_format_of
 from unprocess_gen.dataset.manifest import header_text, read_rows
 from unprocess_gen.pipeline.run_records import INDEX, ShardRecords, recorded_sources, write_listing
 from unprocess_gen.pipeline.storage import WORK, Storage, cannot_write
@@ -79,6 +79,7 @@ class Workspace:
         Raises LockedError if another run holds it, ConfigError if it cannot be written, contains other files or is
         inside a dataset.
         """
+        check_format(self.storage.path)
         self.storage.open()
         self._refuse_foreign_files()
         try:
@@ -213,8 +214,10 @@ class Workspace:
                 f"out={self.out}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
             )
 
-    def finish(self, shards: int, facts_of: Callable[[Tally], dict[str, Any]]) -> dict[str, Any]:
-        """Write ``manifest.csv``, then ``dataset.json``, and return the latter's contents.
+    def finish(
+        self, shards: int, columns: Sequence[str], facts_of: Callable[[Tally], dict[str, Any]]
+    ) -> dict[str, Any]:
+        """Write ``manifest.csv`` with some columns, then ``dataset.json``, and return the latter's contents.
 
         If a shard is provisional, ``.work`` is kept, so that the next run retries it. Raises MachineError or
         DamageError.
@@ -225,7 +228,7 @@ class Workspace:
             manifest = self.storage.scratch / "manifest.csv"
             digest = hashlib.sha256()
             with manifest.open("wb", buffering=2**20) as stream:
-                for text in self._manifest(shards, entries, tally):
+                for text in self._manifest(shards, columns, entries, tally):
                     digest.update(text)
                     stream.write(text)
             manifest_sha256 = digest.hexdigest()
@@ -235,9 +238,11 @@ class Workspace:
             self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
         return dataset
 
-    def _manifest(self, shards: int, entries: list[dict[str, Any]], tally: Tally) -> Iterator[bytes]:
+    def _manifest(
+        self, shards: int, columns: Sequence[str], entries: list[dict[str, Any]], tally: Tally
+    ) -> Iterator[bytes]:
         """Yield the text of the manifest; append the entry of each shard, and add its counts."""
-        yield header_text().encode()
+        yield header_text(columns).encode()
         for record in self.storage.path.map(self.records.record, range(shards)):
             entries.append(record.entry)
             tally.add(record.tally)
@@ -288,6 +293,7 @@ def dataset_facts(
     """Return the contents of ``dataset.json``, including the text of ``config.yaml`` for `repair`."""
     config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
     return {
+        "format": FORMAT,
         "fingerprint": fingerprint(config_sha256, manifest_sha256),
         "manifest_sha256": manifest_sha256,
         "config_sha256": config_sha256,
@@ -319,6 +325,7 @@ def read_dataset(path: AnyPath) -> dict[str, Any]:
             raise ValueError(f"more than {MAX_BYTES} bytes")
         content = path.read_bytes()
         facts = parse_json(content)
+        check_format_of(path, facts)
         facts.pop("dataset_sha256")
         intact = dataset_text(facts).encode() == content
         if intact:

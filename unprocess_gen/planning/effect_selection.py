@@ -157,8 +157,6 @@ class EffectRules:
         Black level of the sensor, DN.
     assumed : mapping of str to tuple of str
         Assumed numbers that each effect uses.
-    unnamed : frozenset of str
-        Effects of later versions whose numbers the profile lacks; rows do not name them as skipped.
     dark_frames : bool
         Whether ``dark_frame`` takes the place of ``read``. Its variance is then the read variance of `Physics`.
     converter_dn : float
@@ -171,7 +169,6 @@ class EffectRules:
     tolerance: float
     black_level_dn: float
     assumed: Mapping[str, tuple[str, ...]]
-    unnamed: frozenset[str]
     dark_frames: bool
     converter_dn: float
     body_light_dn: float
@@ -186,7 +183,6 @@ def effect_rules(config: Config) -> EffectRules:
         config.effects.tolerance,
         float(config.sensor.black_level_dn),
         {effect: assumed_numbers(noise, effect) for effect in effects},
-        frozenset(effect for effect in effects if BY_NAME[effect].since and missing_number(noise, effect) is not None),
         uses_dark_frames(noise),
         math.inf if sensor.clip == UNCLIPPED else 2.0**sensor.bits - 1 - sensor.black_level_dn,
         min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn),
@@ -220,11 +216,8 @@ class Selection:
 
     @property
     def skipped(self) -> tuple[str, ...]:
-        """Return the other effects with the reasons that rows record; predicts only what the image decided.
-
-        Effects that version 0.1 did not have are named only if the profile gives their numbers.
-        """
-        off = (effect for effect in PHYSICAL_EFFECTS if effect not in self.on and effect not in self.rules.unnamed)
+        """Return the other effects with the reasons that rows record; predicts only what the image decided."""
+        off = (effect for effect in PHYSICAL_EFFECTS if effect not in self.on)
         replaced = (f"read: {IN_DARK_FRAMES}",) if self.rules.dark_frames else ()
         return (*replaced, *(f"{effect}: {self._reason(effect)}" for effect in off))
 

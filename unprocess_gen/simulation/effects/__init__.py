@@ -48,22 +48,6 @@ REPLACED = tuple(effect.name for effect in EFFECTS if effect.is_in_dark_frames)
 NUMBERS: dict[str, Number] = {name: number for effect in EFFECTS for name, number in effect.declared.items()}
 """Numbers of all effects by the names of their fields."""
 
-RECORDED_NUMBERS = (
-    ("dn_per_e", "prnu_std", "dark_e"),
-    (
-        *("hot_pixel_share", "hot_pixel_e", "full_well_e", "read_law", "read_shape", "read_std_dn", "row_std_dn"),
-        *("column_std_dn", "black_error_dn", "dead_pixel_share"),
-    ),
-    ("row_correlation", "column_temporal_std_dn", "gain_by_colour", "lens_shading"),
-)
-"""Order of the columns of version 0.2: before and after ``dark_offset``, and those that 0.1 did not have."""
-
-_KEYS_OF_PROFILES = (
-    *("prnu_std", "dark_e_per_s", "dark_reference_c", "dark_doubling_c", "hot_pixel_share", "hot_pixel_e_per_s"),
-    *("dead_pixel_share", "full_well_e", "row_correlation", "gain_by_colour", "lens_shading"),
-)
-"""Order of the keys in ``config.yaml`` of version 0.2."""
-
 
 def profile_keys() -> dict[str, tuple[Effect, Number]]:
     """Return the keys of physical profiles.
@@ -73,12 +57,11 @@ def profile_keys() -> dict[str, tuple[Effect, Number]]:
     dict of str to (Effect, Number)
         In the order of ``config.yaml``.
     """
-    keys = {
+    return {
         number.key or name: (effect, number)
         for effect in EFFECTS
         for name, number in (*effect.declared.items(), *effect.keys.items())
     }
-    return {key: keys[key] for key in dict.fromkeys((*_KEYS_OF_PROFILES, *keys))}
 
 
 class Physics(

@@ -19,7 +19,6 @@ class ColumnTemporalNumbers(EffectNumbers):
         "standard deviation of the part of column offsets that is new in every frame",
         forms=("root", "line"),
         counter=4,
-        since="0.2",
     )
 
 
@@ -29,7 +28,6 @@ class ColumnTemporal(Effect):
     name = "column_temporal"
     meaning = "an offset of each column, new in every frame"
     numbers = ColumnTemporalNumbers
-    since = "0.2"
     is_in_dark_frames = True
 
     def column_offset_dn(self, crop: Crop) -> Float:

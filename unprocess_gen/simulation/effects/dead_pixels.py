@@ -27,7 +27,6 @@ class DeadPixelNumbers(EffectNumbers):
         high=1.0,
         optional="0 DN",
         highest=1.0,
-        since="0.3",
     )
 
 

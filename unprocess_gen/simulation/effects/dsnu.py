@@ -21,7 +21,6 @@ class DsnuNumbers(EffectNumbers):
         unit="electrons",
         high=1e6,
         highest=1e9,
-        since="0.3",
     )
 
 
@@ -31,7 +30,6 @@ class Dsnu(Effect):
     name = "dsnu"
     meaning = "unequal offsets of pixels; fixed pattern"
     numbers = DsnuNumbers
-    since = "0.3"
     is_fixed = is_in_dark_frames = True
 
     def site_offset_dn(self, crop: Crop) -> Float:

@@ -93,8 +93,6 @@ class Effect:
         Whether the numbers depend on the temperature.
     has_switch : bool
         Whether ``effects.<name>`` switches it; otherwise other settings decide.
-    since : str
-        First version with the effect; empty for 0.1. Rows of profiles without its numbers do not name it.
     is_fixed : bool
         Whether it is the same in all frames of a camera body. Clean frames may contain it; then only the rounding of
         the clean frame masks it.
@@ -116,7 +114,6 @@ class Effect:
     keys: ClassVar[Mapping[str, Number]] = {}
     heat: ClassVar[bool] = False
     has_switch: ClassVar[bool] = True
-    since: ClassVar[str] = ""
     is_fixed: ClassVar[bool] = False
     is_before_well: ClassVar[bool] = False
     is_in_dark_frames: ClassVar[bool] = False

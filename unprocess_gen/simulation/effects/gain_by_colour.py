@@ -25,8 +25,6 @@ class GainByColourNumbers(EffectNumbers):
         columns={f"gain_{colour[0]}": f"system gain of {colour}, relative to dn_per_e" for colour in COLOURS},
         lowest=0.1,
         highest=10.0,
-        empty_if="all are 1",
-        since="0.2",
     )
 
 
@@ -36,7 +34,6 @@ class GainByColour(Effect):
     name = "gain_by_colour"
     meaning = "a system gain of its own for each colour"
     numbers = GainByColourNumbers
-    since = "0.2"
 
     def plane_gains(self, plan: Plan) -> tuple[float, ...]:
         """Return the gain of the colour of each site of the tile; the gain of green for a sensor without filters."""

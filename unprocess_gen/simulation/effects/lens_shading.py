@@ -36,8 +36,6 @@ class LensShadingNumbers(EffectNumbers):
         },
         lowest=-10.0,
         highest=10.0,
-        empty_if="all are 0",
-        since="0.2",
     )
 
 
@@ -95,7 +93,6 @@ class LensShading(Effect):
     name = "lens_shading"
     meaning = "less light towards the corners, in the clean and the noisy frame"
     numbers = LensShadingNumbers
-    since = "0.2"
     in_both_frames = True
 
     def light_factor(self, crop: Crop) -> Float:

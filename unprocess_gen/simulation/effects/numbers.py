@@ -56,10 +56,6 @@ class Number:
         Name and meaning of each column; empty for one column with the name and meaning of the field.
     lowest, highest : float
         Values that rows allow.
-    empty_if : str
-        Condition under which columns that version 0.1 did not have are empty.
-    since : str
-        First version with the number; empty for 0.1.
     """
 
     meaning: str
@@ -80,8 +76,6 @@ class Number:
     columns: Mapping[str, str] = field(default_factory=dict)
     lowest: float = 0.0
     highest: float = LARGEST
-    empty_if: str = "it is 0"
-    since: str = ""
 
     @property
     def may_be_unknown(self) -> bool:

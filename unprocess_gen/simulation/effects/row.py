@@ -24,7 +24,6 @@ class RowNumbers(EffectNumbers):
         optional="independent rows",
         lowest=-0.999,
         highest=0.999,
-        since="0.2",
     )
 
 
