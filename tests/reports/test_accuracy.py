@@ -73,7 +73,9 @@ def test_reference_tier_uses_the_exact_table_of_the_curve(settings: Settings, mo
 OVERRIDES = (
     (),
     ("noise=sony_a7s2", "scene=night", "output.layout=packed"),
-    ("noise=brooks2019", "noise.levels=2", "output.dtype=float32", "source.patch=8"),
+    pytest.param(
+        ("noise=brooks2019", "noise.levels=2", "output.dtype=float32", "source.patch=8"), marks=pytest.mark.slow
+    ),
 )
 
 
