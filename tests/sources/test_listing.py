@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.tasks import ShardResult
-from unprocess_gen.sources.clips import ClipSizes, clip_warnings, number_clips
+from unprocess_gen.sources.clips import ClipSizes
 from unprocess_gen.sources.listing import Listing, list_folder, unmatched_sentence
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import read_bytes
@@ -51,14 +51,9 @@ def test_order_is_by_the_bytes_of_the_relative_path(tmp_path: Path) -> None:
     assert paths(listed(tmp_path, limit=2)) == in_order[:2]
 
 
-def test_globs_ignore_case(tmp_path: Path) -> None:
-    fill(tmp_path, "a.JPG", "b.Jpg")
-    assert paths(listed(tmp_path, "*.jPg")) == ["a.JPG", "b.Jpg"]
-
-
 def test_glob_with_a_slash_matches_the_relative_path(tmp_path: Path) -> None:
-    fill(tmp_path, "in/a.jpg", "out/a.jpg", "a.jpg")
-    assert paths(listed(tmp_path, "in/*")) == ["in/a.jpg"]
+    fill(tmp_path, "in/a.JPG", "out/a.jpg", "a.jpg")
+    assert paths(listed(tmp_path, "in/*.jpg")) == ["in/a.JPG"]
 
 
 def test_unmatched_files_are_counted_by_suffix_with_advice(tmp_path: Path) -> None:
@@ -86,23 +81,12 @@ def test_single_picture_is_a_root_whatever_the_globs(tmp_path: Path) -> None:
     assert read_bytes(str(tmp_path / "=a.png"), source) == b"=a.png"
 
 
-def test_folder_of_the_name_of_its_file_is_a_folder(tmp_path: Path) -> None:
-    fill(tmp_path, "a.jpg/a.jpg")
-    assert read_bytes(f"{tmp_path}/a.jpg", only(tmp_path / "a.jpg")) == b"a.jpg/a.jpg"
-
-
 @pytest.mark.parametrize("path", ["/etc/passwd", "../secret.jpg", "sub/../../secret.jpg"])
 def test_path_outside_the_root_is_never_opened(tmp_path: Path, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(tmp_path, "secret.jpg", "root/a.jpg")
     monkeypatch.setattr(os, "open", lambda *_, **__: pytest.fail("opened"))
     with pytest.raises(SourceError, match=r"^unreadable: .* leads outside source\.root"):
         read_bytes(f"{tmp_path}/root", Source(0, path, path, 10))
-
-
-def test_several_clips_or_one_photograph_give_no_warning(tmp_path: Path) -> None:
-    fill(tmp_path, "a/1.jpg", "a/2.jpg", "b/1.jpg")
-    assert clip_warnings(number_clips(str(tmp_path), listed(tmp_path).sources)) == ()
-    assert clip_warnings(number_clips(str(tmp_path), listed(tmp_path).sources[:1])) == ()
 
 
 def test_frames_of_different_sizes_in_a_clip_give_one_warning() -> None:
@@ -132,7 +116,7 @@ def test_a_link_to_a_folder_is_followed(tmp_path: Path) -> None:
     assert paths(listed(tmp_path / "root")) == ["b.jpg", "linked/a.jpg"]
 
 
-@pytest.mark.parametrize("target", [".", "..", "sub"], ids=["itself", "above the root", "below"])
+@pytest.mark.parametrize("target", ["..", "sub"], ids=["above the root", "below"])
 def test_links_back_to_an_ancestor_end(tmp_path: Path, target: str) -> None:
     fill(tmp_path, "root/a.jpg", "root/sub/b.jpg")
     (tmp_path / "root" / "sub" / "loop").symlink_to(tmp_path / "root" / target)
@@ -148,11 +132,6 @@ def test_folders_that_link_to_each_other_are_both_listed(tmp_path: Path) -> None
     listing = listed(tmp_path)
     assert paths(listing) == ["one/a.jpg", "one/to/b.jpg", "two/b.jpg", "two/to/a.jpg"]
     assert listing.skipped_links == 2
-
-
-def test_a_directory_whose_name_matches_is_also_entered(tmp_path: Path) -> None:
-    fill(tmp_path, "x.jpg/y.jpg")
-    assert paths(listed(tmp_path)) == ["x.jpg", "x.jpg/y.jpg"]
 
 
 def test_listing_opens_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,12 +155,6 @@ def test_an_unreadable_sub_folder_stops_the_run_and_is_named(tmp_path: Path, mon
         listed(tmp_path)
 
 
-def test_dangling_link_that_no_glob_matches_is_ignored(tmp_path: Path) -> None:
-    fill(tmp_path, "a.jpg")
-    (tmp_path / "lock").symlink_to("host:123")
-    assert paths(listed(tmp_path)) == ["a.jpg"]
-
-
 @pytest.mark.parametrize("name", ["missing", "pipe", "nul\0"])
 def test_root_of_other_kind_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / "pipe")
@@ -190,34 +163,18 @@ def test_root_of_other_kind_is_refused_in_one_line(tmp_path: Path, name: str) ->
     assert "\n" not in str(caught.value)
 
 
-def test_no_match_is_refused_with_the_root_and_the_globs(tmp_path: Path) -> None:
-    fill(tmp_path, "a.txt")
-    with pytest.raises(ConfigError) as caught:
-        listed(tmp_path, "*.jpg", "*.png")
-    assert str(tmp_path) in str(caught.value)
-    assert "['*.jpg', '*.png']" in str(caught.value)
-
-
 # Names ----------------------------------------------------------------------------------------------------------------
 
 HARD_NAMES = {
     b"new\nline.jpg": "new%0Aline.jpg",
-    b"tab\t.jpg": "tab%09.jpg",
     b'comma, quote".jpg': 'comma, quote".jpg',
     b"=1+1.jpg": "%3D1+1.jpg",
-    b"+a.jpg": "%2Ba.jpg",
-    b"-a.jpg": "%2Da.jpg",
-    b"@a.jpg": "%40a.jpg",
     b"a=b-c+d@e.jpg": "a=b-c+d@e.jpg",
     b"100%.jpg": "100%25.jpg",
-    b"del\x7f.jpg": "del%7F.jpg",
     b"\xff\xfe.jpg": "%FF%FE.jpg",
-    b"\xed\xa0\x80.jpg": "%ED%A0%80.jpg",
     "\u202egnp.jpg".encode(): "%E2%80%AEgnp.jpg",
     "\u2066a\u061c\u200f.jpg".encode(): "%E2%81%A6a%D8%9C%E2%80%8F.jpg",
-    "\x85\u2028\u2029.jpg".encode(): "%C2%85%E2%80%A8%E2%80%A9.jpg",
     "e\u0301 é 日本 😀 {}$.jpg".encode(): "e\u0301 é 日本 😀 {}$.jpg",
-    b".hidden.jpg": ".hidden.jpg",
     b"x" * 251 + b".jpg": "x" * 251 + ".jpg",
 }
 
@@ -294,16 +251,6 @@ def test_a_file_without_permission_to_read_is_unreadable(tmp_path: Path, monkeyp
         read_bytes(str(tmp_path), source)
 
 
-def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").touch()
-    source = only(tmp_path)
-    before = len(os.listdir("/proc/self/fd"))
-    for _ in range(3):
-        with pytest.raises(SourceError):
-            read_bytes(str(tmp_path), source)
-    assert len(os.listdir("/proc/self/fd")) == before
-
-
 # Twins ----------------------------------------------------------------------------------------------------------------
 
 
@@ -313,17 +260,6 @@ def test_only_files_of_equal_size_and_end_are_read_completely(tmp_path: Path) ->
         (tmp_path / f"{name}.jpg").write_bytes(content)
     numbered = number_twins(str(tmp_path), listed(tmp_path).sources)
     assert [(source.sha256 is not None, source.occurrence) for source in numbered] == [(True, 0), (False, 0)] * 2
-
-
-def test_only_files_that_share_a_size_are_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, content in {"a": b"12", "b": b"34", "c": b"567"}.items():
-        (tmp_path / f"{name}.jpg").write_bytes(content)
-    found = listed(tmp_path).sources
-    opened: list[str] = []
-    system_open = os.open
-    monkeypatch.setattr(os, "open", lambda path, *args: opened.append(path) or system_open(path, *args))
-    number_twins(str(tmp_path), found)
-    assert [Path(path).name for path in opened] == ["a.jpg", "b.jpg"]
 
 
 def numbers_of_complete_digests(root: Path, found: tuple[Source, ...]) -> list[int]:

@@ -95,13 +95,6 @@ def test_dither_all_fills_every_band_and_keeps_white(settings: Settings) -> None
     assert (dequantise(np.zeros((9, 9, 3), dtype=np.uint8), plan, CURVE) == 0).all()
 
 
-def test_dither_of_0_1_is_unchanged_below_the_highlights(settings: Settings, dithered: object) -> None:
-    srgb = pixels(6, 30, 40)
-    every = dequantise(srgb, plan_image(settings("source.dequantize=dither_all"), "d" * 64), CURVE)
-    old = dequantise(srgb, dithered, CURVE)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(every[srgb < 254], old[srgb < 254])
-
-
 def test_channels_are_moved_independently(dithered: object) -> None:
     moved = dequantise(np.full((100, 100, 3), 77, dtype=np.uint8), dithered, CURVE).reshape(-1, 3)  # type: ignore[arg-type]
     assert np.abs(np.corrcoef(moved.T) - np.eye(3)).max() < 6 / 100
