@@ -20,7 +20,7 @@ from unprocess_gen.calibration.profile import MARK, NamedNumber, estimates_json,
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.sources.raw.metadata import RawMetadata, read_tags
+from unprocess_gen.sources.raw.metadata import RawMetadata, read_metadata
 
 FORM = "calibrate --from noise_profile"
 DIGITS = 12
@@ -61,7 +61,7 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     with machine_errors(folder):
         is_raw = [path for path in folder.rglob("*") if path.suffix.lower() in RAW_FILES]
         files = [folder] if folder.is_file() else sorted(is_raw)
-        facts = {path: read_tags(path, "calibrate") for path in files}
+        facts = {path: read_metadata(path, "calibrate", with_libraw=False) for path in files}
         stated = {path: tags for path, tags in facts.items() if tags.noise_profile is not None}
         sha256 = joined_sha256(map(file_sha256, stated))
     if not stated:

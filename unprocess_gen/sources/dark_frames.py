@@ -22,8 +22,7 @@ from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.raw_files import SUFFIXES
 from unprocess_gen.core.types import DarkFrame, DarkFrames, Raw
-from unprocess_gen.sources import mosaics
-from unprocess_gen.sources.mosaics import Mosaic, mosaic_sha256, read_mosaic
+from unprocess_gen.sources.mosaics import Mosaic, check_sha256, even_sides, map_mosaic, mosaic_sha256, read_mosaic
 
 KEY = "noise.dark_frames"
 
@@ -67,7 +66,7 @@ class DarkFolder:
                 "restore the file, or give their folder"
             )
         read = _mapped if name.lower().endswith(".npy") else _decoded
-        return mosaics.even_sides(read(Path(self.folder) / name, sha256))
+        return even_sides(read(Path(self.folder) / name, sha256))
 
 
 def dark_folder(folder: str) -> DarkFolder:
@@ -122,15 +121,15 @@ def _described(folder: DarkFolder, noise: NoiseConfig, sensor: SensorConfig) -> 
         mosaic = read_mosaic(Path(folder.folder) / name, KEY)
         _check(f"{KEY}={folder.folder}: {name}", mosaic, noise.bits, sensor.pattern)
         blacks.add(mosaic.black_dn)
-        pixels = mosaics.even_sides(mosaic.pixels)
+        pixels = even_sides(mosaic.pixels)
         frames.append(DarkFrame(sha256, *pixels.shape))
         counts += np.bincount(pixels.reshape(-1), minlength=2**16)
     mean_dn, variance_dn2 = trimmed_moments(counts)
-    black_dn = noise.dark_frames_black_dn
-    if black_dn is None:
-        black_dn = _stated_black(folder, blacks)
-    if black_dn is None:
-        black_dn = mean_dn
+    if noise.dark_frames_black_dn is None and len(blacks) > 1:
+        problem = "the files state several black levels; expected one; set noise.dark_frames_black_dn"
+        raise ConfigError(f"{KEY}={folder.folder}: {problem}")
+    levels = noise.dark_frames_black_dn, blacks.pop(), mean_dn
+    black_dn = next(level for level in levels if level is not None)
     if abs(mean_dn - black_dn) > BRIGHTEST_MEAN * span_dn:
         raise ConfigError(
             f"{KEY}={folder.folder}: the mean of the frames is {mean_dn:.5g} DN, and black is {black_dn:g} DN; "
@@ -166,26 +165,15 @@ def _check(start: str, mosaic: Mosaic, bits: int, pattern: str) -> None:
         )
 
 
-def _stated_black(folder: DarkFolder, stated: set[float | None]) -> float | None:
-    """The black level that all files state; None if no file states one."""
-    if len(stated) > 1:
-        levels = ", ".join("none" if level is None else f"{level:g}" for level in sorted(stated, key=str))
-        raise ConfigError(
-            f"{KEY}={folder.folder}: the files state several black levels ({levels} DN); expected one; set "
-            "noise.dark_frames_black_dn"
-        )
-    return stated.pop()
-
-
 @functools.lru_cache(maxsize=MAPPED)
 def _mapped(path: Path, sha256: str) -> Raw:
     """Return the array of an NPY file, mapped into memory."""
-    mosaics.check_sha256(path, "dark frame", sha256)
-    return mosaics.map_mosaic(path, KEY)
+    check_sha256(path, "dark frame", sha256)
+    return map_mosaic(path, KEY)
 
 
 @functools.lru_cache(maxsize=DECODED)
 def _decoded(path: Path, sha256: str) -> Raw:
     """Return the pixels of another file."""
-    mosaics.check_sha256(path, "dark frame", sha256)
+    check_sha256(path, "dark frame", sha256)
     return read_mosaic(path, KEY).pixels

@@ -131,7 +131,7 @@ def check_sha256(path: Path, what: str, sha256: str) -> None:
     Raises SourceChangedError.
     """
     try:
-        digest = file_sha256(path)
+        digest = mosaic_sha256(path)
     except OSError as error:
         raise SourceChangedError(f"{what} {path}: cannot be read ({error.strerror}); restore it") from error
     if digest != sha256:

@@ -76,32 +76,27 @@ class RawMetadata:
         return replace(facts, bits=None if facts.white_dn is None else int(facts.white_dn).bit_length())
 
 
-def read_metadata(path: Path, key: str) -> RawMetadata:
-    """Read the facts of a raw file; ``key`` begins messages.
+def read_metadata(path: Path, key: str, with_libraw: bool = True) -> RawMetadata:
+    """Read the facts of a raw file: those of TIFF, EXIF and DNG tags, and what LibRaw knows; ``key`` begins messages.
 
     Raises ConfigError or MachineError.
     """
-    tags = read_tags(path, key)
-    _require("rawpy", path, key)
+    for library in ("tifffile", *(["rawpy"] if with_libraw else [])):
+        require(library, f"{key}: {path} is a raw file, which needs {library}", "raw", ", or convert the frames to NPY")
+    with machine_errors(path):
+        content = path.read_bytes()
+    tags = tags_of(content, check=False)
+    if not with_libraw:
+        return tags
     try:
-        with machine_errors(path), opened_by_libraw(path.read_bytes()) as raw:
+        with opened_by_libraw(content) as raw:
             return tags.completed(decoder_facts(raw))
     except SourceError as error:
         raise ConfigError(f"{key}: {path} {error.text}") from error
 
 
-def read_tags(path: Path, key: str) -> RawMetadata:
-    """Read the facts that tags of TIFF, EXIF and DNG state, whatever the compression; none if the file is no TIFF.
-
-    Raises ConfigError or MachineError.
-    """
-    _require("tifffile", path, key)
-    with machine_errors(path):
-        return tags_of(path.read_bytes(), check=False)
-
-
 def tags_of(content: bytes, check: bool = True) -> RawMetadata:
-    """Read what `read_tags` does from the bytes of a file.
+    """Read the facts that tags state, whatever the compression; none if the file is no TIFF.
 
     With ``check``, SourceError unless a TIFF is complete and its raw image is a mosaic of integers.
     """
@@ -135,12 +130,6 @@ def _check_mosaic(page: Any, size: int) -> None:
     for what, is_refused in refusals.items():
         if is_refused:
             raise SourceError("unsupported", f"{what}; expected a mosaic of integers")
-
-
-def _require(library: str, path: Path, key: str) -> None:
-    """Refuse a raw file without the library that reads it."""
-    use = f"{key}: {path} is a raw file, which needs {library}"
-    require(library, use, "calibrate", ", or convert the frames to NPY")
 
 
 def _tag_facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model: str) -> RawMetadata:
