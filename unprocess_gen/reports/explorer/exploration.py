@@ -61,7 +61,7 @@ class Exploration:
     """The settings of a page, by key as texts, and which pair of them is shown.
 
     ``others`` are overrides that add something (``+experiment=…``), ``flags`` are flags of Hydra. ``index`` is the
-    number of the source in the listing, ``part`` the rest of the key of the pair. ``digests`` are recorded by a row.
+    number of the source in the listing, ``part`` the rest of the key of the pair.
     """
 
     folders: OptionFolders
@@ -70,7 +70,6 @@ class Exploration:
     flags: tuple[str, ...] = ()
     index: int = 0
     part: str = ""
-    digests: tuple[str, str] | None = None
 
     @property
     def overrides(self) -> list[str]:

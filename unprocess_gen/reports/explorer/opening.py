@@ -96,12 +96,7 @@ def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
     for key, place in places.items():
         if place:
             settings[key] = _path_text(place) if isinstance(place, str) else override_text(place)
-    state = replace(
-        start,
-        settings=settings | given,
-        part=str(row["key"]).removeprefix(image_key(row)),
-        digests=None if given or start.others else (str(row["clean_xxh3"]), str(row["noisy_xxh3"])),
-    )
+    state = replace(start, settings=settings | given, part=str(row["key"]).removeprefix(image_key(row)))
     config = _source_config(state)
     source = next((source for source in listed_sources(config) if source.name == row["source"]), None)
     if source is None:

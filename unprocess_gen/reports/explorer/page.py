@@ -131,7 +131,7 @@ class Page:
         try:
             yield
         except UnprocessGenError as error:
-            self._say(str(error))
+            self._message.text = render_macro("alert", str(error))
 
     def _update(self) -> None:
         """Compute the pair, draw everything, and set the controls."""
@@ -152,8 +152,7 @@ class Page:
         self._draw_view()
         self._draw_statistics(shown)
         self._command.value = self._state.command
-        differs = self._state.digests not in (None, (str(shown.row["clean_xxh3"]), str(shown.row["noisy_xxh3"])))
-        self._say("the pair differs from its row: its source or the settings have changed" if differs else "")
+        self._message.text = ""
 
     def _draw_view(self) -> None:
         """Draw the sites in view, from even rows and columns."""
@@ -168,23 +167,20 @@ class Page:
         self._pixels.data = {name: [value] for name, value in columns.items()}
 
     def _draw_statistics(self, shown: Shown) -> None:
-        transfer = views.photon_transfer(shown)
+        points, line, fit = views.photon_transfer(shown)
         curves = {
             "source_histogram": views.source_histogram(shown),
             "raw_histogram": views.raw_histogram(shown),
             "highlight": views.highlight_curves(shown),
-            "transfer": {"expected": transfer.line},
+            "transfer": {"expected": line},
         }
         for name, lines in curves.items():
             colours = [LINE_COLOURS.get(label.partition(",")[0], LINE_COLOURS["noisy"]) for label in lines]
             xs, ys = ([list(line[axis]) for line in lines.values()] for axis in (0, 1))
             self._lines[name].data = {"xs": xs, "ys": ys, "label": list(lines), "colour": colours}
-        self._points.data = {"x": transfer.points[0], "y": transfer.points[1]}
-        self._facts.text = render_macro("facts", _pair_facts(shown, transfer.text))
+        self._points.data = dict(zip("xy", points, strict=True))
+        self._facts.text = render_macro("facts", _pair_facts(shown, fit))
         self._plan.text = render_macro("lines", "\n".join(shown.lines))
-
-    def _say(self, sentence: str) -> None:
-        self._message.text = render_macro("alert", sentence) if sentence else ""
 
     def _sync(self, shown: Shown) -> None:
         """Set the controls to the values of the pair, in one message to the browser."""
@@ -245,14 +241,14 @@ def _text_box(name: str) -> Div:
     return Div(name=name, sizing_mode="stretch_width", stylesheets=[render_page("explorer_texts.css")])
 
 
-def _pair_facts(shown: Shown, transfer: str) -> dict[str, str]:
+def _pair_facts(shown: Shown, fit: str) -> dict[str, str]:
     """Numbers of the pair, by what the page calls them."""
     row, sites, camera = shown.row, shown.clean.size, shown.plan.camera
     return {
         "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
         **{MEANINGS[column].removesuffix(", sites"): f"{int(row[column] or 0) / sites:.3%}" for column in SITE_COLUMNS},
         "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
-        "noise of the pair": transfer,
+        "noise of the pair": fit,
         "effects": ", ".join(shown.plan.noise.effects),
         "XXH3": f"clean {row['clean_xxh3']}, noisy {row['noisy_xxh3']}",
     }

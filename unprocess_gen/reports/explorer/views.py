@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +13,10 @@ from unprocess_gen.reports.explorer.exploration import Shown
 from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.contact_sheet import common_stretch, develop_detail, stretch
-from unprocess_gen.reports.sheets.panels import MosaicArray, Window
+from unprocess_gen.reports.sheets.panels import Window
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.isp import process, to_light
+from unprocess_gen.statistics.mosaics import planes_of
 
 PICTURES = {
     "source": "Source",
@@ -30,35 +31,34 @@ PICTURES = {
 VIEW_PX = (360, 480)
 """Most rows and columns of a picture; of a larger window, means of blocks are drawn."""
 
-Columns = dict[str, Any]
 
-
-def _block_side(window: Window) -> int:
-    """Return the side of the blocks of sites that become one pixel: 1, or an even number."""
-    side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, VIEW_PX, strict=True))
-    return side + side % 2 if side > 1 else 1
-
-
-def view(shown: Shown, window: Window, common: bool) -> Columns:
+def view(shown: Shown, window: Window, common: bool) -> dict[str, Any]:
     """Return the pictures of a window as RGBA words ``[h, w]``, their place, and the values under the pointer.
 
     With ``common``, raw frames are drawn from black to white (square root) and developed ones as photographs; else each
     picture is stretched by itself.
     """
-    side = _block_side(window)
-    white = float(np.iinfo(shown.srgb.dtype).max)
-    source = shown.srgb[window] if side == 1 else _block_means(shown.srgb[window].astype(np.float32), side)
-    frames = {"clean": shown.clean, "noisy": shown.noisy}
-    columns: Columns = {"source": _words(source / white)}
-    for name, frame in frames.items():
-        raw, developed = _window_pictures(frame, shown, window, side)
-        light = common_stretch(raw, shown.plan) if common else stretch(raw)[0]
-        columns[name] = _words(light)
+    side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, VIEW_PX, strict=True))
+    side += side % 2 if side > 1 else 0
+    pattern, srgb = shown.plan.sensor.pattern, shown.srgb[window]
+    source = srgb if side == 1 else _block_means(srgb.astype(np.float32), side)
+    columns: dict[str, Any] = {"source": _words(source / np.iinfo(srgb.dtype).max)}
+    for name, frame in {"clean": shown.clean, "noisy": shown.noisy}.items():
+        raw: Any = frame[window]
+        if side == 1:
+            developed = develop_detail(frame, shown.plan, window)
+            developed = np.zeros((*raw.shape, 3)) if developed is None else developed
+        else:
+            planes = _plane_means(raw, side)
+            raw = planes.mean(axis=-1)
+            developed = process(to_light(panels.planes_to_rgb(planes, pattern), shown.plan), shown.plan)
+        columns[name] = _words(common_stretch(raw, shown.plan) if common else stretch(raw)[0])
         columns[f"{name}_developed"] = _words(developed if common else stretch(developed, least=1e-6)[0])
         columns[f"{name}_dn"] = raw if raw.dtype == np.uint16 else raw.astype(np.float32)
-    columns["saturated"] = _words(_saturated(shown.saturated[window], columns["clean"].shape, shown, side))
-    for channel, name in enumerate("rgb"):
-        columns[name] = np.rint(source[..., channel]).astype(np.uint16)
+    sites = shown.saturated[window].astype(np.float64)
+    means = None if side == 1 else panels.planes_to_rgb(_plane_means(sites, side), pattern)
+    columns["saturated"] = _words(panels.colour_sites(sites, pattern) if means is None else means)
+    columns |= {name: np.rint(source[..., channel]).astype(np.uint16) for channel, name in enumerate("rgb")}
     height, width = columns["clean"].shape
     note = "of this site" if side == 1 else f"means of {side} × {side} sites; zoom in for single sites"
     place = {"x": window[1].start, "y": window[0].start, "dw": width * side, "dh": height * side}
@@ -74,27 +74,10 @@ def _block_means(values: NDArray[Any], side: int) -> NDArray[Any]:
 
 
 def _plane_means(frame: NDArray[Any], side: int) -> Float:
-    """Average the four planes of a mosaic over blocks, ``[h, w, 4]``."""
+    """Average the four planes of a mosaic over blocks of an even side, ``[h, w, 4]``."""
     rows, columns = (length // side * side for length in frame.shape)
-    planes = [frame[y:rows:2, x:columns:2].astype(np.float32) for y in (0, 1) for x in (0, 1)]
+    planes = [plane.astype(np.float32) for plane in planes_of(frame[:rows, :columns])]
     return np.stack([_block_means(plane, side // 2) for plane in planes], axis=-1)
-
-
-def _window_pictures(frame: MosaicArray, shown: Shown, window: Window, side: int) -> tuple[MosaicArray, Float]:
-    """Return a window of a frame in DN, and developed."""
-    if side == 1:
-        raw, developed = frame[window], develop_detail(frame, shown.plan, window)
-        return raw, np.zeros((*raw.shape, 3)) if developed is None else developed
-    planes = _plane_means(frame[window], side)
-    rgb = panels.planes_to_rgb(planes, shown.plan.sensor.pattern)
-    return planes.mean(axis=-1), process(to_light(rgb, shown.plan), shown.plan)
-
-
-def _saturated(mask: NDArray[np.bool_], shape: tuple[int, ...], shown: Shown, side: int) -> Float:
-    """Return the share of saturated sites in each channel, ``[h, w, 3]``."""
-    if side == 1:
-        return panels.colour_sites(mask.astype(float), shown.plan.sensor.pattern)
-    return panels.planes_to_rgb(_plane_means(mask, side), shown.plan.sensor.pattern)
 
 
 def _words(values: Float) -> NDArray[np.uint32]:
@@ -113,11 +96,10 @@ Curves = dict[str, tuple[Any, Any]]
 
 def source_histogram(shown: Shown) -> Curves:
     """Return the shares of the codes of each channel of the source."""
-    bins = np.linspace(0, np.iinfo(shown.srgb.dtype).max + 1, BINS + 1)
-    curves = {}
+    limits, curves = (0.0, np.iinfo(shown.srgb.dtype).max + 1.0), {}
     for channel, name in enumerate(("red", "green", "blue")):
-        counts = np.bincount(shown.srgb[..., channel].ravel(), minlength=int(bins[-1]))
-        curves[name] = bins[:-1], counts.reshape(BINS, -1).sum(axis=1) / shown.srgb[..., 0].size
+        counts, edges = np.histogram(shown.srgb[..., channel], BINS, limits)
+        curves[name] = edges[:-1], counts / counts.sum()
     return curves
 
 
@@ -126,16 +108,14 @@ def raw_histogram(shown: Shown) -> Curves:
 
     DN that do not occur are NaN, because the axis is logarithmic.
     """
-    top = 2**shown.plan.sensor.bits
-    counts = {}
+    low, high = np.percentile(shown.noisy, (0.1, 99.9)).round()
+    low, high = min(low, float(shown.clean.min())), max(high, float(shown.clean.max()))
+    edges = np.arange(low, high + 2, 1 + (high - low) // BINS) - 0.5
+    curves = {}
     for name, frame in (("clean", shown.clean), ("noisy", shown.noisy)):
-        dn = frame if frame.dtype == np.uint16 else np.clip(np.rint(frame), 0, top - 1).astype(np.uint16)
-        counts[name] = np.bincount(dn.ravel(), minlength=top)
-    used, below = np.flatnonzero(counts["clean"]), np.cumsum(counts["noisy"]) / shown.noisy.size
-    low, high = min(used[0], np.searchsorted(below, 0.001)), max(used[-1], np.searchsorted(below, 0.999))
-    starts = np.arange(low, high + 1, 1 + (high - low) // BINS)
-    sums = {name: np.add.reduceat(count[: high + 1], starts) for name, count in counts.items()}
-    return {name: (starts, np.where(total, total / shown.clean.size, np.nan)) for name, total in sums.items()}
+        counts = np.histogram(frame, edges)[0]
+        curves[name] = edges[:-1] + 0.5, np.where(counts, counts / frame.size, np.nan)
+    return curves
 
 
 def highlight_curves(shown: Shown) -> Curves:
@@ -147,29 +127,21 @@ def highlight_curves(shown: Shown) -> Curves:
     return {f"{name}, {gain:.3g}": (light, inverted[:, channel]) for channel, (name, gain) in enumerate(named)}
 
 
-class TransferPlot(NamedTuple):
-    """Points of the photon transfer, the expected line, and the fit in words; the text says why there are none."""
-
-    points: tuple[Any, Any]
-    line: tuple[Any, Any]
-    text: str
-
-
 POINTS_DRAWN = 1000
 FITTED_PX = 512
 
 
-def photon_transfer(shown: Shown) -> TransferPlot:
-    """Fit the variance of the noise against the signal, in the first sites of a large frame."""
+def photon_transfer(shown: Shown) -> tuple[tuple[Any, Any], tuple[Any, Any], str]:
+    """Fit the variance of the noise against the signal, in the first sites of a large frame.
+
+    Return points, the expected line, and the fit in words, or why there are none.
+    """
     side = FITTED_PX // 2 if shown.plan.output.layout == PACKED else FITTED_PX
     clean, noisy = (frame[..., :side, :side] for frame in (shown.pair.clean, shown.pair.noisy))
     height, width = (min(length, FITTED_PX) for length in shown.clean.shape)
     fit = fit_pair(clean, noisy, {**shown.row, "height": height, "width": width}, shown.dark_pixels)
     if fit is None:
-        return TransferPlot(([], []), ([], []), "too few sites or levels for a fit")
-    step = max(1, len(fit.signal_dn) // POINTS_DRAWN)
-    ends = np.array([0.0, fit.signal_dn.max(initial=1.0)])
-    text = str(fit).partition(": ")[2]
-    return TransferPlot(
-        (fit.signal_dn[::step], fit.variance_dn2[::step]), (ends, fit.expected[0] * ends + fit.expected[1]), text
-    )
+        return ([], []), ([], []), "too few sites or levels for a fit"
+    step, ends = max(1, len(fit.signal_dn) // POINTS_DRAWN), np.array([0.0, fit.signal_dn.max(initial=1.0)])
+    points, line = (fit.signal_dn[::step], fit.variance_dn2[::step]), (ends, fit.expected[0] * ends + fit.expected[1])
+    return points, line, str(fit).partition(": ")[2]
