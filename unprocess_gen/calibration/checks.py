@@ -113,6 +113,11 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
     _check(frames, scores | _pixel_scores(dark), notes)
 
 
+def is_clipped(dark: Measured) -> bool:
+    """True if black is clipped."""
+    return _exceeds(clipped_black(dark), LIMITS["clipped black"].refused)
+
+
 def clipped_black(dark: Measured) -> Score:
     """Score the share of the lowest value, 0 if the histogram falls to both sides alike."""
     shares = []

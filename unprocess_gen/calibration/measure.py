@@ -141,6 +141,9 @@ def _darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> 
     for frames in _groups(captures, "dark", iso, notes):
         sums = _summed(frames, captures.sensor, watch)
         measured = sums.measure()
+        if darks and checks.is_clipped(measured):  # by the dark current of a long exposure
+            notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
+            continue
         checks.check_dark(frames, captures.sensor, measured, notes)
         patterns = [high_passed(plane) for plane in planes_of(sums.mean_frame())]
         threshold = FAR * max(*(robust_std(pattern)[1] for pattern in patterns), 0.05)
