@@ -15,6 +15,7 @@ from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill
 from helpers.promise_report import Figure
 
+from unprocess_gen import RawPairs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.types import EXACT, FAST, REFERENCE, TIERS
@@ -139,6 +140,8 @@ def test_runs_have_the_bytes_of_generate(
     assert min(times) > 0
     assert made == [tree_hash(folder / "ds")]
     assert not (folder / "dataset").exists()
+    assert "\naccuracy: fast\n" in (folder / "ds/config.yaml").read_text(encoding="utf-8")
+    assert {row["accuracy"] for *_, row in RawPairs(folder / "ds")} == {FAST}
 
 
 def test_ended_measurement_leaves_nothing(folder: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
