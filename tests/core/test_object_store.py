@@ -18,7 +18,7 @@ from helpers.object_store import Proxy
 
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, MachineError
-from unprocess_gen.core.object_store import MAX_PIECE, ObjectChangedError, ObjectPath, StoreAccessError
+from unprocess_gen.core.object_store import PIECE, ObjectChangedError, ObjectPath, StoreAccessError
 from unprocess_gen.core.paths import any_path
 
 QUICK = {"init_backoff": timedelta(milliseconds=1), "max_backoff": timedelta(milliseconds=20), "base": 2}
@@ -81,7 +81,7 @@ def test_reader_seeks_like_a_file(bucket: ObjectPath, tmp_path: Path) -> None:
 
 
 def test_pieces_of_large_objects_are_joined(bucket: ObjectPath, tmp_path: Path) -> None:
-    large = os.urandom(2 * MAX_PIECE + 12345)
+    large = os.urandom(2 * PIECE + 12345)
     (tmp_path / "large").write_bytes(large)
     (bucket / "large").commit(tmp_path / "large")
     assert (bucket / "large").read_bytes() == large
@@ -90,17 +90,8 @@ def test_pieces_of_large_objects_are_joined(bucket: ObjectPath, tmp_path: Path) 
     assert not copy.exists()
 
 
-def test_sequential_reading_takes_few_requests(slow_proxy: Proxy, bucket: ObjectPath) -> None:
-    (bucket / "data").write_bytes(bytes(2**22))
-    before = slow_proxy.count("GET")
-    with (bucket / "data").open() as stream:
-        while stream.readline(2**12):
-            pass
-    assert slow_proxy.count("GET") - before <= 8
-
-
 def test_missing_object_is_a_missing_file(bucket: ObjectPath) -> None:
-    for action in ((bucket / "none").read_bytes, (bucket / "none").open().read, (bucket / "none").stat):
+    for action in ((bucket / "none").read_bytes, (bucket / "none").open, (bucket / "none").stat):
         with pytest.raises(FileNotFoundError, match=f"s3://{bucket.bucket}/none"):
             action()
 
@@ -114,17 +105,6 @@ def test_missing_bucket_is_named_in_one_line(s3: str) -> None:
         ) as error:
             action()
         assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("code", "is_missing"), [("NoSuchBucket", True), ("ContainerNotFound", True), ("NoSuchKey", False)]
-)
-def test_missing_bucket_is_not_a_missing_object(code: str, is_missing: bool) -> None:
-    """The codes of S3 and Google, and of Azure; a missing object has another one."""
-    text = f"status code: 404 Not Found: <Error><Code>{code}</Code><Message>none</Message></Error>"
-    with pytest.raises((StoreAccessError, FileNotFoundError)) as error, object_store._request(ObjectPath("s3://a/b")):
-        raise FileNotFoundError(text)
-    assert isinstance(error.value, StoreAccessError) == is_missing
 
 
 def use_google(endpoint: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +139,8 @@ def test_google_and_azure_get_the_conditions_of_requests(
     with servers.one_object_server(CONTENT) as (endpoint, requests):
         use(endpoint, tmp_path, monkeypatch)
         path = ObjectPath(f"{scheme}://bucket/a/b c.jpg")
-        assert path.read_bytes('"listed"') == CONTENT
+        with path.open_listed(len(CONTENT), '"listed"') as (file, _):
+            assert file.read() == CONTENT
         assert path.create(b"1")
         path.write_bytes(b"2")
     object_store._store.cache_clear()
@@ -169,7 +150,7 @@ def test_google_and_azure_get_the_conditions_of_requests(
         ("PUT", "/bucket/a/b c.jpg"),
     ]
     read, create, overwrite = (request.headers for request in requests)
-    assert (read["if-match"], read["range"]) == ('"listed"', f"bytes=0-{MAX_PIECE - 1}")
+    assert read["if-match"] == '"listed"'
     assert create_only in create.items()
     assert create_only not in overwrite.items()
 
@@ -202,20 +183,11 @@ def test_changed_etag_is_reported(bucket: ObjectPath) -> None:
     path = bucket / "changing"
     path.write_bytes(b"before")
     etag = path.entry().etag
-    assert path.read_bytes(etag) == b"before"
+    with path.open_listed(6, etag, start=2) as (file, _):
+        assert file.read() == b"fore"
     path.write_bytes(b"after!")
-    with pytest.raises(ObjectChangedError, match=rf"^{path}: "):
-        path.read_bytes(etag)
-
-
-def test_object_replaced_while_read_is_reported(bucket: ObjectPath) -> None:
-    path = bucket / "changing"
-    path.write_bytes(bytes(2**20))
-    with path.open() as stream:
-        stream.read(10)
-        path.write_bytes(b"1" * 2**20)
-        with pytest.raises(ObjectChangedError):
-            stream.read()
+    with pytest.raises(ObjectChangedError, match=rf"^{path}: "), path.open_listed(6, etag):
+        pass
 
 
 def test_failing_answers_are_repeated(slow_proxy: Proxy, bucket: ObjectPath) -> None:
@@ -231,20 +203,6 @@ def test_lasting_failure_ends_in_one_line(slow_proxy: Proxy, bucket: ObjectPath)
     with pytest.raises(MachineError, match=rf"^{bucket}/a: the object store failed \(503 .*; rerun when it answers$"):
         (bucket / "a").read_bytes()
     assert len(slow_proxy.requests) == object_store.MAX_RETRIES + 1
-
-
-def test_slow_answer_is_repeated(slow_proxy: Proxy, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
-    (bucket / "a").write_bytes(b"1")
-    monkeypatch.setattr(object_store, "REQUEST_TIMEOUT_S", 0.3)
-    object_store._store.cache_clear()
-    slow_proxy.delay_s = 0.6
-
-    def recover(*_: str) -> int:
-        slow_proxy.delay_s = 0.6 if len(slow_proxy.requests) < 3 else 0.0
-        return 0
-
-    slow_proxy.answer = recover
-    assert (bucket / "a").read_bytes() == b"1"
 
 
 def test_unreachable_server_ends_in_one_line(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from unprocess_gen.core.entries import EntryKind
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.object_store import EntryKind, ObjectPath
+from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import LocalPath, any_path, local_path, open_text
 from unprocess_gen.dataset.manifest import read_rows
 

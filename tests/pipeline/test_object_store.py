@@ -235,7 +235,7 @@ def test_writer_that_fails_leaves_no_object(
 
 
 def test_interrupted_upload_leaves_no_object(bucket: ObjectPath, proxy: Proxy, tmp_path: Path) -> None:
-    (tmp_path / "shard").write_bytes(bytes(3 * object_store.MAX_PIECE))
+    (tmp_path / "shard").write_bytes(bytes(3 * object_store.PIECE))
     proxy.answer = lambda method, path: 403 if "partNumber=2" in path else 0
     with pytest.raises(MachineError):
         (bucket / "shard").commit(tmp_path / "shard")

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from helpers.cases import slow_except
 from helpers.commands import COMMAND, Cli, RunMain, environment
 from helpers.datasets import MadeHash, Make, TreeHash
 from helpers.photographs import fill, pixels
@@ -38,7 +39,6 @@ from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.cli.messages import logging_to
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.dataset.manifest import read_rows
@@ -102,7 +102,7 @@ def six(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("number", range(FILES))
+@pytest.mark.parametrize("number", slow_except((2, 4), range(FILES)))
 def test_run_killed_around_any_rename_can_be_resumed(
     number: int,
     six: Path,
@@ -252,12 +252,6 @@ def test_damaged_committed_shard_is_regenerated(
     assert_complete(begun / "ds")
 
 
-def test_progress_of_a_resumed_run_counts_finished_images(begun: Path, make: Make, capfd: Any) -> None:
-    with logging_to():
-        make(begun / "p", begun / "ds", TWO)
-    assert "gen-dataset: 6/6 images" in capfd.readouterr().err
-
-
 @pytest.fixture
 def finished(six: Path, tmp_path: Path) -> Path:
     """Copy photographs p and their dataset ds."""
@@ -270,24 +264,12 @@ def add(source: Path) -> None:
 
 CHANGES: list[tuple[str, Callable[[Path], Any], str]] = [
     ("seed=1", lambda source: None, r"was begun with other settings: seed=1 \(there: 0\)"),
-    ("isp=srgb", lambda source: None, r"was begun with other settings: isp.gamma=srgb \(there: 2.2\); isp.tone=none"),
-    ("source.limit=5", lambda source: None, r"was begun with other settings: source.limit=5 \(there: null\)"),
     ("seed=0", add, r"was begun with other sources: new.png is new"),
     ("seed=0", lambda source: (source / "003.png").unlink(), r"was begun with other sources: 003.png was deleted"),
     (
         "seed=0",
         lambda source: (source / "003.png").write_bytes(b"x"),
         r"was begun with other sources: 003.png has 1 bytes, had \d+",
-    ),
-    (
-        "seed=0",
-        lambda source: (source / "003.png").rename(source / "x.png"),
-        r"was begun with other sources: x.png is new; 003.png was deleted",
-    ),
-    (
-        "seed=0",
-        lambda source: [path.unlink() for path in sorted(source.iterdir())[:5]],
-        r"000.png was deleted; 001.png was deleted; 002.png was deleted; and 2 more",
     ),
 ]
 
@@ -351,7 +333,7 @@ def held(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-@pytest.mark.parametrize("name", ["shards/shard-00000.tar", "manifest.csv", "dataset.json", "photo.jpg", "thesis.tex"])
+@pytest.mark.parametrize("name", ["shards/shard-00000.tar", "manifest.csv", "dataset.json", "photo.jpg"])
 def test_folder_with_foreign_files_is_refused_and_unchanged(name: str, make: Make, tmp_path: Path) -> None:
     path, entry = tmp_path / "ds" / name, name.split("/")[0]
     path.parent.mkdir(parents=True)

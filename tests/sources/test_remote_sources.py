@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import urllib.request
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,16 +69,6 @@ def test_single_object_is_a_source(photos: Path, remote: ObjectPath) -> None:
     assert without_etag(listed(remote / "deep.png")) == listed(photos / "deep.png")
     (source,) = listed(remote / "deep.png").sources
     assert read_bytes(str(remote / "deep.png"), source) == (photos / "deep.png").read_bytes()
-
-
-def test_folder_markers_are_no_sources(remote: ObjectPath, s3: str) -> None:
-    before = listed(remote, include="[*]")
-    for marker in ("photos/", "photos/sub/"):
-        request = urllib.request.Request(f"{s3}/{remote.bucket}/{marker}", data=b"", method="PUT")
-        urllib.request.urlopen(request).close()
-    assert listed(remote, include="[*]") == before
-    (remote / "zero").write_bytes(b"")
-    assert listed(remote, include="[*]").sources[-1].path == "zero"
 
 
 def test_twins_are_numbered_like_files(tmp_path: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,29 +5,26 @@ folder and a URL. A missing object raises FileNotFoundError, like a missing file
 `core.errors` with one sentence that names the URL.
 
 obstore reads credentials and endpoints from the environment (``AWS_ACCESS_KEY_ID``, ``AWS_ENDPOINT_URL``,
-``GOOGLE_SERVICE_ACCOUNT``, ``AZURE_STORAGE_ACCOUNT_NAME``, …). It repeats requests that fail to connect, time out or
-get a 5xx or 429 answer, with a growing delay, until `RETRY_TIMEOUT_S`. Design: ``docs/design/object_stores.md``.
+``GOOGLE_SERVICE_ACCOUNT``, ``AZURE_STORAGE_ACCOUNT_NAME``, …), and repeats requests that fail. Design:
+``docs/design/object_stores.md``.
 """
 
 from __future__ import annotations
 
-import enum
 import io
-import itertools
 import os
 import re
-import shutil
 import tempfile
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO
 
+from unprocess_gen.core.entries import Entry, EntryKind, Item, Result, started_ahead
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.libraries import require
 
@@ -40,33 +37,23 @@ SCHEMES = {"s3": "AWS_ACCESS_KEY_ID", "gs": "GOOGLE_SERVICE_ACCOUNT", "az": "AZU
 MISSING_BUCKET = ("NoSuchBucket", "ContainerNotFound")
 """Codes by which S3 and Google, and Azure, report that a bucket does not exist."""
 
-REQUEST_TIMEOUT_S = 60
-"""Longest time for one request; no request carries more than `MAX_PIECE` bytes."""
+REQUEST_TIMEOUT_S = 300
+"""Longest time for one request, which may read a complete shard."""
 
-CONNECT_TIMEOUT_S = 5
+MAX_RETRIES, RETRY_TIMEOUT_S = 8, 90
+"""Repetitions of a request, and the time from its first attempt after which it is not repeated."""
 
-MAX_RETRIES = 8
+BUFFER = 2**18
+"""Bytes of one request of a file that is read in pieces."""
 
-RETRY_TIMEOUT_S = 90
-"""Time from the first attempt of a request after which it is not repeated."""
-
-MIN_PIECE, MAX_PIECE = 2**16, 2**23
-"""Bytes of a range request: the first one, and the most that sequential reading grows to."""
-
-UPLOADS = 4
-"""Pieces of `MAX_PIECE` bytes of one file that are uploaded at a time and are in memory."""
+PIECE = 2**23
+"""Bytes of an upload's request; obstore sends four at a time."""
 
 TEMPORARY_PREFIX = "unprocess_gen-"
 """Beginning of the names of temporary folders, by which a later run on this host finds those that a kill left."""
 
-DELETED_AT_ONCE = 1000
-"""Objects that one request deletes, the most that S3 allows."""
-
 THREADS = 32
-"""Requests at a time of `ObjectPath.each`."""
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+"""Requests at a time of `ObjectPath.map`."""
 
 _URL = re.compile(rf"({'|'.join(SCHEMES)})://([^/]*)/*(.*?)/*", re.DOTALL)
 _started_by: set[int] = set()
@@ -78,41 +65,6 @@ class ObjectChangedError(MachineError):
 
 class StoreAccessError(MachineError):
     """Report that a store refuses access, or that a bucket does not exist."""
-
-
-class EntryKind(enum.Enum):
-    """Kind of an entry of a folder."""
-
-    FILE = "regular file or object"
-    FOLDER = "folder or prefix"
-    LOOP = "link to a folder that contains the link"
-    OTHER = "pipe or device"
-    BROKEN_LINK = "link to nothing"
-    UNREADABLE = "entry whose status cannot be read"
-
-
-class Entry(NamedTuple):
-    """Entry of a folder.
-
-    Attributes
-    ----------
-    path : str
-        Path below the listed folder or prefix.
-    size : int or None
-        Size of a file in bytes.
-    kind : EntryKind
-        What the entry is.
-    etag : str or None
-        ETag of an object, if the store has ETags.
-    problem : str
-        Why the status of the entry cannot be read.
-    """
-
-    path: str
-    size: int | None
-    kind: EntryKind = EntryKind.FILE
-    etag: str | None = None
-    problem: str = ""
 
 
 def is_url(text: object) -> bool:
@@ -185,33 +137,17 @@ class ObjectPath:
     # -------------------------------------------------------------------------------------------------- as a folder
 
     def walk_entries(self, recursive: bool = True) -> Iterator[Entry]:
-        """Yield the objects below this prefix in the order of the store, without holding the listing in memory.
-
-        Empty objects ``FOLDER/``, by which consoles show folders, are omitted if they are followed by objects below
-        them; obstore lists them without the slash.
-        """
-        held: Entry | None = None
-        for entry in self._listed(recursive):
-            if held is not None and not entry.path.startswith(f"{held.path}/"):
-                yield held
-            held = None
-            if entry.size:
-                yield entry
-            else:
-                held = entry
-        if held is not None:
-            yield held
-
-    def _listed(self, recursive: bool) -> Iterator[Entry]:
+        """Yield the objects below this prefix in the order of the store, without holding the listing in memory."""
         prefix = f"{self.key}/" if self.key else ""
         with _request(self) as (obstore, store):
             if recursive:
                 chunks = obstore.list(store, self.key or None, chunk_size=1000)
             else:
                 chunks = iter([obstore.list_with_delimiter(store, self.key or None)["objects"]])
-            for facts in itertools.chain.from_iterable(chunks):
-                if facts["path"] != self.key:
-                    yield Entry(facts["path"].removeprefix(prefix), facts["size"], etag=facts["e_tag"])
+            for chunk in chunks:
+                for facts in chunk:
+                    if facts["path"] != self.key:
+                        yield Entry(facts["path"].removeprefix(prefix), facts["size"], etag=facts["e_tag"])
 
     def entries(self) -> dict[str, int]:
         """Names one level below this prefix: sizes in bytes of objects, -1 for prefixes."""
@@ -276,26 +212,28 @@ class ObjectPath:
 
     # ------------------------------------------------------------------------------------------------------ reading
 
-    def open(self, mode: str = "rb", etag: str | None = None, first_piece: int = MIN_PIECE) -> io.BufferedReader:
-        """Open the object as a seekable binary file for reading; the first read is the first request.
-
-        Reading raises ObjectChangedError if the object has another ETag than ``etag``. Requests begin with
-        ``first_piece`` bytes and grow to `MAX_PIECE` while reading is sequential.
-        """
+    def open(self, mode: str = "rb") -> io.BufferedReader:
+        """Open the object as a seekable binary file for reading."""
         if mode != "rb":
             raise ValueError(f"mode={mode}: objects are opened for reading only")
-        return io.BufferedReader(_RangeReader(self, etag, min(first_piece, MAX_PIECE)))
+        return io.BufferedReader(_Reader(self), BUFFER)
 
     @contextmanager
-    def open_listed(self, size: int, etag: str | None = None) -> Iterator[tuple[BinaryIO, int]]:
-        """Open an object of a listing; yield the open file and the listed size, which the ETag proves."""
-        with self.open("rb", etag, max(size, 1)) as stream:
-            yield stream, size
+    def open_listed(self, size: int, etag: str | None = None, start: int = 0) -> Iterator[tuple[BinaryIO, int]]:
+        """Read an object of a listing from a byte on; yield the bytes as a file and the listed size.
 
-    def read_bytes(self, etag: str | None = None) -> bytes:
-        """Return the content of the object; raise FileNotFoundError, ObjectChangedError or MachineError."""
-        with self.open("rb", etag, MAX_PIECE) as stream:
-            return stream.read()
+        Raises ObjectChangedError unless the object has the listed ETag, if that is given.
+        """
+        options = {"if_match": etag} if etag else {}
+        with _request(self) as (obstore, store):
+            answer = obstore.get(store, self.key, options=options | ({"range": (start, size)} if start else {}))
+            content = bytes(answer.bytes())
+        yield io.BytesIO(content), size
+
+    def read_bytes(self) -> bytes:
+        """Return the content of the object; raise FileNotFoundError or MachineError."""
+        with self.open_listed(0) as (file, _):
+            return file.read()
 
     def read_text(self, encoding: str = "utf-8") -> str:
         """Return the content of the object as text."""
@@ -303,9 +241,8 @@ class ObjectPath:
 
     def mapped(self, offset: int, size: int) -> tuple[bytearray, int]:
         """Read a part of the object with one request, as bytes that can be written to; see `LocalPath.mapped`."""
-        with self.open("rb", first_piece=size) as stream:
-            stream.seek(offset)
-            content = bytearray(stream.read(size))
+        with _request(self) as (obstore, store):
+            content = bytearray(obstore.get_range(store, self.key, start=offset, length=size))
         if len(content) < size:
             raise ValueError("the object ends before")
         return content, 0
@@ -315,8 +252,9 @@ class ObjectPath:
         """Provide a temporary copy of the object on the local disk."""
         with tempfile.TemporaryDirectory(prefix=TEMPORARY_PREFIX) as folder:
             file = Path(folder) / self.name
-            with self.open(first_piece=MAX_PIECE) as source, file.open("wb") as copy:
-                shutil.copyfileobj(source, copy, MAX_PIECE)
+            with _request(self) as (obstore, store), file.open("wb") as copy:
+                for chunk in obstore.get(store, self.key).stream():
+                    copy.write(chunk)
             yield file
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
@@ -354,7 +292,7 @@ class ObjectPath:
 
     def _put(self, content: bytes | Path, mode: Any) -> None:
         with _request(self) as (obstore, store):
-            obstore.put(store, self.key, content, mode=mode, chunk_size=MAX_PIECE, max_concurrency=UPLOADS)
+            obstore.put(store, self.key, content, mode=mode, chunk_size=PIECE, max_concurrency=4)
 
     def delete(self) -> None:
         """Delete the object; an object that does not exist is no error."""
@@ -364,8 +302,7 @@ class ObjectPath:
     def delete_all(self) -> None:
         """Delete the object, and all objects below this prefix."""
         prefix = f"{self.key}/" if self.key else ""
-        entries = self.walk_entries()
-        while keys := [prefix + entry.path for entry in itertools.islice(entries, DELETED_AT_ONCE)]:
+        if keys := [prefix + entry.path for entry in self.walk_entries()]:
             with suppress(FileNotFoundError), _request(self) as (obstore, store):
                 obstore.delete(store, keys)
         self.delete()
@@ -375,39 +312,14 @@ class ObjectPath:
         return Path(tempfile.gettempdir()), TEMPORARY_PREFIX
 
 
-def started_ahead(
-    pool: ThreadPoolExecutor,
-    function: Callable[[Item], Result],
-    items: Iterable[Item],
-    most: int,
-    size: Callable[[Item], int] = lambda item: 0,
-    most_bytes: int = 0,
-) -> Generator[Future[Result], None, None]:
-    """Yield the calls of a function in the order of the items.
+class _Reader(io.RawIOBase):
+    """Adapt obstore's reader to a file of the standard library."""
 
-    Up to ``most`` calls have begun, of items whose sizes sum to at most ``most_bytes``; one call is always allowed.
-    """
-    started: deque[tuple[Future[Result], int]] = deque()
-    try:
-        for item in items:
-            while started and (len(started) == most or sum(begun for _, begun in started) + size(item) > most_bytes):
-                yield started.popleft()[0]
-            started.append((pool.submit(function, item), size(item)))
-        while started:
-            yield started.popleft()[0]
-    finally:
-        for future, _ in started:
-            future.cancel()
-
-
-class _RangeReader(io.RawIOBase):
-    """Read an object by range requests. All of them ask for the ETag of the first answer."""
-
-    def __init__(self, path: ObjectPath, etag: str | None = None, first_piece: int = MIN_PIECE) -> None:
+    def __init__(self, path: ObjectPath) -> None:
         super().__init__()
-        self._path, self._etag, self._size = path, etag, -1
-        self._piece, self._start, self._position = memoryview(b""), 0, 0
-        self._first_piece = self._piece_size = first_piece
+        self._path = path
+        with _request(path) as (obstore, store):
+            self._file = obstore.open_reader(store, path.key, buffer_size=BUFFER)
 
     def readable(self) -> bool:
         return True
@@ -416,56 +328,17 @@ class _RangeReader(io.RawIOBase):
         return True
 
     def tell(self) -> int:
-        return self._position
+        return int(self._file.tell())
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        if whence == io.SEEK_END:
-            offset += self._path.stat().st_size
-        elif whence == io.SEEK_CUR:
-            offset += self._position
-        if offset < 0:
-            raise ValueError(f"position {offset} is before the start of {self._path}")
-        self._position = offset
-        return offset
+        return int(self._file.seek(offset, whence))
 
     def readinto(self, buffer: WriteableBuffer) -> int:
         view = memoryview(buffer).cast("B")
-        if not view:
-            return 0
-        piece = self._at_position(len(view))[: len(view)]
-        view[: len(piece)] = piece
-        self._position += len(piece)
-        return len(piece)
-
-    def _at_position(self, wanted: int) -> memoryview:
-        """Return bytes from the position on, fetched if necessary; none only at the end of the object."""
-        end = self._start + len(self._piece)
-        if not self._start <= self._position < end:
-            sequential = self._position == end and end > 0
-            self._piece_size = min(2 * self._piece_size, MAX_PIECE) if sequential else self._first_piece
-            size = max(self._piece_size, min(wanted, MAX_PIECE))
-            self._piece, self._start = self._fetch(self._position, size), self._position
-        return self._piece[self._position - self._start :]
-
-    def _fetch(self, start: int, size: int) -> memoryview:
-        if 0 <= self._size <= start:
-            return memoryview(b"")
-        options = {"range": (start, start + size), **({"if_match": self._etag} if self._etag else {})}
-        try:
-            with _request(self._path) as (obstore, store):
-                answer = obstore.get(store, self._path.key, options=options)
-                content = memoryview(answer.bytes())
-        except _EndOfObjectError:
-            return memoryview(b"")
-        self._size, self._etag = answer.meta["size"], self._etag or answer.meta["e_tag"]
-        return content
-
-
-# ------------------------------------------------------------------------------------------------ obstore's own terms
-
-
-class _EndOfObjectError(Exception):
-    """Report that a range begins behind the last byte."""
+        with _request(self._path):
+            content = self._file.read(len(view))
+        view[: len(content)] = content
+        return len(content)
 
 
 @lru_cache(maxsize=64)
@@ -476,16 +349,8 @@ def _store(scheme: str, bucket: str) -> Any:
     return from_url(
         f"{scheme}://{bucket}",
         # an endpoint of http:// is used as given: obstore would otherwise need AWS_ALLOW_HTTP=true as well
-        client_options={
-            "allow_http": True,
-            "timeout": timedelta(seconds=REQUEST_TIMEOUT_S),
-            "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
-        },
-        retry_config={
-            "max_retries": MAX_RETRIES,
-            "retry_timeout": timedelta(seconds=RETRY_TIMEOUT_S),
-            "backoff": {"init_backoff": timedelta(seconds=0.2), "max_backoff": timedelta(seconds=10), "base": 2},
-        },
+        client_options={"allow_http": True, "timeout": timedelta(seconds=REQUEST_TIMEOUT_S)},
+        retry_config={"max_retries": MAX_RETRIES, "retry_timeout": timedelta(seconds=RETRY_TIMEOUT_S)},
     )
 
 
@@ -523,8 +388,6 @@ def _error(path: ObjectPath, error: Exception, is_refused: bool = False) -> Exce
             f"{path}: access was refused ({reason}); expected credentials in the environment, such as "
             f"{SCHEMES[path.scheme]}"
         )
-    if reason.startswith("416"):
-        return _EndOfObjectError()
     return MachineError(f"{path}: the object store failed ({reason}); rerun when it answers")
 
 

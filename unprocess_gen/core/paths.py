@@ -19,9 +19,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from unprocess_gen.core.entries import Entry, EntryKind, Item, Result
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import commit_file, sync, sync_folder
-from unprocess_gen.core.object_store import Entry, EntryKind, Item, ObjectPath, Result, is_url
+from unprocess_gen.core.object_store import ObjectPath, is_url
 
 # A pipe that replaced a listed file must not block the open for ever.
 _OPEN_FLAGS = os.O_RDONLY
@@ -101,8 +102,8 @@ class LocalPath(_NativePath):
             return None
 
     @contextmanager
-    def open_listed(self, size: int, etag: str | None = None) -> Iterator[tuple[BinaryIO, int]]:
-        """Open a file without waiting for a pipe; yield the open file and its present size.
+    def open_listed(self, size: int, etag: str | None = None, start: int = 0) -> Iterator[tuple[BinaryIO, int]]:
+        """Open a file at a byte, without waiting for a pipe; yield the open file and its present size.
 
         Raises NotAFileError unless it is a regular file, OSError if it cannot be opened. A listed size and ETag are not
         compared.
@@ -110,6 +111,7 @@ class LocalPath(_NativePath):
         descriptor = os.open(self, _OPEN_FLAGS)
         try:
             size = _size_of_regular(descriptor)
+            os.lseek(descriptor, start, os.SEEK_SET)
             yield os.fdopen(descriptor, "rb", buffering=0, closefd=False), size
         finally:
             os.close(descriptor)

@@ -19,10 +19,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from unprocess_gen.config.values import error_in_one_line
+from unprocess_gen.core.entries import Result
 from unprocess_gen.core.errors import RESUME, ConfigError, LockedError, MachineError, UnprocessGenError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.locks import LockFile
-from unprocess_gen.core.object_store import ObjectPath, Result, StoreAccessError
+from unprocess_gen.core.object_store import ObjectPath, StoreAccessError
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import LocalPath, any_path
 from unprocess_gen.core.records import MAX_BYTES

@@ -25,9 +25,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import PurePosixPath
 
+from unprocess_gen.core.entries import Entry, EntryKind
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import leads_outside
-from unprocess_gen.core.object_store import Entry, EntryKind, StoreAccessError
+from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import absolute_text, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.types import Source

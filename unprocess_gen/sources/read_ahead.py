@@ -12,7 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
 
-from unprocess_gen.core.object_store import ObjectPath, started_ahead
+from unprocess_gen.core.entries import started_ahead
+from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Source
 

@@ -43,8 +43,8 @@ def source_file(root: str, path: str) -> LocalPath | ObjectPath:
 
 
 @contextmanager
-def opened(root: str, source: Source) -> Iterator[BinaryIO]:
-    """Open a source, unless it is not, or no longer, the regular file that was listed.
+def opened(root: str, source: Source, start: int = 0) -> Iterator[BinaryIO]:
+    """Open a source at byte ``start``, unless it is not, or no longer, the regular file that was listed.
 
     Raises
     ------
@@ -56,10 +56,11 @@ def opened(root: str, source: Source) -> Iterator[BinaryIO]:
     """
     if source.reason is not None:
         raise SourceError(source.reason, f"{source.name} was not a readable file when the folder was listed")
+    listed_bytes = source.size_bytes or 0
+    if listed_bytes > MAX_FILE_BYTES:
+        raise SourceError("too_large", f"{source.name} has {listed_bytes} bytes, more than {MAX_FILE_BYTES}")
     try:
-        with source_file(root, source.path).open_listed(source.size_bytes or 0, source.etag) as (file, size_bytes):
-            if size_bytes > MAX_FILE_BYTES:
-                raise SourceError("too_large", f"{source.name} has {size_bytes} bytes, more than {MAX_FILE_BYTES}")
+        with source_file(root, source.path).open_listed(listed_bytes, source.etag, start) as (file, size_bytes):
             _check_size(source, size_bytes, "since it was listed")
             yield file
     except ObjectChangedError:

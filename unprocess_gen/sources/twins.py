@@ -58,8 +58,7 @@ def _sharing_tails(root: str, groups: Iterable[Sequence[Source]]) -> Iterator[So
 
 def _tail_digest(root: str, source: Source) -> int | None:
     """Digest of a file's last `TAIL_BYTES`, None if it cannot be read."""
-    with suppress(SourceError), opened(root, source) as file:
-        file.seek(max(0, (source.size_bytes or 0) - TAIL_BYTES))
+    with suppress(SourceError), opened(root, source, max(0, (source.size_bytes or 0) - TAIL_BYTES)) as file:
         return xxhash.xxh3_64_intdigest(file.read(TAIL_BYTES))
     return None
 
