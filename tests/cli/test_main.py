@@ -40,7 +40,6 @@ REFUSED = [
     (["seed=[1"], r".*\[1"),
     (["--flag"], r"generate: --flag: no such flag; expected -+quiet, .*--multirun, "),
     (["--out", "x"], r"generate: --out: no such flag; expected .*; out is a setting: write out=…"),
-    (["preview", "ds", "sheets"], r"preview: sheets: unknown argument; .*; to write to sheets, add --to sheets"),
     (["--help", "verfy"], r"--help verfy: no such verb or group; expected one of generate, .*; did you mean verify"),
     (["camera=/my/own.yaml"], r"camera=/my/own.yaml: .*; for a file of your own, .* --config-dir FOLDER camera=own"),
     (["--multrun", "seed=1,2"], r"generate: --multrun: no such flag; .*; did you mean --multirun\?"),
@@ -49,8 +48,6 @@ REFUSED = [
     (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate -2: expected an integer of 0 or more"),
     (["replay", "ds", "--keys="], r"replay: --keys: a value is missing"),
     (["verify"], r"verify: expected the folder of a dataset or of a sweep"),
-    (["plan", "--quiet", "--verbose"], r"--quiet and --verbose exclude each other"),
-    (["plan", "--log-file", "/no/such/file"], r"--log-file /no/such/file: cannot be written"),
     (["--config-dir", "/no/such"], r"--config-dir /no/such: no such folder"),
     (["--config-name", "other"], r".*'other'"),
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
@@ -424,7 +421,6 @@ OUTPUTS = [
     ("preview", "DS", "--to", "DS/sheets"),
     ("dng", "DS", "--keys", "2", "--to", "DS/new"),
     ("report", "DS", "--to", "DS/page.html"),
-    ("verify", "DS", "--log-file", "DS/manifest.csv"),
     ("accuracy", "out=DS/accuracy"),
 ]
 
@@ -438,13 +434,6 @@ def test_no_verb_writes_into_a_dataset(
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert "is inside the dataset" in done.err
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / moved).rglob("*")} == before
-
-
-def test_log_file_is_not_appended_to_a_photograph(moved: Path, run_main: RunMain, tmp_path: Path) -> None:
-    photograph = tmp_path / "moved/002.png"
-    before = photograph.read_bytes()
-    done = run_main("verify", moved, "--log-file", photograph)
-    assert (done.code, photograph.read_bytes()) == (2, before)
 
 
 @pytest.mark.parametrize("verb", slow_except(("replay",), TAKES_SOURCE))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import logging
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -143,36 +142,6 @@ def test_quiet_shows_no_progress_but_results(run_main: RunMain, tmp_path: Path) 
     done = run_main("source.root=p", "n_jobs=1", "-q")
     assert (done.code, done.err) == (0, "")
     assert done.out.startswith("ds: 2 pairs")
-
-
-def test_verbose_shows_version_and_command(run_main: RunMain, tmp_path: Path) -> None:
-    fill(tmp_path / "p", 2)
-    done = run_main("plan", "-v", "source.root=p")
-    assert re.match(r"gen-dataset: unprocess_gen [\d.]+\S*, Python 3\.\d+\.\d+\S*: \['plan', '-v'", done.err)
-
-
-def test_log_file_has_messages_results_errors_and_exit_code(run_main: RunMain, tmp_path: Path) -> None:
-    fill(tmp_path / "p", 2)
-    for _ in range(2):
-        assert run_main("source.root=p", "n_jobs=1", "--log-file", "run.log").code == 0
-    assert run_main("verify", "nothing", "--log-file=run.log").code == 2
-    lines = (tmp_path / "run.log").read_text().splitlines()
-    assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|ERROR) ", line) for line in lines)
-    text = "\n".join(lines)
-    for part in (
-        "2/2 images",
-        "ds: 2 pairs",
-        "ds is complete",
-        "INFO exit code 0",
-        "ERROR verify: nothing: ",
-        "exit code 2",
-    ):
-        assert part in text
-
-
-def test_full_log_file_does_not_end_a_run(run_main: RunMain, tmp_path: Path) -> None:
-    fill(tmp_path / "p", 2)
-    assert run_main("source.root=p", "n_jobs=1", "--log-file", "/dev/full").code == 0
 
 
 # Signals --------------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.cli.messages import logging_to
+from unprocess_gen.cli.messages import logging_to_stderr
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.types import Source
@@ -330,7 +330,7 @@ def test_n_jobs_minus_one_uses_all_allowed_cores() -> None:
 
 
 def test_progress_is_plain_lines_without_a_terminal(make: Make, photos: Path, tmp_path: Path, capfd: Any) -> None:
-    with logging_to():
+    with logging_to_stderr():
         make(photos, tmp_path / "ds")
     out, err = capfd.readouterr()
     assert out == ""
@@ -357,7 +357,7 @@ def test_run_reports_compiling_unless_kernels_are_compiled(
 
     monkeypatch.setattr(worker.self_test, "are_compiled", lambda kernels: compiled)
     monkeypatch.setattr(worker.self_test, "check", compile_kernels)
-    with logging_to():
+    with logging_to_stderr():
         make(fill(tmp_path / "p", 1), tmp_path / "ds", "self_test=stop")
     assert (COMPILING in "".join([*shown, capsys.readouterr().err])) is not compiled
 

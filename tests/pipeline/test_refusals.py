@@ -21,7 +21,7 @@ from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 from helpers.processes import ONE
 
-from unprocess_gen.cli.messages import logging_to
+from unprocess_gen.cli.messages import logging_to_stderr
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import machine_error
@@ -251,7 +251,7 @@ class Terminal:
 def run_progress(monkeypatch: pytest.MonkeyPatch, terminal: Terminal, quiet: bool = False, label: str = "") -> str:
     monkeypatch.delenv("COLUMNS", raising=False)
     monkeypatch.setattr(os, "get_terminal_size", lambda *_: os.terminal_size((0, 0)))
-    with logging_to(quiet=quiet), monkeypatch.context() as patch:
+    with logging_to_stderr(quiet=quiet), monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", terminal)
         with Progress(4, label=label) as progress:
             progress.advance(2, failed=1)
@@ -281,7 +281,7 @@ def test_closed_terminal_does_not_end_the_run(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_lines_name_the_job_of_a_sweep(capfd: pytest.CaptureFixture[str]) -> None:
-    with logging_to(), Progress(2, label="3/20 camera=sony_a7r") as progress:
+    with logging_to_stderr(), Progress(2, label="3/20 camera=sony_a7r") as progress:
         progress.advance(2)
     assert capfd.readouterr().err.startswith("gen-dataset: 3/20 camera=sony_a7r: 2/2 images, ")
 
@@ -290,7 +290,7 @@ def test_time_left_leaves_out_compiling(monkeypatch: pytest.MonkeyPatch, capfd: 
     """The first image is finished after a minute of compiling, the next two in six seconds."""
     clock = iter((0.0, 60.0, 66.0))
     monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(clock))
-    with logging_to(), Progress(9) as progress:
+    with logging_to_stderr(), Progress(9) as progress:
         progress.advance(1)
         progress.advance(2)
     assert capfd.readouterr().err == "gen-dataset: 3/9 images, 0.3 images/s, 0 failed, 18 s left\n"

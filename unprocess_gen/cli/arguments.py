@@ -54,11 +54,7 @@ class Argument:
         return f"{', '.join(self.names)} {self.metavar}".rstrip() if self.is_flag else f"{self.key}={self.metavar}"
 
 
-STANDARD = (
-    Argument(("-q", "--quiet"), "show only warnings and errors on stderr; results still go to stdout"),
-    Argument(("-v", "--verbose"), "show details on stderr"),
-    Argument(("--log-file",), "append all messages to FILE, with the time of each", "FILE"),
-)
+STANDARD = (Argument(("-q", "--quiet"), "show only warnings and errors on stderr; results still go to stdout"),)
 """Flags of every verb."""
 
 
@@ -235,10 +231,7 @@ def _take_settings(verb: Verb, words: Iterable[str], values: dict[str, Any]) -> 
         elif verb.composes:
             raise ConfigError(f"{verb.name}: {word}: expected a setting key=value{path_hint(word)}")
         else:
-            hint = _expected(verb, key)
-            if not equals and any("--to" in argument.names for argument in verb.arguments) and "to" not in values:
-                hint += f"; to write to {word}, add --to {word}"
-            raise ConfigError(f"{verb.name}: {word}: unknown argument; {hint}")
+            raise ConfigError(f"{verb.name}: {word}: unknown argument; {_expected(verb, key)}")
     return others
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import compose, run_sweep
-from unprocess_gen.cli.messages import print_result, report
+from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.cli.runs import generate_dataset
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import build_names
@@ -34,7 +34,7 @@ def build(call: Call) -> int:
         if name or "to" in call.values:
             raise ConfigError("build: --list: lists all builds; expected neither NAME nor --to; leave them out")
         for entry in map(read_build, build_names()):
-            print_result(f"{entry.name:<28} {len(entry.rows()):>3} pairs  {entry.recipe.title}")
+            print_results(f"{entry.name:<28} {len(entry.rows()):>3} pairs  {entry.recipe.title}")
         return 0
     if name is None or "to" not in call.values:
         missing = "NAME" if name is None else "--to"
@@ -51,7 +51,7 @@ def build(call: Call) -> int:
         report(f"{folder}: {text}", logging.ERROR)
     if shown:
         return DamageError.exit_code
-    print_result(f"{folder} is the build {name}, bit for bit")
+    print_results(f"{folder} is the build {name}, bit for bit")
     return 0
 
 

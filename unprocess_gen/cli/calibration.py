@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.messages import print_result, report
+from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import local_path
 from unprocess_gen.reports.formatting import counted, short_number
@@ -25,7 +25,7 @@ def calibrate(call: Call) -> int:
         raise ConfigError(f"calibrate: --report {page}: draws measured frames, not tags; leave it out")
     check_outputs(to)
     isos = _state(folder, to) if "from" in call.values else _measure(folder, to, page)
-    print_result(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with {_usage(to)} scene.iso={isos[0]:g}")
+    print_results(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with {_usage(to)} scene.iso={isos[0]:g}")
     return 0
 
 
@@ -38,7 +38,7 @@ def _state(folder: Path, to: Path) -> Sequence[float]:
     _report_notes(stated.notes)
     write_files(to, stated_yaml(stated, to.stem), stated_json(stated))
     for iso, a, b, *_ in stated.isos:
-        print_result(f"ISO {iso:g}: a {short_number(a[1], 4)} DN, b {short_number(b[1], 4)} DN² (stated)")
+        print_results(f"ISO {iso:g}: a {short_number(a[1], 4)} DN, b {short_number(b[1], 4)} DN² (stated)")
     return [result.iso for result in stated.isos]
 
 
@@ -56,14 +56,14 @@ def _measure(folder: Path, to: Path, page: str | None) -> Sequence[float]:
     write_profile(calibration, to)
     for result in calibration.isos:
         gain, read, row = (result[name] for name in ("dn_per_e", "read_std_dn", "row_std_dn"))
-        print_result(
+        print_results(
             f"ISO {result.iso:g}: {short_number(gain.value, 4)} DN per electron "
             f"({short_number(gain.low, 4)} to {short_number(gain.high, 4)}), "
             f"read noise {short_number(read.value, 4)} DN, row noise {short_number(row.value, 3)} DN"
         )
     if page is not None:
         write_page(calibration, to.stem, f"gen-dataset calibrate {folder} --to {to}", Path(page))
-        print_result(f"drawn in {page}")
+        print_results(f"drawn in {page}")
     return calibration.captures.isos
 
 

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.messages import print_result, print_results
+from unprocess_gen.cli.messages import print_results
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import LocalPath, local_path
@@ -29,5 +29,5 @@ def camera(call: Call) -> int:
             LocalPath(path).write(options[group].encode(), str(path.parent))
     chosen = " ".join(f"{group}={path.stem}" for group, path in paths.items())
     print_results(sources)
-    print_result(f"{to}: use it with --config-dir {shlex.quote(str(to.parent.parent))} {chosen}")
+    print_results(f"{to}: use it with --config-dir {shlex.quote(str(to.parent.parent))} {chosen}")
     return 0

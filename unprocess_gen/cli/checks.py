@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.messages import print_result, report, report_error
+from unprocess_gen.cli.messages import print_results, report, report_error
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import worst
 from unprocess_gen.config.serialization import read_dataset_yaml
@@ -43,7 +43,7 @@ def verify(call: Call) -> int:
             codes.append(_finish(folder / result.folder, result.damages, call))
         except UnprocessGenError as error:  # the other datasets are verified nevertheless
             codes.append(report_error(error))
-    print_result(f"{folder}: {codes.count(0)} of {len(codes)} datasets are intact")
+    print_results(f"{folder}: {codes.count(0)} of {len(codes)} datasets are intact")
     return worst(codes)
 
 
@@ -69,7 +69,7 @@ def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
         texts = _compare_frames(folder, Path(call.values["against"]))
     if texts:
         return worst(codes) or DamageError.exit_code
-    print_result(f"{folder} is intact{done}")
+    print_results(f"{folder} is intact{done}")
     return 0
 
 
@@ -82,7 +82,7 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
         if step.exit_code:
             report(step.text, logging.ERROR)
         else:
-            print_result(step.text)
+            print_results(step.text)
         codes.append(step.exit_code)
     return codes
 
@@ -114,13 +114,13 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     pairs = RawPairs(folder)
     checks = check_pairs(with_bar(pairs, "pair checked", len(pairs)), len(pairs), access)
     if not checks.count:
-        print_result(
+        print_results(
             f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
             "noise.dark_frames=FOLDER names their folder"
         )
         return []
     unchecked = f"; {checks.unchecked} not checked: too few usable sites, or a dark frame that is not available"
-    print_result(
+    print_results(
         f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong"
         + (unchecked if checks.unchecked else "")
     )
@@ -138,7 +138,7 @@ def _compare_frames(folder: AnyPath, frames: Path) -> list[str]:
     for note in comparisons.notes:
         report(note)
     compared = [comparison for comparison in comparisons.numbers if comparison.verdict != against.NOT_COMPARED]
-    print_result(
+    print_results(
         f"{frames}: {counted(len(compared), 'number')} compared with the profile {config.noise.name}, "
         f"{len(comparisons.differences)} wrong"
     )
@@ -169,7 +169,7 @@ def replay(call: Call) -> int:
             report(_complaint(result), logging.ERROR)
     same = codes.count(0) - unknown
     others = len(codes) - codes.count(0)
-    print_result(
+    print_results(
         f"{counted(same, 'pair')} {_are(same)} the same, bit for bit; {others} {_are(others)} not"
         + (f"; {counted(unknown, 'row')} without digests" if unknown else "")
         + (f"; arrays in {to}" if written else "")

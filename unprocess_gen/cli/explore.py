@@ -40,4 +40,4 @@ def explore(call: Call) -> int:
 
 
 def _print_address(address: str) -> None:
-    print_results([f"{address} shows the page on this machine; stop with Ctrl-C"])
+    print_results(f"{address} shows the page on this machine; stop with Ctrl-C")

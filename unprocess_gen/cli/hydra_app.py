@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.messages import print_result, print_results, report_error
+from unprocess_gen.cli.messages import print_results, report_error
 from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.sweep import job_folder, job_row, named_overrides, sweep_out, worst, write_row
 from unprocess_gen.core.errors import ConfigError
@@ -51,12 +51,12 @@ def compose(
     node, jobs = expand(call.overrides, folders, "--multirun" in call.hydra)
     if "--cfg" in call.hydra:
         for each in [node] if node is not None else (compose_node(job.overrides, folders) for job in jobs):
-            print_results([_config_text(each, call)])
+            print_results(_config_text(each, call))
         return 0
     if node is None:
         return run_sweep(folders, jobs, task, sweep_csv, totals)
     code, _, texts = task(validated_config(node, call.overrides), "")
-    print_results(texts)
+    print_results(*texts)
     return code
 
 
@@ -126,9 +126,9 @@ def run_sweep(
             results.append(result)
         if sweep_csv:
             write_row(out, job_row(name, ",".join(named[number - 1]), job.swept, code, result))
-        print_results(texts)
+        print_results(*texts)
     if totals is not None and results:
-        print_result(totals(results))
+        print_results(totals(results))
     return worst(codes)
 
 

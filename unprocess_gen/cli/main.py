@@ -20,7 +20,7 @@ from unprocess_gen import __version__
 from unprocess_gen.cli.arguments import Verb, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
 from unprocess_gen.cli.help import global_help, group_help, key_help, verb_help
-from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
+from unprocess_gen.cli.messages import checked_streams, logging_to_stderr, report, report_error
 from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
@@ -54,14 +54,9 @@ def run(arguments: Sequence[str]) -> int:
         return 0
     prepare_libraries()
     call = parse(verb, rest)
-    values = call.values
-    with logging_to("quiet" in values, "verbose" in values, values.get("log_file")):
-        LOGGER.debug("unprocess_gen %s, Python %s: %s", __version__, sys.version.split()[0], list(arguments))
-        module, function = verb.run.split(".")
-        # errors are reported before the log file is closed
-        code = _exit_code(lambda: getattr(import_module(f"unprocess_gen.cli.{module}"), function)(call), arguments)
-        RESULTS.info("exit code %d", code)
-        return code
+    module, function = verb.run.split(".")
+    with logging_to_stderr("quiet" in call.values):
+        return int(getattr(import_module(f"unprocess_gen.cli.{module}"), function)(call))
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:
@@ -115,8 +110,6 @@ def _exit_code(step: Callable[[], int | None], arguments: Sequence[str]) -> int:
             return _report_signal(SIGNALS.received or signal.SIGINT, arguments)
         if isinstance(error, UnprocessGenError | PermissionError):
             return report_error(error)
-        if LOGGER.handlers:
-            RESULTS.error("unexpected error", exc_info=error)
         raise
 
 

@@ -1,6 +1,6 @@
-"""Write results to stdout, and messages to stderr and a log file.
+"""Write results to stdout, and messages to stderr.
 
-Messages go through the logger ``unprocess_gen``; the verbs' flags decide where they appear. A full stdout is a system
+Messages go through the logger ``unprocess_gen``. A full stdout is a system
 error, while a full stderr is ignored: it must not end a run.
 """
 
@@ -10,30 +10,20 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any, TextIO
 
-from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
-from unprocess_gen.core.output_paths import check_log_file
+from unprocess_gen.core.errors import MachineError, UnprocessGenError
 from unprocess_gen.sources.image.codec_messages import REDIRECTED
 
 LOGGER = logging.getLogger("unprocess_gen")
-RESULTS = logging.getLogger("unprocess_gen.results")
-"""What goes to stdout, once more for the log file; never shown on stderr."""
 
 
-def print_result(text: object) -> None:
-    """Print a line on stdout; with ``--log-file``, log it too."""
-    print(text)
-    RESULTS.info("%s", text)
-
-
-def print_results(texts: Iterable[object]) -> None:
-    """Print lines as `print_result` does, and flush: an error of stdout is raised here, not by a later step."""
+def print_results(*texts: object) -> None:
+    """Print lines on stdout and flush: an error of stdout is raised here, not by a later step."""
     for text in texts:
-        print_result(text)
+        print(text)
     sys.stdout.flush()
 
 
@@ -46,8 +36,6 @@ def report_error(error: BaseException, job: str = "") -> int:
         report(f"{job}{error}", logging.ERROR)
         return error.exit_code
     traceback.print_exception(error)
-    if LOGGER.handlers:
-        RESULTS.error("%sunexpected error", job, exc_info=error)
     return 1
 
 
@@ -60,49 +48,27 @@ def report(message: str, level: int = logging.WARNING) -> None:
 
 
 @contextmanager
-def logging_to(quiet: bool = False, verbose: bool = False, log_file: str | None = None) -> Iterator[None]:
-    """Show the messages of the logger ``unprocess_gen`` on stderr, and append them to a log file."""
-    if quiet and verbose:
-        raise ConfigError("--quiet and --verbose exclude each other; expected one of them")
-    handlers = [_StderrHandler(), *([] if log_file is None else [_file_handler(log_file)])]
-    LOGGER.setLevel(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)
-    RESULTS.setLevel(logging.INFO)
+def logging_to_stderr(quiet: bool = False) -> Iterator[None]:
+    """Show the messages of the logger ``unprocess_gen`` on stderr; with ``quiet``, only warnings and errors."""
+    handler = _StderrHandler()
+    LOGGER.addHandler(handler)
+    LOGGER.setLevel(logging.WARNING if quiet else logging.INFO)
     LOGGER.propagate = False
-    for handler in handlers:
-        LOGGER.addHandler(handler)
     try:
         yield
     finally:
-        LOGGER.propagate = True
+        LOGGER.removeHandler(handler)
         LOGGER.setLevel(logging.NOTSET)
-        for handler in handlers:
-            LOGGER.removeHandler(handler)
-            with suppress(OSError):  # what cannot be written to a full disk is dropped
-                handler.close()
+        LOGGER.propagate = True
 
 
 class _StderrHandler(logging.Handler):
     """Print each message on the current ``sys.stderr``, after the name of the program."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one message; results are on stdout already."""
-        if record.name != RESULTS.name:
-            with REDIRECTED:
-                print(f"gen-dataset: {record.getMessage()}", file=sys.stderr, flush=True)
-
-
-def _file_handler(log_file: str) -> logging.Handler:
-    """Return a handler that appends messages to a file; a full disk does not end the run."""
-    check_log_file(Path(log_file), f"--log-file {log_file}")
-    try:
-        handler = logging.FileHandler(log_file, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(
-            f"--log-file {log_file}: cannot be written ({error.strerror}); expected a file name"
-        ) from None
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    handler.handleError = lambda record: None  # type: ignore[method-assign]
-    return handler
+        """Print one message."""
+        with REDIRECTED:
+            print(f"gen-dataset: {record.getMessage()}", file=sys.stderr, flush=True)
 
 
 class _Stream:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
 from unprocess_gen.cli.hydra_app import compose
-from unprocess_gen.cli.messages import print_result, report
+from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.cli.places import given_root
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.reports.formatting import counted
@@ -54,9 +54,9 @@ def part(call: Call) -> int:
         )
     made = make_part(out, number, call.values.get("n_jobs"), given_root(call))
     if made is None:
-        print_result(f"{out} is complete; nothing to do")
+        print_results(f"{out} is complete; nothing to do")
         return DONE
-    print_result(
+    print_results(
         f"{out}: part {number} of {made.parts}: {counted(made.shards, 'shard')} committed, {made.made} of them "
         f"({counted(made.rows, 'row')}) in this run, {made.seconds:.1f} s"
     )
@@ -81,14 +81,14 @@ def status(call: Call) -> int:
     out = str(call.path)
     state = parts_status(out)
     if "left" in call.values:
-        print_result(left_text(state.left))
+        print_results(left_text(state.left))
     elif state.complete:
-        print_result(f"{out} is complete")
+        print_results(f"{out} is complete")
     else:
         done = f"{state.parts - len(state.left)} of {counted(state.parts, 'part')}"
         shards = f"{state.committed} of {counted(state.shards, 'shard')} committed"
         next_step = f"left: {left_text(state.left)}" if state.left else f"run gen-dataset merge {shlex.quote(out)}"
-        print_result(f"{out}: {done} done, {shards}; {next_step}")
+        print_results(f"{out}: {done} done, {shards}; {next_step}")
     return DONE
 
 
@@ -97,5 +97,5 @@ def merge(call: Call) -> int:
     from unprocess_gen.pipeline.parts import merge
 
     summary, max_failed = merge(str(call.path))
-    print_result(summary.sentence(max_failed))
+    print_results(summary.sentence(max_failed))
     return TOO_MANY_FAILED if summary.made and sum(summary.failed.values()) > max_failed else DONE

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import compose
-from unprocess_gen.cli.messages import print_result
+from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals, swept_keys
@@ -76,7 +76,7 @@ def report(call: Call) -> int:
     dark = dark_frames_of(folder / "manifest.csv", call)
     if "noise.dark_frames" in call.values and dark is not None:
         dark_folder(dark)  # refuses a folder that the user names and that does not exist
-    print_result(write_dataset_report(folder, to, None if root is None else any_path(root), dark))
+    print_results(write_dataset_report(folder, to, None if root is None else any_path(root), dark))
     return 0
 
 
@@ -87,7 +87,7 @@ def _report_sweep(folder: Path, to: Path | None, call: Call) -> int:
     if others := sorted(call.values.keys() & {"source.root", "noise.dark_frames"}):
         raise ConfigError(f"report: {folder}: is a sweep; {others[0]} is for one of its datasets; leave it out")
     jobs = read_sweep_table(folder / SWEEP_TABLE)
-    print_result(write_sweep_page(folder, jobs, swept_keys(jobs), to))
+    print_results(write_sweep_page(folder, jobs, swept_keys(jobs), to))
     return 0
 
 
@@ -113,7 +113,7 @@ def preview(call: Call) -> int:
             omitted = "the source's panel and the stages are" if with_stages else "the source's panel is"
             report_message(f"{sheet.key} ({sheet.source}): {omitted} omitted: {sheet.missing_source}")
     skipped = f"; {counted(failed, 'failed row')} skipped" if failed else ""
-    print_result(f"{counted(files, 'picture')} in {to}{skipped}")
+    print_results(f"{counted(files, 'picture')} in {to}{skipped}")
     return code
 
 
@@ -146,5 +146,5 @@ def dng(call: Call) -> int:
         (exported.without_profile, f"{undescribed} without NoiseProfile, which cannot describe the noise"),
         (failed, f"{counted(failed, 'failed row')} skipped"),
     )
-    print_result(f"{to}: " + "; ".join(text for count, text in counts if count))
+    print_results(f"{to}: " + "; ".join(text for count, text in counts if count))
     return 0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
 from unprocess_gen.cli.hydra_app import compose
-from unprocess_gen.cli.messages import print_result, print_results
+from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.config.option_files import group_options
 from unprocess_gen.core.paths import any_path
@@ -59,8 +59,8 @@ def again(call: Call) -> int:
     config = recorded_config(folder, given_root(call), changes)
     check_sources(folder, config)
     code, _, lines = generate_dataset(config)
-    print_results(lines)
-    print_result(compare(folder, any_path(config.out)))
+    print_results(*lines)
+    print_results(compare(folder, any_path(config.out)))
     return code
 
 

@@ -66,13 +66,6 @@ def check_output_file(file: Path, option: str, expected: str, *marks: bytes) -> 
         raise ConfigError(f"{option}: exists and is not {expected}; choose another name, or remove the file")
 
 
-def check_log_file(file: Path, option: str) -> None:
-    """Raise ConfigError if a file is inside a dataset, or exists and is not text."""
-    _refuse_dataset(file, option, "file")
-    if file.is_file() and b"\0" in _first_bytes(file, option):
-        raise ConfigError(f"{option}: exists and is not a text file; expected a log file; choose another name")
-
-
 def _first_bytes(file: Path, option: str) -> bytes:
     """Return the first 1,024 bytes of a file; ConfigError if it cannot be read."""
     try:
