@@ -29,7 +29,6 @@ from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.object_store import TEMPORARY_PREFIX, ObjectPath
 from unprocess_gen.core.types import Source
-from unprocess_gen.dataset.shards import ShardWriter
 from unprocess_gen.pipeline import workspace as workspaces
 from unprocess_gen.pipeline.generate import Summary, generate
 from unprocess_gen.pipeline.run_records import write_listing
@@ -163,18 +162,6 @@ def test_committed_shards_are_not_made_twice(
     assert_same(bucket / "ds", undisturbed)
 
 
-@pytest.mark.slow
-def test_failing_answers_during_a_run_are_repeated(
-    twelve: Path, bucket: ObjectPath, undisturbed: Path, proxy: Proxy
-) -> None:
-    servers.upload(twelve, bucket / "photos")
-    moment = random.Random(5)
-    proxy.answer = lambda *_: moment.choice((0, 0, 0, 0, 0, 0, 0, 503))
-    generate(config_of(bucket / "photos", bucket / "ds"))
-    proxy.answer = lambda *_: 0
-    assert_same(bucket / "ds", undisturbed)
-
-
 def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, undisturbed: Path) -> None:
     outcomes: list[Summary | Exception] = []
 
@@ -218,20 +205,6 @@ def test_record_of_sources_is_never_replaced(bucket: ObjectPath) -> None:
     assert write_listing(storage, sources) == write_listing(storage, sources)
     with pytest.raises(ConfigError, match=r"ds: was begun with other sources"):
         write_listing(storage, [replace(sources[0], etag="2")])
-
-
-def test_writer_that_fails_leaves_no_object(
-    twelve: Path, bucket: ObjectPath, scratch: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(ShardWriter, "add_rows", fail)
-    with pytest.raises(MachineError, match="No space left on device"):
-        generate(config_of(twelve, bucket / "ds"))
-    assert (bucket / "ds/shards").entries() == {}
-    assert (bucket / "ds/.work/rows").entries() == {}
-    assert not list(scratch.iterdir())
 
 
 def test_interrupted_upload_leaves_no_object(bucket: ObjectPath, proxy: Proxy, tmp_path: Path) -> None:
