@@ -24,8 +24,8 @@ from unprocess_gen.sources.scenes import synthetic
 HEADERS_READ = 8
 """Sources whose sizes are read before a run; the others are taken to be as large as their mean."""
 
-BYTES_BESIDE_ARRAYS = 8000
-"""Bytes of a pair in a shard beside its arrays: the row as JSON, and headers."""
+OTHER_BYTES = 8000
+"""Bytes of a pair in a shard without its arrays: the row as JSON, and headers."""
 
 
 def source_bytes(config: Config, height: int, width: int) -> int:
@@ -35,7 +35,7 @@ def source_bytes(config: Config, height: int, width: int) -> int:
     clean, noisy = (np.dtype(name).itemsize for name in (output.clean_dtype or output.dtype, output.dtype))
     site = clean + pairs * noisy + len(output.targets) * 3 * np.dtype(np.float32).itemsize
     sites = sum(patch.height * patch.width for patch in patches)
-    return (sites * site + len(patches) * pairs * BYTES_BESIDE_ARRAYS) * output.frames
+    return (sites * site + len(patches) * pairs * OTHER_BYTES) * output.frames
 
 
 def check_free_space(config: Config, sources: Sequence[Source]) -> None:
