@@ -25,7 +25,6 @@ import sys
 import tarfile
 import tempfile
 import warnings
-import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -35,7 +34,6 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script
 from helpers.commands import run_process
 
-PIP_PACKAGES = ("pillow", "wand", "thumbor", "filetype", "puremagic")
 DEBIAN_SOURCES = (
     *("libpng1.6", "libjpeg-turbo", "tiff", "libwebp", "libgd2", "graphicsmagick", "imagemagick", "gdk-pixbuf"),
     *("exiv2", "leptonlib", "vips", "golang-golang-x-image", "pygame"),
@@ -75,13 +73,10 @@ def fetched(scratch: Path) -> Iterator[tuple[str, list[Path]]]:
     """Yields each package with the archives of its source."""
     apt = apt_options(scratch)
     run_process("apt-get", *apt, "update")
-    pip = (sys.executable, "-m", "pip", "download", "--no-binary", ":all:", "--no-deps")
-    commands = {package: (*pip, package) for package in PIP_PACKAGES}
-    commands |= {package: ("apt-get", *apt, "source", "--download-only", package) for package in DEBIAN_SOURCES}
-    for package, command in commands.items():
+    for package in DEBIAN_SOURCES:
         (scratch / package).mkdir()
-        done = run_process(*command, cwd=scratch / package)
-        found = sorted(p for p in (scratch / package).iterdir() if re.search(r"\.(tar\.\w+|tgz|zip)$", p.name))
+        done = run_process("apt-get", *apt, "source", "--download-only", package, cwd=scratch / package)
+        found = sorted(p for p in (scratch / package).iterdir() if re.search(r"\.(tar\.\w+|tgz)$", p.name))
         if not found:
             last = (done.stderr.strip().splitlines() or ["no output"])[-1]
             print(f"{package}: not fetched ({last[:120]})", file=sys.stderr)
@@ -118,28 +113,15 @@ def unpack(archives: list[Path], to: Path) -> int:
 
 def members(archive: Path) -> Iterator[tuple[str, bytes]]:
     """Yields the pictures of an archive under names that a default glob matches."""
-    files = zip_files if archive.suffix == ".zip" else tar_files
-    for path, read in files(archive):
-        content = read()
-        name = re.sub(r"[^A-Za-z0-9._-]", "_", path.rpartition("/")[2])[-80:]
-        if name.lower().endswith(MATCHED):
-            yield name, content
-        elif OTHER_PICTURES.match(content):
-            yield name + (".jpg" if zlib.crc32(content) % 2 else ".png"), content
-
-
-def zip_files(archive: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
-    with zipfile.ZipFile(archive) as opened:
-        for entry in opened.infolist():
-            if not entry.is_dir() and entry.file_size <= LARGEST:
-                yield entry.filename, lambda entry=entry: opened.read(entry)  # type: ignore[misc]
-
-
-def tar_files(archive: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
     with tarfile.open(archive) as opened:
         for entry in opened:
-            if entry.isreg() and entry.size <= LARGEST:
-                yield entry.name, lambda entry=entry: opened.extractfile(entry).read()  # type: ignore[misc, union-attr]
+            file = opened.extractfile(entry) if entry.isreg() and entry.size <= LARGEST else None
+            content = b"" if file is None else file.read()
+            name = re.sub(r"[^A-Za-z0-9._-]", "_", entry.name.rpartition("/")[2])[-80:]
+            if content and name.lower().endswith(MATCHED):
+                yield name, content
+            elif OTHER_PICTURES.match(content):
+                yield name + (".jpg" if zlib.crc32(content) % 2 else ".png"), content
 
 
 # Deriving -------------------------------------------------------------------------------------------------------------

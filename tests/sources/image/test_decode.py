@@ -122,8 +122,6 @@ DEEP: dict[str, Callable[[np.ndarray], bytes]] = {
     "png": lambda pixels: cv2.imencode(".png", pixels[..., ::-1])[1].tobytes(),
     "tiff": lambda pixels: tiff(pixels),
     "tiff, big-endian": lambda pixels: tiff(pixels, byteorder=">"),
-    "tiff, deflated": lambda pixels: tiff(pixels, compression="zlib", predictor=True),
-    "tiff, LZW": lambda pixels: cv2.imencode(".tif", pixels[..., ::-1])[1].tobytes(),
     "tiff, tiles": lambda pixels: tiff(pixels, tile=(16, 16)),
 }
 
@@ -283,10 +281,9 @@ def test_alpha_is_dropped_if_all_pixels_are_opaque_and_refused_otherwise(kind: s
     assert reason_of(write(with_alpha(np.iinfo(dtype).max - 1, dtype))) == "alpha"
 
 
-@pytest.mark.parametrize("alpha", [255, 254], ids=["opaque", "not"])
-def test_gray_png_with_alpha(alpha: int) -> None:
-    data = png(2, 8, 4, bytes([5, 255, 170, alpha]))
-    assert pixels_of(data)[0, :, 0].tolist() == [5, 170] if alpha == 255 else reason_of(data) == "alpha"
+def test_gray_png_with_alpha() -> None:
+    assert pixels_of(png(2, 8, 4, bytes([5, 255, 170, 255])))[0, :, 0].tolist() == [5, 170]
+    assert reason_of(png(2, 8, 4, bytes([5, 255, 170, 254]))) == "alpha"
 
 
 PALETTE = chunk(b"PLTE", bytes(range(12)))
@@ -337,6 +334,7 @@ def test_heif_content_is_named_with_advice(brand: bytes, name: str) -> None:
 
 GRADES = noise(4, 6, channels=1)[..., 0]
 UNSUPPORTED = {
+    "12-bit jpeg": pillow(smooth(), "JPEG").replace(b"\xff\xc0\0\x11\x08", b"\xff\xc0\0\x11\x0c"),
     "float tiff": tiff(GRADES.astype(np.float32), "minisblack"),
     "signed tiff": tiff(GRADES.astype(np.int16), "minisblack"),
     "lab tiff": tiff(noise(4, 6), "cielab"),
@@ -353,12 +351,6 @@ UNSUPPORTED = {
 @pytest.mark.parametrize("kind", UNSUPPORTED)
 def test_kinds_that_opencv_would_read_wrongly_are_unsupported(kind: str) -> None:
     assert reason_of(UNSUPPORTED[kind]) == "unsupported"
-
-
-def test_a_jpeg_of_12_bits_is_unsupported() -> None:
-    data = pillow(smooth(), "JPEG")
-    frame = data.index(b"\xff\xc0")
-    assert reason_of(data[: frame + 4] + b"\x0c" + data[frame + 5 :]) == "unsupported"
 
 
 CMYK = Image.new("CMYK", (5, 4), (10, 20, 30, 40))
@@ -387,11 +379,6 @@ def test_the_limit_of_pixels_is_inclusive() -> None:
     data = pillow(noise(7, 13), "PNG")
     assert pixels_of(data, max_pixels=91).shape == (7, 13, 3)
     assert reason_of(data, max_pixels=90) == "too_large"
-
-
-def test_a_setting_that_does_not_exist_is_a_value_error() -> None:
-    with pytest.raises(ValueError, match="icc is 'maybe', expected one of ignore, refuse"):
-        decode(pillow(smooth(), "PNG"), max_pixels=1, icc="maybe")
 
 
 # Colour profiles ------------------------------------------------------------------------------------------------------
@@ -474,24 +461,13 @@ def test_bytes_after_the_end_are_accepted(kind: str) -> None:
         np.testing.assert_array_equal(pixels_of(CUTTABLE[kind] + tail), pixels_of(CUTTABLE[kind]))
 
 
-@pytest.mark.parametrize("kind", ["jpeg", "png", "webp, lossless, EXIF", "tiff, deflated, 16 bits"])
-def test_pixels_overwritten_with_zeros_up_to_the_end_are_refused(kind: str) -> None:
-    data = CUTTABLE[kind]
-    middle = len(data) // 2
-    assert reason_of(data[:middle] + bytes(len(data) - middle)) in ("truncated", "corrupt")
-
-
 CORRUPT = {
     "jpeg without a frame": b"\xff\xd8\xff\xe0\0\4ab\xff\xd9",
-    "jpeg without a scan": pillow(smooth(), "JPEG")[:20] + b"\xff\xd9",
     "jpeg of height 0": pillow(smooth(), "JPEG").replace(struct.pack(">HH", 40, 61), struct.pack(">HH", 0, 61), 1),
     "png with a flipped bit": CUTTABLE["png"][:-40] + bytes([CUTTABLE["png"][-40] ^ 1]) + CUTTABLE["png"][-39:],
     "png of width 0": png(0, 8, 2, b""),
-    "png of no colour type": png(1, 8, 5, b"abc"),
     "png that begins otherwise": b"\x89PNG\r\n\x1a\n" + chunk(b"CgBI", bytes(20)) + chunk(b"IEND"),
     "webp without a picture": b"RIFF" + struct.pack("<I4s4sI", 12, b"WEBP", b"EXIF", 0),
-    "webp of garbage": b"RIFF" + struct.pack("<I4s4sI", 32, b"WEBP", b"VP8L", 20) + b"\x2f\1\1\1\0" + bytes(15),
-    "tiff without a page": b"II*\0\0\0\0\0",
     "tiff of few strips": retagged(tiff(smooth(), rowsperstrip=8), {278: 2}),
     "tiff of short strips": retagged(tiff(smooth()), {279: 100}),
     "bmp of width -1": bmp(-1, 1, 24, bytes(8)),
@@ -567,14 +543,9 @@ def with_cicp(primaries: int, transfer: int, matrix: int = 0, full_range: int = 
     return data[:33] + chunk(b"cICP", bytes((primaries, transfer, matrix, full_range))) + data[33:]
 
 
-@pytest.mark.parametrize(("primaries", "transfer"), [(9, 16), (9, 18), (1, 8)])
-def test_png_of_high_dynamic_range_is_unsupported(primaries: int, transfer: int) -> None:
-    assert reason_of(with_cicp(primaries, transfer)) == "unsupported"
-
-
-@pytest.mark.parametrize(("matrix", "full_range"), [(9, 1), (0, 0)])
-def test_png_that_is_not_full_range_rgb_is_unsupported(matrix: int, full_range: int) -> None:
-    assert reason_of(with_cicp(1, 13, matrix, full_range)) == "unsupported"
+@pytest.mark.parametrize("codes", [(9, 16), (9, 18), (1, 8), (1, 13, 9, 1), (1, 13, 0, 0)])
+def test_png_whose_codes_are_not_display_referred_rgb_is_unsupported(codes: tuple[int, ...]) -> None:
+    assert reason_of(with_cicp(*codes)) == "unsupported"
 
 
 def test_other_primaries_of_a_png_are_treated_like_a_profile() -> None:
