@@ -13,7 +13,6 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -25,24 +24,17 @@ from helpers.commands import RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
 from helpers.promise_report import Figure
-from hypothesis import given
-from hypothesis import strategies as st
 from jinja2 import UndefinedError
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import dataset_text, read_dataset
 from unprocess_gen.reports import formatting, html_pages
 from unprocess_gen.reports.dataset_page import page as dataset_report
-from unprocess_gen.reports.dataset_page import statistics
 from unprocess_gen.reports.dataset_page.statistics import (
-    ManifestStatistics,
-    NumberSummary,
     add_value,
-    read_statistics,
     values_text,
 )
 
@@ -51,20 +43,6 @@ HOSTILE = "<img src=x onerror=alert('&amp;')>\".png"
 
 
 OVERRIDES = ("output.pairs_per_shard=4", "noise=brooks2019")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _charts_drawn_once() -> Iterator[None]:
-    """Draw equal histograms once: they take half of the time of a page, and most pages here are of one dataset."""
-    chart, drawn = dataset_report._chart, dict[tuple[str, bytes], dataset_report.Chart]()
-
-    def once(column: NumberSummary) -> dataset_report.Chart:
-        key = column.column, column.values.tobytes()
-        return drawn[key] if key in drawn else drawn.setdefault(key, chart(column))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset_report, "_chart", once)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -104,47 +82,12 @@ def cells(folder: Path, column: str) -> list[str]:
 
 # Statistics -----------------------------------------------------------------------------------------------------------
 
-GAINS = st.lists(st.floats(-1e15, 1e15) | st.none(), min_size=1, max_size=40)
-
-
-@given(GAINS, st.integers(1, 10))
-def test_ranges_are_those_of_the_values_whatever_the_batch_size(
-    made: Path, gains: list[float | None], size: int
-) -> None:
-    pair = next(row for row in read_rows(made / "manifest.csv") if row["status"] == "ok")
-    rows = [dict(pair) | {"red_gain": gain, "key": f"{number:08d}"} for number, gain in enumerate(gains)]
-    statistics = ManifestStatistics(len(rows))
-    for start in range(0, len(rows), size):
-        statistics.add(rows[start : start + size])
-
-    values = [gain for gain in gains if gain is not None]
-    assert (statistics.rows, statistics.images) == (len(rows), len(rows))
-    assert ("red_gain" in statistics.numbers) == bool(values)
-    if values:
-        column = statistics.numbers["red_gain"]
-        assert (column.least, column.greatest, column.values.tolist()) == (min(values), max(values), values)
-        assert column.mean == pytest.approx(sum(values) / len(values), rel=1e-9, abs=1e-3)
-
-
-@pytest.mark.parametrize(("count", "step"), [(12, 1), (207, 3)])
-def test_histograms_of_many_pairs_have_evenly_spaced_values(
-    made: Path, count: int, step: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(statistics, "PAIRS_DRAWN", 100)
-    pair = next(row for row in read_rows(made / "manifest.csv") if row["status"] == "ok")
-    rows = ({"red_gain": float(number)} | {key: value for key, value in pair.items() if key != "red_gain"}
-            for number in range(count))  # fmt: skip
-    column = read_statistics(rows, count).numbers["red_gain"]
-    assert (column.least, column.greatest, column.mean) == (0, count - 1, (count - 1) / 2)
-    assert column.values.tolist() == list(range(0, count, step))
-
 
 @pytest.mark.parametrize(
     ("values", "text"),
     [
         ("aab", "a (2), b (1)"),
         ("aa", "a"),
-        ("abcde", "5 different values"),
         ("aabcdefghijklmnopqrstuvw", "more than 16 different values"),
     ],
 )
@@ -215,11 +158,11 @@ def test_failures_are_listed_with_reason_and_detail(made: Path, text: str) -> No
 
 
 def test_ranges_and_means_agree_with_the_manifest(made: Path, text: str) -> None:
-    for column in ("red_gain", "blue_gain", "inverse_rgb_gain", "w_nexus_6p", "a_dn", "b_dn2"):
+    for column in ("red_gain", "inverse_rgb_gain", "a_dn", "b_dn2"):
         values = [float(cell) for cell in cells(made, column)]
-        (caption,) = re.findall(rf"<figcaption><b>{column}</b>(.*?)</figcaption>", text)
-        low, high, mean = (formatting.short_number(n, 4) for n in (min(values), max(values), sum(values) / len(values)))
-        assert caption.endswith(f": {low} to {high}, mean {mean}")
+        (row,) = re.findall(rf"<tr><td>{column}</td>(.*?)</tr>", text, re.DOTALL)
+        shown = (formatting.short_number(number, 6) for number in (min(values), sum(values) / len(values), max(values)))
+        assert re.findall(r'class="n">([^<]*)<', row) == list(shown)
 
 
 def test_clipped_sites_agree_with_the_manifest(made: Path, text: str) -> None:
@@ -234,9 +177,9 @@ def test_omitted_effects_are_listed_with_their_reason(make: Make, tmp_path: Path
     camera = ["noise=oppo_reno10x", "noise.iso=[uniform,100,3200]", "effects.prnu=off"]
     make(None, tmp_path / "ds", "source.limit=2", *camera, "source.patch=[random,64,3]")
     text = dataset_report.dataset_page(tmp_path / "ds")
-    assert '<tr><td>prnu</td><td class="n">6</td><td>switched off</td></tr>' in text
-    assert '<tr><td>row</td><td class="n">6</td><td>noise=oppo_reno10x gives no row_std_dn</td></tr>' in text
-    assert "<b>read_std_dn</b>" in text
+    assert '<tr><td>prnu</td><td class="w">switched off</td></tr>' in text
+    assert '<tr><td>row</td><td class="w">noise=oppo_reno10x gives no row_std_dn</td></tr>' in text
+    assert "<tr><td>read_std_dn</td>" in text
     assert "<dd>2, rows 6</dd>" in text
 
 
@@ -248,7 +191,7 @@ def test_versions_checksums_settings_and_commands_are_listed(made: Path, text: s
         assert said in read
     assert facts["versions"]["numpy"] in read
     assert (made / "config.yaml").read_text(encoding="utf-8") in read
-    assert re.search(r"<td>noise.name</td><td>brooks2019</td>", text)
+    assert re.search(r'<td>noise</td><td class="w">brooks2019</td>', text)
     assert "source.root=PHOTOGRAPHS out=again" in read
     assert facts["source"]["root"] in read
 
@@ -438,17 +381,6 @@ def test_odd_facts_are_shown_or_damage(key: str, failed: Path, tmp_path: Path, r
         assert done.err.count("\n") <= 1
 
 
-def test_odd_config_is_damage(copy: Path, run_main: RunMain) -> None:
-    for text in ("seed: 1\n", "- a\n", (copy / "config.yaml").read_text().replace("bits: 12", "bits: many")):
-        facts = read_dataset(copy / "dataset.json")
-        (copy / "config.yaml").write_text(text)
-        facts["config_sha256"] = file_sha256(copy / "config.yaml")
-        (copy / "dataset.json").write_text(dataset_text(facts), encoding="ascii")
-        done = run_main("report", copy)
-        assert (done.code, done.err.count("\n")) == (4, 1)
-        assert "config.yaml" in done.err
-
-
 # In a browser ---------------------------------------------------------------------------------------------------------
 
 MEASURE = """<script>addEventListener("load", () => {
@@ -501,7 +433,7 @@ def test_browser_shows_every_picture_without_overflow(
     assert measured["wide"] == [width, width]
     assert shot.shape[:2] == (measured["high"], width)
     assert measured["cut"] == []
-    assert len(measured["pictures"]) == scenes_page.count("<img ") >= 9
+    assert len(measured["pictures"]) == scenes_page.count("<img ") == 2
     for complete, natural_width, box in measured["pictures"]:
         assert complete and natural_width > 0
         assert box[2] >= min(200, width - 40) and box[3] >= 40

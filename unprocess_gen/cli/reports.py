@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -99,11 +98,8 @@ def preview(call: Call) -> int:
 
     folder = dataset_folder(call)
     to, root, with_stages = Path(call.values["to"]), given_root(call), "stages" in call.values
-    keys: Sequence[str] = []
-    failed = files = code = 0
-    if "keys" in call.values:
-        selected = select_pairs(folder / "manifest.csv", call.values["keys"])
-        keys, failed = [str(row["key"]) for row in selected.rows.values()], selected.failed
+    keys, files, code = call.values.get("keys", ""), 0, 0
+    failed = select_pairs(folder / "manifest.csv", keys).failed if keys else 0
     photographs = source_root(folder / "manifest.csv", root)
     _check_not_among_photographs(to, photographs)
     for sheet in write_sheets(folder, to, keys, None if root is None else any_path(root), with_stages):

@@ -16,56 +16,22 @@ from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_file, 
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.pipeline.workspace import REPORT
 
-LIBRARIES = {"matplotlib": "drawing needs", "jinja2": "HTML pages need"}
-"""Optional libraries of the extra ``figures``, and the purpose that an error message names."""
 
-
-def require_libraries(verb: str, names: tuple[str, ...] = ("matplotlib", "jinja2")) -> None:
-    """Check that the optional libraries of a verb are installed.
-
-    Parameters
-    ----------
-    verb : str
-        Name of the verb, for the message.
-    names : tuple of str
-        Keys of `LIBRARIES`.
-
-    Raises
-    ------
-    ConfigError
-        If a library is missing; the message names the extra that installs it.
-    """
-    for name in names:
-        require(name, f"{verb}: {LIBRARIES[name]} {name}", "figures")
+def require_libraries(verb: str) -> None:
+    """Raise ConfigError if an optional library of a verb that writes a page is missing; it names the extra."""
+    for name in ("matplotlib", "jinja2"):
+        require(name, f"{verb}: pages need {name}", "figures")
 
 
 def check_report_folder(out: Path, verb: str) -> None:
-    """Check, before any work, that a verb can draw and write its report to a folder.
+    """Check, before any work, that a verb can draw and write its report to a folder, which need not exist.
 
-    Parameters
-    ----------
-    out : Path
-        Folder of the report; it need not exist.
-    verb : str
-        Name of the verb, for messages.
-
-    Raises
-    ------
-    ConfigError
-        If a library is missing, the folder cannot be written, or it contains or is inside a dataset.
+    ConfigError if a library is missing, the folder cannot be written, or it contains or is inside a dataset.
     """
     require_libraries(verb)
-    for name in DATASET_ENTRIES:
-        if (out / name).exists():
-            raise ConfigError(
-                f"out={out}: contains a dataset ({name}); expected a folder without one; choose another out"
-            )
+    if name := next((name for name in DATASET_ENTRIES if (out / name).exists()), None):
+        raise ConfigError(f"out={out}: contains a dataset ({name}); expected a folder without one; choose another out")
     check_output_folder(out, f"out={out}")
-
-
-def check_page_file(file: Path, option: str) -> None:
-    """Raise ConfigError if a page cannot be written to a file, or would replace another file than a page."""
-    check_output_file(file, option, "an HTML page", b"<!doctype html", b"<html")
 
 
 def page_file(folder: AnyPath, to: Path | None = None) -> Path:
@@ -76,7 +42,7 @@ def page_file(folder: AnyPath, to: Path | None = None) -> Path:
     require_libraries("report")
     if to is not None:
         if not (isinstance(folder, Path) and to.resolve() == (folder / REPORT).resolve()):
-            check_page_file(to, f"--to {to}")
+            check_output_file(to, f"--to {to}", "an HTML page", b"<!doctype html", b"<html")
         return to
     if not isinstance(folder, Path):
         raise ConfigError(f"report: {folder} is in an object store; expected a local file; give --to FILE")

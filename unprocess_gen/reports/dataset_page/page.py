@@ -2,21 +2,17 @@
 
 The page is one self-contained file. It is not part of the dataset: nothing reads it. It describes ``dataset.json``,
 ``config.yaml`` and ``manifest.csv``, whose SHA-256 are checked first; ``gen-dataset verify`` checks every byte. Of the
-arrays, only a few evenly spaced pairs are read: `PAIRS_FITTED` for the noise check, and the pairs of the contact sheet.
+arrays, only a few evenly spaced pairs are read: `PAIRS_CHECKED` for the noise, and the pairs of the contact sheet.
 """
 
 from __future__ import annotations
 
-import functools
 import shlex
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import read_dataset_yaml
-from unprocess_gen.config.values import error_in_one_line, value_text
+from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.paths import AnyPath, folder_name
@@ -28,14 +24,8 @@ from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.workspace import read_dataset
-from unprocess_gen.reports.dataset_page.statistics import (
-    MEANINGS,
-    SITE_COLUMNS,
-    NumberSummary,
-    read_statistics,
-    values_text,
-)
-from unprocess_gen.reports.encoding import figure_png, picture_jpeg
+from unprocess_gen.reports.dataset_page.statistics import MEANINGS, SITE_COLUMNS, read_statistics, values_text
+from unprocess_gen.reports.encoding import picture_jpeg
 from unprocess_gen.reports.formatting import byte_size, short_number
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.noise_check.checks import check_pairs
@@ -45,18 +35,9 @@ from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 from unprocess_gen.sources.dark_frames import dark_folder
 from unprocess_gen.sources.names import encode_name
 
-PAIRS_FITTED = 8
+PAIRS_CHECKED = 8
 SHARDS_LISTED = 20
 JPEG_QUALITY = 88
-
-SETTINGS_SHOWN = (
-    *("seed", "source.limit", "source.clips", "source.downscale", "source.dequantize", "source.patch"),
-    *("camera.name", "camera.xyz2cam", "gains.red", "gains.blue", "gains.inverse_rgb", "gains.highlight"),
-    *("isp.tone", "isp.gamma", "sensor.bits", "sensor.black_level_dn", "sensor.white_level_dn", "sensor.pattern"),
-    *("sensor.clip", "sensor.saturated", "noise.name", "noise.law", "noise.iso", "noise.levels", "noise.draws"),
-    *("scene.name", "scene.exposure_ratio", "effects.all", "effects.tolerance", "accuracy"),
-)
-"""Settings in the table; the others are in the folded ``config.yaml``."""
 
 
 def write_dataset_report(
@@ -77,10 +58,8 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: st
     """Render the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
     from jinja2 import TemplateError  # optional library, extra "figures"
 
-    facts, config = checked_facts(folder)
-    count = facts["pairs"] + sum(facts["failed"].values()) + facts.get("filtered", 0)
-    rows = with_bar(read_rows(folder / "manifest.csv"), "row", count)
-    statistics = read_statistics(rows, facts["pairs"])
+    facts = checked_facts(folder)
+    statistics = read_statistics(with_bar(read_rows(folder / "manifest.csv"), "row"))
     first, name = statistics.first_pair, folder_name(folder)
     try:
         return render_page(
@@ -89,13 +68,11 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: st
             facts=facts,
             size=byte_size(sum(entry["bytes"] for entry in facts["shards"])),
             config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
-            settings=shown_settings(config),
             statistics=statistics,
             values_text=values_text,
             short_number=short_number,
             meanings=MEANINGS,
             site_columns=SITE_COLUMNS,
-            charts=[_chart(column) for column in statistics.numbers.values() if column.least < column.greatest],
             shards=[(shard_name(number), entry) for number, entry in enumerate(facts["shards"][:SHARDS_LISTED])],
             name=name,
             quoted=shlex.quote(name),
@@ -105,14 +82,8 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: st
         raise DamageError(f"{folder / 'dataset.json'}: cannot be shown ({error_in_one_line(error)})") from error
 
 
-def shown_settings(config: Config) -> dict[str, str]:
-    """Return `SETTINGS_SHOWN` that are not null, as text."""
-    settings: dict[str, Any] = {key: functools.reduce(getattr, key.split("."), config) for key in SETTINGS_SHOWN}
-    return {key: value_text(value) for key, value in settings.items() if value is not None}
-
-
-def checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
-    """Read ``dataset.json`` and the config, after comparing the digests of manifest and config."""
+def checked_facts(folder: AnyPath) -> dict[str, Any]:
+    """Read ``dataset.json``, and compare the digests of manifest and config."""
     if not (folder / "dataset.json").exists():
         raise DamageError(f"{folder}: dataset.json does not exist; expected a finished dataset")
     facts = read_dataset(folder / "dataset.json")
@@ -123,9 +94,10 @@ def checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
                 f"{path}: differs from the SHA-256 in dataset.json; run gen-dataset verify {folder} for details"
             )
     try:
-        return facts, read_dataset_yaml(folder / "config.yaml")[0]
+        read_dataset_yaml(folder / "config.yaml")
     except ConfigError as error:
         raise DamageError(str(error)) from error
+    return facts
 
 
 def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | None, first: Row) -> dict[str, Any]:
@@ -134,7 +106,7 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
     The noise of a few evenly spaced pairs is checked and fitted, unless their dark frames are not available.
     """
     every, missing, checks, fits = RawPairs(folder), "", None, list[NoiseFit]()
-    pairs = [every[number] for number in evenly_spaced(range(len(every)), PAIRS_FITTED)]
+    pairs = [every[number] for number in evenly_spaced(range(len(every)), PAIRS_CHECKED)]
     try:
         if first["dark_frame"] and dark_frames is None:
             raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
@@ -153,34 +125,3 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
         "first_shard": f"{folder_name(folder)}/shards/{shard_name(int(first['shard'] or 0))}",
         "first_key": sample_key(first),
     }
-
-
-class Chart(NamedTuple):
-    """The histogram of a column as a ``data:`` address, and its caption."""
-
-    column: str
-    caption: str
-    picture: str
-
-
-LOGARITHMIC_RATIO = 20
-"""Ratio of greatest to least value from which the scale of a histogram is logarithmic."""
-
-BARS = 24
-
-
-def _chart(column: NumberSummary) -> Chart:
-    from matplotlib.figure import Figure  # optional library, extra "figures"
-
-    figure = Figure(figsize=(3, 1.1), layout="constrained")
-    axes = figure.subplots()
-    axes.spines[["left", "top", "right"]].set_visible(False)
-    axes.set_yticks([])
-    is_logarithmic = column.least > 0 and column.greatest >= LOGARITHMIC_RATIO * column.least
-    axes.set_xscale("log" if is_logarithmic else "linear")
-    space = np.geomspace if is_logarithmic else np.linspace
-    axes.hist(column.values, space(column.least, column.greatest, BARS + 1).tolist())
-    least, mean, greatest = (short_number(value, 4) for value in (column.least, column.mean, column.greatest))
-    unit = " % of the frame" if column.column in SITE_COLUMNS else ""
-    caption = f"{MEANINGS[column.column]}: {least} to {greatest}{unit}, mean {mean}"
-    return Chart(column.column, caption, data_uri(figure_png(figure, dpi=120)))

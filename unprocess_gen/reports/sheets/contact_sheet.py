@@ -1,53 +1,57 @@
 """Draw sheets of a dataset's pairs: PNG files of each pair, or an overview with one strip per pair.
 
-Sheets need only shards and manifest. The source panel is omitted, with the reason in its place, if the photograph is
-not available or differs from the row's. Each panel shows the complete frame, averaged, and a detail at one pixel per
-site.
-
-Two stretches are used. ``own`` maps the percentiles `STRETCHED` of a picture to black and white, so that a few
-defective sites do not hide the picture; frames cannot be compared. ``common`` maps the black to the white level,
-square root, for every frame of a scene.
-
-A sheet of stages shows the photograph after each step of unprocessing (Figure 1 of the article), computed with the
-reference functions on the complete image scaled to a panel and on a detail, and the frames of the dataset.
-
-Each PNG file contains the digest of the manifest that it shows. A folder with sheets of another dataset is refused,
-because their names are keys: sheets of two datasets would replace each other or be mixed.
+Sheets need only shards and manifest. The panel of the source is empty, with the reason, if the photograph is not
+available or differs from the row's. Each panel shows the complete frame, averaged, and a detail at one pixel per site.
+Raw frames are drawn from the black to the white level of the scene, square root. A sheet of stages shows the
+photograph after each step of unprocessing (Figure 1 of the article), computed with the reference functions.
 """
 
 from __future__ import annotations
 
-import re
-import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+import functools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import file_sha256
+from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import CODE_RANGE, Float, Plan, Srgb
-from unprocess_gen.dataset.manifest import patch_from_row, read_columns
+from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.types import CODE_RANGE, Float, Photograph, Plan, Row, Source, Srgb
+from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
+from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
+from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
+from unprocess_gen.pipeline.replay import ADVICE, recorded_source, source_of, source_root
 from unprocess_gen.reports.encoding import picture_png
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.sheets import panels
-from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs
 from unprocess_gen.reports.sheets.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.simulation.reference import unprocess
-from unprocess_gen.simulation.reference.cfa import MONO, mosaic
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
+from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.patches import crop_patch
 
-PNG_HEADER_BYTES = 33
-"""Bytes of the signature and the first chunk of a PNG file, behind which text may follow (PNG specification, 5.6)."""
+PAIRS_SHOWN = 8
+"""Number of pairs shown if no keys are given."""
+RMS_SHOWN = 4.0
+"""Differences that are drawn black and white, in units of their RMS."""
 
-SHEET_NAME = re.compile(r"\d{8,}(-p\d+)?(-l\d+d\d+)?(\.stages)?\.png")
-"""Names of sheets: the key of a pair, and what they show."""
+Load = Callable[[SourceConfig, Source], tuple[str, Photograph]]
+
+
+class SheetPair(NamedTuple):
+    """The frames, row and plan of a pair, and its source pixels or the reason why they are missing."""
+
+    clean: MosaicArray
+    noisy: MosaicArray
+    row: Row
+    plan: Plan
+    source: Srgb | None
+    missing_source: str
 
 
 class SheetFiles(NamedTuple):
@@ -59,91 +63,98 @@ class SheetFiles(NamedTuple):
     missing_source: str
 
 
+def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterator[SheetPair]:
+    """Yield pairs in the order of the manifest, by default `PAIRS_SHOWN` evenly spaced ones.
+
+    ``keys`` is the text of ``--keys``, ``source`` the folder of the photographs, by default the recorded one.
+    ConfigError for an unknown key or folder.
+    """
+    if source is not None and not source.is_dir():
+        raise ConfigError(f"source.root={source}: is not a folder; expected the folder of the photographs")
+    pairs, manifest = RawPairs(folder), folder / "manifest.csv"
+    if not len(pairs):
+        raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
+    root = source_root(manifest, None if source is None else str(source))
+    load = functools.lru_cache(maxsize=1)(load_source)  # pairs of one photograph are adjacent
+    for number in select_pairs(manifest, keys).rows if keys else evenly_spaced(range(len(pairs)), PAIRS_SHOWN):
+        clean, noisy, row = pairs[number]
+        part, missing = _load_part(row, root, load)
+        yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_from_row(row), part, missing)
+
+
+def _load_part(row: Row, root: str | None, load: Load) -> tuple[Srgb | None, str]:
+    """Load the part of the source that a row's frames show; None and the reason if it is not available."""
+    if root is None and row["source_bytes"] != 0:
+        return None, "the dataset does not record where its photographs are; give source.root=ROOT"
+    source = source_of(row)
+    try:
+        sha256, photograph = load(recorded_source(root, source, plan_from_row(row).source), source)
+    except (SourceError, MachineError, ConfigError) as error:  # the sheet is drawn without this photograph
+        return None, f"{str(error).partition(';')[0]}; {ADVICE}"
+    if sha256 != row["source_sha256"]:
+        return None, f"it has changed: its SHA-256 differs from the row's; {ADVICE}"
+    return crop_patch(photograph.srgb, patch_from_row(row)), ""
+
+
+# ------------------------------------------------------------------------------------------------------------- sheets
+
+
 def write_sheets(
-    folder: AnyPath, to: Path, keys: Sequence[str] = (), source: AnyPath | None = None, with_stages: bool = False
+    folder: AnyPath, to: Path, keys: str = "", source: AnyPath | None = None, with_stages: bool = False
 ) -> Iterator[SheetFiles]:
     """Write ``KEY.png`` for each pair, and ``KEY.stages.png`` if asked for; yield the files once they are written.
 
-    ConfigError if ``to`` is inside a dataset, is not a folder or contains sheets of another dataset, and as for
-    `contact_sheet`.
+    ConfigError if ``to`` is inside a dataset or is not a folder, and as for `selected_pairs`.
     """
     check_output_folder(to, f"--to {to}")
-    mark = _mark(folder)
-    for path in sorted(to.glob("*.png")):
-        if SHEET_NAME.fullmatch(path.name) and not _is_marked(path, mark):
-            raise ConfigError(
-                f"--to {to}: {path.name} is not a sheet of {folder}; expected a folder without sheets of other "
-                "datasets; choose another folder, or remove them"
-            )
     for pair in selected_pairs(folder, keys, source):
-        contents = {f"{pair.key}.png": _marked_png(pair_sheet(pair), mark)}
+        key, window = str(pair.row["key"]), panels.detail_window(pair.clean.shape)
+        heading = _heading(pair, window)
+        drawn = {f"{key}.png": panels.lay_out(heading, _pair_panels(pair, window, panels.PANEL_PX), 3)}
         if with_stages and pair.source is not None:
-            contents[f"{pair.key}.stages.png"] = _marked_png(stages_sheet(pair, pair.source), mark)
+            drawn[f"{key}.stages.png"] = panels.lay_out(heading, _stage_panels(pair, pair.source, window), 4)
+        contents = {name: picture_png(sheet) for name, sheet in drawn.items()}
         write_files(to, contents)
-        yield SheetFiles(pair.key, str(pair.row["source"]), tuple(to / name for name in contents), pair.missing_source)
+        yield SheetFiles(key, str(pair.row["source"]), tuple(to / name for name in contents), pair.missing_source)
 
 
-def contact_sheet(folder: AnyPath, keys: Sequence[str] = (), source: AnyPath | None = None) -> Picture:
-    """Draw an overview, RGB, with one strip per pair in the order of the manifest.
-
-    ``keys`` identify pairs, or images and patches, which select all of their pairs; by default, `PAIRS_SHOWN`
-    evenly spaced pairs. ``source`` is the folder of the photographs, by default the recorded one. ConfigError for an
-    unknown key or folder; DamageError if the dataset is damaged.
-    """
-    return np.vstack([_strip(pair) for pair in with_bar(selected_pairs(folder, keys, source), "pair drawn")])
-
-
-def _mark(folder: AnyPath) -> bytes:
-    """Text chunk of a PNG file (PNG specification, 11.3.3.2) that identifies a dataset."""
-    manifest = folder / "manifest.csv"
-    read_columns(manifest)  # DamageError if it cannot be read
-    body = f"tEXtunprocess_gen\0manifest_sha256={file_sha256(manifest)}".encode("ascii")
-    return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
+def contact_sheet(folder: AnyPath, keys: str = "", source: AnyPath | None = None) -> Picture:
+    """Draw an overview, RGB, with one strip per pair in the order of the manifest; arguments of `selected_pairs`."""
+    strips = []
+    for pair in with_bar(selected_pairs(folder, keys, source), "pair drawn"):
+        drawn = _pair_panels(pair, panels.detail_window(pair.clean.shape), panels.STRIP_PX)
+        overviews = [panel._replace(detail=None) for panel in drawn]
+        strips.append(panels.lay_out([f"{pair.row['key']}   {pair.row['source']}"], overviews, 6, panels.STRIP_PX))
+    return np.vstack(strips)
 
 
-def _is_marked(path: Path, mark: bytes) -> bool:
-    with suppress(OSError), path.open("rb") as stream:
-        return mark in stream.read(PNG_HEADER_BYTES + len(mark))
-    return False
-
-
-def _marked_png(picture: Picture, mark: bytes) -> bytes:
-    content = picture_png(picture)
-    return content[:PNG_HEADER_BYTES] + mark + content[PNG_HEADER_BYTES:]
-
-
-# ------------------------------------------------------------------------------------------------------ contact sheets
-
-
-def pair_sheet(pair: SheetPair) -> Picture:
-    """Draw the contact sheet of a pair: source, clean frame, difference, noisy frame, and both developed."""
-    window = panels.detail_window(pair.clean.shape)
-    return panels.lay_out(_heading(pair, window), _pair_panels(pair, window, panels.PANEL_PX))
-
-
-def _strip(pair: SheetPair) -> Picture:
-    """Draw the strip of a pair in an overview: without details and own stretches, the difference last."""
-    drawn = [
-        panel._replace(note=panel.note if panel.overview is None else "", detail=None)
-        for panel in _pair_panels(pair, panels.detail_window(pair.clean.shape), panels.STRIP_PX)
-        if not panel.title.endswith("own stretch")
+def _heading(pair: SheetPair, window: Window) -> list[str]:
+    """The lines above a sheet: identity and size, noise, and the place of the details."""
+    sensor, scene, noise, (rows, columns) = pair.plan.sensor, pair.plan.scene, pair.plan.noise, window
+    height, width = pair.clean.shape
+    return [
+        f"{pair.row['key']}   {pair.row['source']}   {width} x {height} {sensor.pattern}, {sensor.bits} bits, black "
+        f"{sensor.black_level_dn}, white {sensor.white_level_dn} DN",
+        f"camera {pair.plan.camera.name}, scene {scene.name} (exposure ratio {scene.exposure_ratio:.4g}), noise "
+        f"{noise.name}: {' '.join(noise.effects) or 'no effect'}",
+        f"details: rows {rows.start} to {rows.stop - 1}, columns {columns.start} to {columns.stop - 1}",
     ]
-    drawn.sort(key=lambda panel: panel.title == DIFFERENCE)
-    return panels.lay_out([f"{pair.key}   {pair.row['source']}"], drawn, panels.STRIP_PX, len(drawn))
 
 
 def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> list[SheetPanel]:
-    """Panels of the source, of the clean frame, of the difference, and of the noisy frame."""
-    source = SheetPanel("source", f"not available: {pair.missing_source}", None)
+    """Panels of the source, of both frames raw and developed, and of their difference."""
+    drawn = [SheetPanel("source", f"not available: {pair.missing_source}", None)]
     if pair.source is not None:
-        source = SheetPanel("source", f"{8 * pair.source.itemsize} bits", *_views(pair.source, window, panel_px))
-    clean, noisy = (panels.average_planes(raw, panel_px) for raw in (pair.clean, pair.noisy))
-    return [
-        source,
-        *_frame_panels("clean", pair.clean, clean, pair.plan, window),
-        _difference_panel(pair, noisy - clean, window),
-        *_frame_panels("noisy", pair.noisy, noisy, pair.plan, window),
-    ]
+        drawn = [SheetPanel("source", f"{8 * pair.source.itemsize} bits", *_views(pair.source, window, panel_px))]
+    averages = [panels.average_planes(raw, panel_px) for raw in (pair.clean, pair.noisy)]
+    for name, raw, planes in zip(("clean", "noisy"), (pair.clean, pair.noisy), averages, strict=True):
+        drawn += _frame_panels(name, raw, planes, pair.plan, window)
+    detail = pair.noisy[window].astype(np.float64) - pair.clean[window]
+    differences = (averages[1] - averages[0]).mean(axis=-1), detail
+    limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(dn * dn))), 1.0) for dn in differences]
+    note = f"{limits[0]:.3g} DN (averaged), {limits[1]:.3g} DN (detail) around grey"
+    pictures = ((dn / limit + 1) / 2 for dn, limit in zip(differences, limits, strict=True))
+    return [*drawn, SheetPanel("noisy - clean", note, *pictures)]
 
 
 def _views(source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Float, Float]:
@@ -153,31 +164,22 @@ def _views(source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Flo
 
 
 def _frame_panels(name: str, raw: MosaicArray, planes: Float, plan: Plan, window: Window) -> list[SheetPanel]:
-    """A raw frame with its own and with the common stretch, and developed; ``planes`` are its averages."""
-    sensor, overview, detail = plan.sensor, planes.mean(axis=-1), raw[window]
-    stretched, ranges = zip(*map(stretch, (overview, detail)), strict=True)
-    white_dn = sensor.black_level_dn + (sensor.white_level_dn - sensor.black_level_dn) * plan.scene.exposure
-    common = (common_stretch(dn, plan) for dn in (overview, detail))
-    rgb = process(to_light(panels.planes_to_rgb(planes, sensor.pattern), plan), plan)
+    """A frame from black to white, and developed; ``planes`` are its averages."""
+    light = (common_stretch(dn, plan) for dn in (planes.mean(axis=-1), raw[window]))
+    rgb = process(to_light(panels.planes_to_rgb(planes, plan.sensor.pattern), plan), plan)
+    white_dn = plan.sensor.black_level_dn + plan.sensor.span_dn * plan.scene.exposure
     return [
-        SheetPanel(f"{name} raw, own stretch", f"{ranges[0]} (averaged), {ranges[1]} (detail)", *stretched),
-        SheetPanel(
-            f"{name} raw, common stretch", f"{sensor.black_level_dn} to {white_dn:.5g} DN, square root", *common
-        ),
-        SheetPanel(f"{name} raw, developed", "with the parameters of the row", rgb, develop_detail(raw, plan, window)),
+        SheetPanel(f"{name} raw", f"{plan.sensor.black_level_dn} to {white_dn:.5g} DN, square root", *light),
+        SheetPanel(f"{name}, developed", "", rgb, develop_detail(raw, plan, window)),
     ]
 
 
-STRETCHED = (0.1, 99.9)
-"""Percentiles of a picture that its own stretch maps to black and white."""
-
-
 def stretch(dn: MosaicArray, least: float = 1.0) -> tuple[Float, str]:
-    """Stretch a frame to [0, 1] between its percentiles `STRETCHED`, which are also given in words.
+    """Stretch a frame to [0, 1] between its percentiles 0.1 and 99.9, which are also given in words.
 
-    A range of less than ``least`` is not stretched to [0, 1].
+    A few defective sites do not hide the picture. A range of less than ``least`` is not stretched to [0, 1].
     """
-    low, high = np.percentile(dn, STRETCHED)
+    low, high = np.percentile(dn, (0.1, 99.9))
     return np.clip((dn - low) / max(high - low, least), 0, 1), f"{low:.5g} to {high:.5g} DN"
 
 
@@ -203,59 +205,20 @@ def develop_detail(raw: MosaicArray, plan: Plan, window: Window) -> Float | None
     return bordered[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
 
 
-DIFFERENCE = "noisy - clean"
-RMS_SHOWN = 4.0
-
-
-def _difference_panel(pair: SheetPair, planes: Float, window: Window) -> SheetPanel:
-    """Noisy minus clean around middle grey; black and white are `RMS_SHOWN` times its RMS, at least 1 DN."""
-    differences = planes.mean(axis=-1), pair.noisy[window].astype(np.float64) - pair.clean[window]
-    limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(dn * dn))), 1.0) for dn in differences]
-    note = f"within {limits[0]:.3g} DN (averaged), {limits[1]:.3g} DN (detail) of middle grey"
-    pictures = ((dn / limit + 1) / 2 for dn, limit in zip(differences, limits, strict=True))
-    return SheetPanel(DIFFERENCE, note, *pictures)
-
-
-def _heading(pair: SheetPair, window: Window) -> list[str]:
-    """The lines above a sheet: identity and size, parameters, and the place of the details."""
-    row, sensor, camera, isp = pair.row, pair.plan.sensor, pair.plan.camera, pair.plan.isp
-    scene, noise, (rows, columns) = pair.plan.scene, pair.plan.noise, window
-    height, width = pair.clean.shape
-    darkened = f", darkened by a factor of {scene.exposure_ratio:.4g}" if scene.exposure_ratio != 1 else ""
-    return [
-        f"{pair.key}   {row['source']}   {width} x {height} {sensor.pattern}, {sensor.bits} bits, black "
-        f"{sensor.black_level_dn}, white {sensor.white_level_dn} DN",
-        f"camera {camera.name}, gains red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb "
-        f"{camera.inverse_rgb_gain:.4g}, highlights {camera.highlight}, tone {isp.tone}, gamma {isp.gamma}; "
-        f"scene {scene.name}{darkened}; noise {noise.name}: a {noise.a_dn:.4g} DN, b {noise.b_dn2:.4g} DN squared, "
-        f"effects {' '.join(noise.effects) or 'none'}",
-        f"details: rows {rows.start} to {rows.stop - 1}, columns {columns.start} to {columns.stop - 1}, one pixel per "
-        "site",
-    ]
-
-
 # -------------------------------------------------------------------------------------------------------------- stages
 
 
-def stages_sheet(pair: SheetPair, source: Srgb) -> Picture:
-    """Draw a sheet of the source after each step, uint8 ``[H, W, 3]`` RGB; black is 0 and white is 1."""
-    plan, window = pair.plan, panels.detail_window(pair.clean.shape)
-    overview, detail = _views(source, window, panels.PANEL_PX)
-    drawn = [_image_panel("source", "codes of the raw file" if plan.source.is_raw else "", overview, detail)]
-    if plan.source.dequantize != "off" and source.dtype == np.uint8:
-        detail = _dithered(pair, source, window)
-        drawn.append(_image_panel("codes dithered", "by up to half a code", overview, detail))
-    both = zip(processing_steps(overview, plan), processing_steps(detail, plan), strict=True)
-    for (title, note, overview), (_, _, detail) in both:
-        drawn.append(_image_panel(title, note, overview, detail))
-    drawn.append(_mosaic_panel("mosaic", plan, overview, mosaic(detail, plan.sensor.pattern)))
+def _stage_panels(pair: SheetPair, source: Srgb, window: Window) -> list[SheetPanel]:
+    """Panels of the source after each step, black 0 and white 1, and of the frames in the colours of their filters."""
+    plan, pattern, views = pair.plan, pair.plan.sensor.pattern, _views(source, window, panels.PANEL_PX)
+    drawn = [SheetPanel("source", "", *views)]
+    for (title, note, overview), (_, _, detail) in zip(*(processing_steps(view, plan) for view in views), strict=True):
+        drawn.append(SheetPanel(title, note, overview, detail))
     for name, raw in (("clean", pair.clean), ("noisy", pair.noisy)):
-        averaged = panels.planes_to_rgb(panels.average_planes(raw, panels.PANEL_PX), plan.sensor.pattern)
-        drawn.append(_mosaic_panel(f"{name} raw", plan, to_light(averaged, plan), to_light(raw[window], plan)))
-    note = "after each step, black 0, white 1, not stretched; mosaics: square root, each site in its filter's colour"
-    if plan.scene.exposure_ratio != 1:
-        note += f"; raw frames brightened {plan.scene.exposure_ratio:.4g} times, as the scene is darker"
-    return panels.lay_out([*_heading(pair, window), note], drawn)
+        averaged = panels.planes_to_rgb(panels.average_planes(raw, panels.PANEL_PX), pattern)
+        light, sites = (common_stretch(dn, plan) for dn in (averaged, raw[window]))
+        drawn.append(SheetPanel(f"{name} raw", f"{pattern}, square root", light, panels.colour_sites(sites, pattern)))
+    return drawn
 
 
 def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Float]]:
@@ -274,25 +237,3 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
     gains = ", ".join(f"{gain:.3g}" for gain in camera.inverse_gains)
     values = unprocess.invert_gains(values, camera.inverse_gains, camera.highlight, camera.highlight_threshold)
     yield "gains inverted", f"times {gains}; highlights {camera.highlight}", values
-
-
-def _dithered(pair: SheetPair, source: Srgb, window: Window) -> Float:
-    """The detail with its codes dithered as the frames were, values in [0, 1]."""
-    plan, patch = pair.plan, patch_from_row(pair.row)
-    origin = patch.y + window[0].start, patch.x + window[1].start
-    curve = linear_table(plan.isp.tone, plan.isp.gamma, 256)
-    return unprocess.dequantise(source[window], plan, curve, origin) / 65535
-
-
-def _image_panel(title: str, note: str, overview: Float, detail: Float) -> SheetPanel:
-    fraction = float(((overview < 0) | (overview > 1)).mean())
-    clipped = f"; {fraction:.2%} outside [0, 1], shown clipped" if fraction else ""
-    return SheetPanel(title, note + clipped, overview, detail)
-
-
-def _mosaic_panel(title: str, plan: Plan, overview: Float, detail: Float) -> SheetPanel:
-    """Panel of a mosaic, of which the overview has the mean of each colour ``[h, w, 3]``."""
-    shares = (1.0, 1.0, 1.0) if plan.sensor.pattern == MONO else (0.25, 0.5, 0.25)  # of the sites of a tile
-    shown, sites = (np.sqrt(np.clip(light, 0, 1)) for light in (overview, detail))
-    panel = _image_panel(title, plan.sensor.pattern, overview, detail)
-    return panel._replace(overview=shown * shares, detail=panels.colour_sites(sites, plan.sensor.pattern))

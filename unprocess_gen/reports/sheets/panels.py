@@ -26,7 +26,6 @@ PANEL_PX = (224, 336)
 STRIP_PX = (120, 180)
 """Height and width of the box that a picture is scaled into, on a sheet and on a strip of an overview."""
 
-PER_ROW = 4
 MARGIN_PX, LINE_PX = 10, 17
 PAPER_GREY, INK_GREY, EMPTY_GREY = 250, 20, 225
 """Grey levels of the sheet, of text, and of panels without a picture."""
@@ -34,9 +33,12 @@ PAPER_GREY, INK_GREY, EMPTY_GREY = 250, 20, 225
 FONT, FONT_SCALE, CHARACTER_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.42, 10
 """Font of OpenCV, its scale, and the width of its widest character."""
 
+Window = tuple[slice, slice]
+"""The rows and columns of a detail."""
+
 
 class SheetPanel(NamedTuple):
-    """An image, complete and as a detail at one pixel per site: grey or RGB values of which [0, 1] is shown.
+    """A titled image, complete and as a detail at one pixel per site: grey or RGB values of which [0, 1] is shown.
 
     The note says why a picture is None.
     """
@@ -47,15 +49,11 @@ class SheetPanel(NamedTuple):
     detail: Float | None = None
 
 
-Window = tuple[slice, slice]
-"""The rows and columns of a detail."""
-
-
 def detail_window(shape: tuple[int, ...], panel_px: tuple[int, int] = PANEL_PX) -> Window:
     """Find the centre of a frame that fits into a panel, which begins at an even row and column like the Bayer tile."""
     starts = [max(0, length - most) // 4 * 2 for length, most in zip(shape, panel_px, strict=True)]
-    ends = [start + min(length, most) for start, length, most in zip(starts, shape, panel_px, strict=True)]
-    return slice(starts[0], ends[0]), slice(starts[1], ends[1])
+    rows, columns = (slice(start, start + most) for start, most in zip(starts, panel_px, strict=True))
+    return slice(rows.start, min(rows.stop, shape[0])), slice(columns.start, min(columns.stop, shape[1]))
 
 
 def average_planes(raw: MosaicArray, panel_px: tuple[int, int]) -> Float:
@@ -108,49 +106,40 @@ def fit_image(values: NDArray[Any], panel_px: tuple[int, int]) -> Float:
 
 
 def lay_out(
-    heading: Sequence[str], panels: Sequence[SheetPanel], panel_px: tuple[int, int] = PANEL_PX, columns: int = PER_ROW
+    heading: Sequence[str], panels: Sequence[SheetPanel], columns: int, panel_px: tuple[int, int] = PANEL_PX
 ) -> Picture:
-    """Lay out a sheet: a heading, then rows of panels with title and note, overview, and detail if a panel has one."""
-    width = columns * (panel_px[1] + MARGIN_PX) + MARGIN_PX
-    bands = [_beside([_text(heading, width - 2 * MARGIN_PX)], width)]
-    for start in range(0, len(panels), columns):
-        row = panels[start : start + columns]
-        bands.append(_beside([_text([panel.title, panel.note], panel_px[1]) for panel in row], width))
-        bands.append(_beside([_centred(panel.overview, panel_px) for panel in row], width))
-        if any(panel.detail is not None for panel in row):
-            bands.append(_beside([_centred(panel.detail, panel_px) for panel in row], width))
-    return np.vstack(bands)
+    """Lay out a sheet: a heading, then rows of panels with title and note, overview, and detail if any has one."""
+    pictures_drawn = 1 + any(panel.detail is not None for panel in panels)
+    texts = [_lines([panel.title, panel.note], panel_px[1]) for panel in panels]
+    boxes = []
+    for text, (_, _, *pictures) in zip(texts, panels, strict=True):
+        drawn = [_box(picture, panel_px) for picture in pictures[:pictures_drawn]]
+        boxes.append(np.vstack([_text(text, panel_px[1], max(map(len, texts))), *drawn]))
+    boxes += [np.full_like(boxes[0], PAPER_GREY)] * (-len(boxes) % columns)
+    rows = [np.hstack(boxes[start : start + columns]) for start in range(0, len(boxes), columns)]
+    width_px = rows[0].shape[1] - MARGIN_PX
+    lines = _lines(heading, width_px)
+    return np.vstack([_text(lines, width_px, len(lines)), *rows])
 
 
-def _blank(height: int, width: int, grey: int = PAPER_GREY) -> Picture:
-    return np.full((height, width, 3), grey, dtype=np.uint8)
-
-
-def _beside(boxes: Sequence[Picture], width: int) -> Picture:
-    """Put boxes of equal width in one row, the lower ones padded."""
-    band = _blank(max(len(box) for box in boxes) + MARGIN_PX // 2, width)
-    for number, box in enumerate(boxes):
-        left = MARGIN_PX + number * (box.shape[1] + MARGIN_PX)
-        band[: len(box), left : left + box.shape[1]] = box
-    return band
-
-
-def _centred(values: Float | None, panel_px: tuple[int, int]) -> Picture:
-    box = _blank(*panel_px, grey=EMPTY_GREY)
+def _box(values: Float | None, panel_px: tuple[int, int]) -> Picture:
+    """Put a picture in the middle of a box, with a margin on the right and below."""
+    box = np.full((*panel_px, 3), EMPTY_GREY, dtype=np.uint8)
     if values is not None:
         picture = byte_codes(values)
         top, left = ((most - length) // 2 for most, length in zip(panel_px, picture.shape, strict=False))
         box[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
-    return box
+    return np.pad(box, ((0, MARGIN_PX), (0, MARGIN_PX), (0, 0)), constant_values=PAPER_GREY)
 
 
-def _text(paragraphs: Sequence[str], width_px: int) -> Picture:
-    """Draw paragraphs; characters that OpenCV's font lacks become question marks."""
-    lines = [line for text in paragraphs for line in textwrap.wrap(text, width_px // CHARACTER_PX)]
-    box = _blank(LINE_PX * len(lines) + MARGIN_PX // 2, width_px)
+def _lines(paragraphs: Sequence[str], width_px: int) -> list[str]:
+    return [line for text in paragraphs for line in textwrap.wrap(text, width_px // CHARACTER_PX)]
+
+
+def _text(lines: Sequence[str], width_px: int, count: int) -> Picture:
+    """Draw lines in a box for ``count``; characters that OpenCV's font lacks become question marks."""
+    box = np.full((LINE_PX * count + MARGIN_PX // 2, width_px + MARGIN_PX, 3), PAPER_GREY, dtype=np.uint8)
     for number, line in enumerate(lines, start=1):
-        shown = line.encode("ascii", "replace").decode()
-        cv2.putText(
-            box, shown, (0, number * LINE_PX - 4), FONT, FONT_SCALE, (INK_GREY, INK_GREY, INK_GREY), 1, cv2.LINE_AA
-        )
+        place, shown = (MARGIN_PX // 2, number * LINE_PX - 4), line.encode("ascii", "replace").decode()
+        cv2.putText(box, shown, place, FONT, FONT_SCALE, (INK_GREY, INK_GREY, INK_GREY), 1, cv2.LINE_AA)
     return box
