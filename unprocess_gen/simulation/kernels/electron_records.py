@@ -41,19 +41,16 @@ def electron_noise(
     origin: tuple[int, int],
 ) -> Electrons:
     """Return the noise of frames of one body."""
-    columns, top, left = padded_width(origin[1], shape[1]), origin[0] % 2, origin[1] // BLOCK * BLOCK
-    members: dict[str, Any] = {"body": body}
-    if any(slots.columns for slots in frames):  # new in every frame
-        noise = _electron_noise(frames, columns, (top, left))
-    elif any(slots.fixed_columns for slots in frames):
-        noise = _electron_noise(frames, -(-(left + columns) // _COLUMNS) * _COLUMNS, (top, 0))
+    columns, left = padded_width(origin[1], shape[1]), origin[1] // BLOCK * BLOCK
+    has_columns = any(slots.columns or slots.fixed_columns for slots in frames)
+    end = -(-(left + columns) // _COLUMNS) * _COLUMNS if has_columns else columns
+    noise = _electron_noise(frames, end, origin[0] % 2)
+    members: dict[str, Any] = {"body": body, "padded_width": columns}
+    if has_columns:
         cut = slice(left, left + columns)
         members["columns_dn"] = np.ascontiguousarray(noise.columns_dn[:, cut])
         members["fixed_columns_dn"] = noise.fixed_columns_dn[cut]
         members["base_dn"] = np.ascontiguousarray(noise.base_dn[..., cut])
-        members["padded_width"] = columns
-    else:
-        noise = _electron_noise(frames, columns, (top, 0))
     if any(slots.rows and slots.rows.correlation for slots in frames):
         members |= {"rows_dn": _correlated_rows(frames, origin[0], shape[0]), "rows_step": shape[0]}
     noise = noise._replace(**members)
@@ -76,14 +73,13 @@ def electron_noise(
 
 
 @functools.lru_cache(maxsize=256)
-def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, int]) -> Electrons:
-    """Return the noise without the body; ``origin`` belongs to the first block, as far as the noise depends on it.
+def _electron_noise(frames: tuple[Slots, ...], columns: int, top: int) -> Electrons:
+    """Return the noise without the body, of the first columns of frames whose first row is ``top``.
 
-    Crops of a body whose columns are fixed cut theirs from 1024 or more: each of their own takes a tenth of a crop of
-    128 x 128.
+    Crops cut their columns from it: to compute them would take a tenth of a crop of 128 x 128.
     """
-    first, members = frames[0], _members_of_sites(frames, origin[0])
-    columns_dn = np.stack([_columns_dn(slots, columns, origin[1]) for slots in frames])
+    first, members = frames[0], _members_of_sites(frames, top)
+    columns_dn = np.stack([_columns_dn(slots, columns) for slots in frames])
     base_dn = columns_dn.reshape(len(frames), 1, -1, VECTOR_WIDTH) + members["planes_dn"][:, :, None]
     numbers = members["numbers"].copy()
     numbers[:, _ERROR_DN] += 2 * FLOAT32_ERROR_DN * np.abs(columns_dn).max(axis=1)
@@ -93,7 +89,7 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, 
         base_dn=(first.black_dn + base_dn).astype(np.float32).reshape(len(frames), 2, columns),
         rows_dn=np.zeros((1, 1)),  # two dimensions as with correlated rows: the same machine code
         rows_step=0,
-        fixed_columns_dn=_fixed_columns(first.fixed_columns, columns, origin[1]),
+        fixed_columns_dn=_fixed_columns(first.fixed_columns, columns),
         sites_dn=NO_OFFSETS,
         sites_step=0,
         padded_width=columns,
@@ -105,11 +101,11 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, 
     )
 
 
-def _columns_dn(slots: Slots, columns: int, left: int) -> Float:
-    """Return the offsets of the columns of a frame, whose body can be another one, from column ``left`` on."""
-    columns_dn = _fixed_columns(slots.fixed_columns, columns, left)
+def _columns_dn(slots: Slots, columns: int) -> Float:
+    """Return the offsets of the first columns of a frame, whose body can be another one."""
+    columns_dn = _fixed_columns(slots.fixed_columns, columns)
     if slots.columns:
-        columns_dn = columns_dn + slots.columns.std_dn * _normals(slots.columns.words, columns, left)
+        columns_dn = columns_dn + slots.columns.std_dn * _normals(slots.columns.words, 1, columns)
     return columns_dn
 
 
@@ -188,31 +184,28 @@ def _correlated_rows(frames: Sequence[Slots], top: int, height: int) -> Float:
     rows_dn = np.zeros((len(frames), height))
     for frame_dn, slots in zip(rows_dn, frames, strict=True):
         if slots.rows and slots.rows.correlation:
-            independent = _normals(slots.rows.words, 1, 0, top + height)
+            independent = _normals(slots.rows.words, top + height, 1)
             frame_dn[:] = slots.rows.std_dn * autoregressive(independent, slots.rows.correlation)[top:]
     return rows_dn
 
 
 _COLUMNS = 1024
-"""Columns of a body whose normals are computed at once: for a crop alone they would take longer than its pixels."""
+"""Columns whose normals are computed at once: for a crop alone they would take longer than its pixels."""
 
 
-def _fixed_columns(offsets: LineOffsets | None, columns: int, left: int) -> Float:
-    """Return the offsets of ``columns`` columns of a body from column ``left`` on."""
-    if offsets is None:
-        return np.zeros(columns)
-    deviates = _first_normals(offsets.words, -(-(left + columns) // _COLUMNS) * _COLUMNS)
-    return np.asarray(offsets.std_dn * deviates[left : left + columns])
+def _fixed_columns(offsets: LineOffsets | None, columns: int) -> Float:
+    """Return the offsets of the first columns of a body."""
+    return np.zeros(columns) if offsets is None else np.asarray(offsets.std_dn * _first_normals(offsets.words, columns))
 
 
 @functools.lru_cache(maxsize=512)
 def _first_normals(stream: SlotWords, columns: int) -> Float:
     """Return the normals of the first columns of a body."""
-    return _normals(stream, columns, 0)
+    return _normals(stream, 1, columns)
 
 
-def _normals(stream: SlotWords, columns: int, left: int, rows: int = 1) -> Float:
-    """Return the normals of a row of columns, or of the first column of some rows."""
+def _normals(stream: SlotWords, rows: int, columns: int) -> Float:
+    """Return the normals of the first columns of one row, or of the first column of some rows."""
     numbers = stream._asdict()
     key, name = numbers.pop("key"), numbers.pop("stream")
-    return normals(words(key, name, (rows, columns), origin=(0, left), **numbers)).ravel()
+    return normals(words(key, name, (rows, columns), **numbers)).ravel()
