@@ -19,20 +19,16 @@ No tag records how highlights were kept. Above the row's threshold readers show 
 channel by channel, so bright colours shift; white stays white. WhiteLevel is the sensor's, even if the full well
 saturates below it.
 
-The XMP packet contains the row as JSON (properties Frame and Row of ``urn:unprocess-gen:manifest#``), which converters
-keep. Columns that version 0.1 lacked are left out if they are empty, as in ``KEY.json``. Files contain no time: equal
-rows and frames give equal bytes. Decisions: ``docs/design/dataset_format.md``.
+Files contain no time: equal rows and frames give equal bytes. Decisions: ``docs/design/dataset_format.md``.
 """
 
 from __future__ import annotations
 
 import io
-import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -42,7 +38,7 @@ from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath, LocalPath
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
-from unprocess_gen.dataset.manifest import plan_from_row, without_empty
+from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.simulation.effects import dark_variance_dn2
@@ -211,7 +207,7 @@ def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
         subfiletype=0,
         metadata=None,
         software=MAKE,
-        description=f"{name} frame of {row['key']}; its manifest row is in the XMP packet",
+        description=f"{name} frame of {row['key']}",
         extratags=tags(row, name, (frame.shape[0], frame.shape[1])),
     )
     return file.getvalue()
@@ -219,13 +215,12 @@ def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
 
 def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
     """Return the tags that TIFF itself does not require, by increasing code; ``shape`` is (height, width)."""
-    plan, packet, (height, width) = plan_from_row(row), xmp(row, name), shape
+    plan, (height, width) = plan_from_row(row), shape
     profile = noise_profile(plan) if name == "noisy" else None
     return [
         Tag(271, ASCII, 0, MAKE),  # Make
         Tag(272, ASCII, 0, plan.camera.name),  # Model
         Tag(274, SHORT, 1, 1),  # Orientation: frames are upright
-        Tag(700, BYTE, len(packet), packet),  # XMP
         Tag(33421, SHORT, 2, (2, 2)),  # CFARepeatPatternDim
         Tag(33422, BYTE, 4, bytes(CHANNELS.index(letter) for letter in plan.sensor.pattern)),  # CFAPattern
         *_exposure(row),
@@ -294,18 +289,3 @@ def rational(value: float) -> tuple[int, int]:
 
 def _rationals(values: Iterable[float]) -> tuple[int, ...]:
     return tuple(part for value in values for part in rational(value))
-
-
-def xmp(row: Row, name: str) -> bytes:
-    """Return the XMP packet (ISO 16684-1) with the row as JSON and the name of the frame."""
-    text = escape(json.dumps(without_empty(row), separators=(",", ":")))
-    return (
-        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
-        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
-        '<rdf:Description rdf:about="" xmlns:unprocess="urn:unprocess-gen:manifest#">\n'
-        f"<unprocess:Frame>{name}</unprocess:Frame>\n"
-        f"<unprocess:Row>{text}</unprocess:Row>\n"
-        "</rdf:Description>\n</rdf:RDF>\n</x:xmpmeta>\n"
-        '<?xpacket end="w"?>'
-    ).encode()
