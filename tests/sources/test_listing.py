@@ -6,7 +6,6 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -14,8 +13,6 @@ from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import Source
-from unprocess_gen.pipeline.tasks import ShardResult
-from unprocess_gen.sources.clips import ClipSizes
 from unprocess_gen.sources.listing import Listing, list_folder, unmatched_sentence
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import read_bytes
@@ -87,22 +84,6 @@ def test_path_outside_the_root_is_never_opened(tmp_path: Path, path: str, monkey
     monkeypatch.setattr(os, "open", lambda *_, **__: pytest.fail("opened"))
     with pytest.raises(SourceError, match=r"^unreadable: .* leads outside source\.root"):
         read_bytes(f"{tmp_path}/root", Source(0, path, path, 10))
-
-
-def test_frames_of_different_sizes_in_a_clip_give_one_warning() -> None:
-    def row(clip: str, width: int, height: int, **others: Any) -> dict[str, Any]:
-        empty = {"key": "00000000", "source_noise_dn": None, "status": "ok", "patch": 0}
-        return empty | {"clip": clip, "width": width, "height": height} | others
-
-    def frame_sizes(*rows: dict[str, Any]) -> tuple[tuple[str, int, int], ...]:
-        return ShardResult(0, None, 0, None, rows).report().frame_sizes
-
-    sizes = ClipSizes()
-    alike = frame_sizes(row("a", 4, 3), row("b", 8, 6), row("a", 4, 3), row("none", 1, 1))
-    assert sizes.warnings(alike) == ()
-    assert sizes.warnings(frame_sizes(row("a", 2, 2, patch=1), row("a", 5, 5, status="failed"))) == ()
-    (warning,) = sizes.warnings(frame_sizes(row("a", 3, 4), row("a", 5, 5)))
-    assert "clip a has frames of 4 x 3 and of 3 x 4 pixels" in warning
 
 
 def test_sub_folders_are_ignored_without_recursive(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from unprocess_gen.config.schema import (
     NoiseConfig,
     ProvenanceConfig,
     SourceConfig,
-    replaced,
 )
 from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
 from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
@@ -102,11 +101,6 @@ def is_physical(noise: NoiseConfig) -> bool:
     return bool(noise.branches)
 
 
-def uses_physics(noise: NoiseConfig) -> bool:
-    """True if pairs of a noise profile are simulated by the kernels of the physical effects."""
-    return is_physical(noise) or noise.law == "poisson"
-
-
 def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
     """Find the numbers of a physical profile at an ISO."""
     return next((branch for branch in noise.branches if branch.iso[0] <= iso <= branch.iso[1]), None)
@@ -154,11 +148,6 @@ def missing_number(noise: NoiseConfig, effect: str) -> str | None:
 def uses_dark_frames(noise: NoiseConfig) -> bool:
     """True if the noise of the read-out is sampled from dark frames."""
     return noise.dark_frames is not None or noise.dark_frames_sha256 is not None
-
-
-def without_dark_frames(config: Config) -> Config:
-    """Return a copy of a configuration with the noise of the profile in place of dark frames."""
-    return replaced(config, NO_DARK_FRAMES)
 
 
 def assumed_numbers(noise: NoiseConfig, effect: str) -> tuple[str, ...]:

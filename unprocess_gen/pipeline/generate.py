@@ -35,7 +35,6 @@ from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import check_free_space
 from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, RunContext, ShardReport, ShardTask, StageTimes, Tally
 from unprocess_gen.pipeline.workspace import Workspace
-from unprocess_gen.sources.clips import ClipSizes
 from unprocess_gen.sources.raw.decode import decoder_versions
 
 PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
@@ -228,7 +227,7 @@ EXECUTORS: dict[str, Callable[[Workspace, Run, list[ShardTask], Progress], Made]
 
 def follow(reports: Iterable[ShardReport], progress: Progress, n_jobs: int = 1) -> Made:
     """Show the progress and warnings of committed shards, whose reports come in any order."""
-    made, clip_sizes, shown = Made(n_jobs=n_jobs), ClipSizes(), 0
+    made, shown = Made(n_jobs=n_jobs), 0
     self_test = ""
     for report in reports:
         if report.killer is not None:
@@ -236,7 +235,7 @@ def follow(reports: Iterable[ShardReport], progress: Progress, n_jobs: int = 1) 
         if report.log.self_test and not self_test:
             self_test = report.log.self_test
             progress.warn(f"the self-test failed: {self_test}; continuing because of self_test=go_on")
-        for text in (*clip_sizes.warnings(report.frame_sizes), *report.failures[: FAILURES_SHOWN - shown]):
+        for text in report.failures[: FAILURES_SHOWN - shown]:
             progress.warn(text)
         shown = min(FAILURES_SHOWN, shown + len(report.failures))
         made.rows += report.rows

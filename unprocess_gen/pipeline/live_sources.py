@@ -16,7 +16,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import Recent
-from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Source, SourcePlan, Srgb, Value
+from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Source, Srgb, Value
 from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import (
@@ -135,10 +135,11 @@ class RecordedPairs:
 
     def pixels(self, image: LiveImage) -> Srgb:
         """Return the decoded image of a pair; raise as `PairRegenerator.photograph`."""
-        names = image.source, image.sha256, image.plan.source
-        if self._cache is None:
-            return self._sources.photograph(*names).srgb
-        return self._cache.get(_cache_name(*names), lambda: self._sources.photograph(*names).srgb)
+
+        def decode() -> Srgb:
+            return self._sources.photograph(image.source, image.sha256, image.plan.source).srgb
+
+        return decode() if self._cache is None else self._cache.get(_cache_name(image), decode)
 
     def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
         """Return the row of a pair; the recorded one in epoch 0."""
@@ -189,10 +190,11 @@ class PlannedPairs:
 
     def pixels(self, image: LiveImage) -> Srgb:
         """Return the decoded image of a pair; raise as `load_source`."""
-        if self._cache is None:
+
+        def decode() -> Srgb:
             return self._decode(image.source)[1].srgb
-        name = _cache_name(image.source, image.sha256, image.plan.source)
-        return self._cache.get(name, lambda: self._decode(image.source)[1].srgb)
+
+        return decode() if self._cache is None else self._cache.get(_cache_name(image), decode)
 
     def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
         """Return the row of a pair."""
@@ -206,8 +208,9 @@ class PlannedPairs:
         return decoded[1:]
 
 
-def _cache_name(source: Source, sha256: str, prepared: SourcePlan) -> str:
+def _cache_name(image: LiveImage) -> str:
+    prepared = image.plan.source
     if prepared.is_raw:
         means = prepared.raw_pattern, *prepared.raw_black_dn, *prepared.raw_white_dn
         return "-".join(map(str, (prepared.mosaic_xxh3, prepared.shrink, *(means if prepared.shrink > 1 else ()))))
-    return f"{sha256}-{source.frame}-{prepared.downscale}"
+    return f"{image.sha256}-{prepared.downscale}"

@@ -144,7 +144,6 @@ def commit_shard(storage: Storage, result: ShardResult, columns: Sequence[str]) 
     csv = rows_text(result.rows, columns)
     facts = {
         "entry": result.entry(),
-        "report": [report.images, report.failed, report.rows, report.frame_sizes],
         "tally": Tally.of(result.rows).facts(),
         "csv_bytes": len(csv.encode()),
     }
@@ -156,7 +155,6 @@ class _ShardFacts(msgspec.Struct, frozen=True):
     """Hold the first line of a record."""
 
     entry: dict[str, Any]
-    report: tuple[Count, Count, Count, list[tuple[str, Count, Count]]]
     tally: Tally
     csv_bytes: Count
 
@@ -168,8 +166,6 @@ class ShardRecord(NamedTuple):
     ----------
     entry : dict
         Entry in ``dataset.json``.
-    report : ShardReport
-        Without times.
     tally : Tally
         Counts of the rows.
     csv : bytes
@@ -177,27 +173,18 @@ class ShardRecord(NamedTuple):
     """
 
     entry: dict[str, Any]
-    report: ShardReport
     tally: Tally
     csv: bytes
 
 
-def _parse_facts(shard: int, content: bytes) -> tuple[_ShardFacts, bytes]:
-    """Parse the first line of a record; ValueError if it is none, or the lines of the manifest are incomplete."""
+def _parse_shard(shard: int, content: bytes) -> ShardRecord:
+    """Parse a record; ValueError if it is none, or the lines of the manifest are incomplete."""
     line, _, csv = content.partition(b"\n")
     facts = parse_record(line, _ShardFacts)
     check_shard(shard, check_record(facts.entry, ShardFacts))
     if len(csv) != facts.csv_bytes:
         raise ValueError(f"{len(csv)} bytes of rows; expected {facts.csv_bytes}")
-    return facts, csv
-
-
-def _parse_shard(shard: int, content: bytes) -> ShardRecord:
-    """Parse a record; ValueError if it is none."""
-    facts, csv = _parse_facts(shard, content)
-    images, failed, pairs, sizes = facts.report
-    report = ShardReport(shard, images, failed, pairs, tuple(sizes))
-    return ShardRecord(facts.entry, report, facts.tally, csv)
+    return ShardRecord(facts.entry, facts.tally, csv)
 
 
 def record_name(shard: int) -> str:
@@ -231,7 +218,7 @@ class ShardRecords:
 
     def _is_committed(self, shard: int, size: int | None) -> bool:
         try:
-            entry = _parse_facts(shard, self._storage.read_bytes(record_name(shard)))[0].entry
+            entry = _parse_shard(shard, self._storage.read_bytes(record_name(shard))).entry
             return not entry.get("provisional") and (entry["file"] is None or entry["bytes"] == size)
         except (OSError, ValueError):
             return False

@@ -198,16 +198,11 @@ class ShardResult:
     def report(self) -> ShardReport:
         """Describe the shard for the coordinator."""
         images = [rows[0] for rows in group_by_image(self.rows)]
-        clips = {
-            (str(row["clip"]), int(row["width"] or 0), int(row["height"] or 0)): None
-            for row in self.rows
-            if row["status"] == "ok" and row["clip"] and not row["patch"]
-        }
         failed = [row for row in images if row["status"] == "failed"]
         details = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in failed[:FAILURES_SHOWN]]
         failures = () if self.killer else (*details, *self.log.notes[:FAILURES_SHOWN])
         counts = len(images), len(failed), len(self.rows)
-        return ShardReport(self.shard, *counts, tuple(clips), self.killer, self.log, failures)
+        return ShardReport(self.shard, *counts, self.killer, self.log, failures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,8 +215,6 @@ class ShardReport:
         Number of the shard.
     images, failed, rows : int
         Number of its sources, of those that failed, and of its rows.
-    frame_sizes : tuple of (str, int, int)
-        Name of each clip with each width and height of its frames.
     killer, log
         As in `ShardResult`.
     failures : tuple of str
@@ -232,7 +225,6 @@ class ShardReport:
     images: int
     failed: int
     rows: int
-    frame_sizes: tuple[tuple[str, int, int], ...] = ()
     killer: str | None = None
     log: ShardLog = field(default_factory=ShardLog)
     failures: tuple[str, ...] = ()

@@ -88,14 +88,6 @@ def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: Da
     return redrawn.replace(draw=noise.draw, frame=noise.frame, dark=noise.dark)
 
 
-def drawn_light(config: Config, key: int) -> tuple[str, float]:
-    """Draw the light of an image again, and its colour temperature; empty and 0 if the gains follow from no light."""
-    if config.source.kind == "raw":
-        return "", 0.0
-    camera = _planner(config).draw_camera(parameter_uniforms(key, DRAW_COUNT))
-    return camera.light, camera.cct_k
-
-
 def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
     """Replace the dark frame of a pair by another one in each epoch, at the same place: the body does not move."""
     digests = [frame.sha256 for frame in dark_frames.frames]

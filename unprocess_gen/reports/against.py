@@ -41,11 +41,6 @@ ABSOLUTE = ("black_error_dn", "read_shape", "row_correlation")
 """Numbers whose differences are not stated relative to them, because they may be near 0."""
 AT_TEMPERATURE = ("dark_e_per_s", "hot_pixel_share", "hot_pixel_e_per_s")
 """Numbers that can be compared only if the frames state their temperature."""
-FIELDS = (
-    *("number", "iso", "site", "unit", "measured", "low", "high"),
-    *("profile", "difference_percent", "standard_errors", "verdict"),
-)
-"""Columns of the list."""
 AGREES, DIFFERS, NOT_COMPARED = "agrees", "differs", "not compared"
 LACKS, UNSEEN = "missing in the profile", "missing in the frames"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from unprocess_gen.core.types import Source
@@ -40,26 +40,3 @@ def clip_warnings(sources: Sequence[Source]) -> tuple[str, ...]:
         f"source.clips=true: all {len(sources)} photographs are in one folder and become frames of one clip; "
         "expected one folder for each clip; set source.clips=false if they are different photographs",
     )
-
-
-class ClipSizes:
-    """Compare the frame sizes of each clip as frames become known."""
-
-    def __init__(self) -> None:
-        self._sizes: dict[str, tuple[int, int] | None] = {}
-
-    def warnings(self, sizes: Iterable[tuple[str, int, int]]) -> tuple[str, ...]:
-        """Return a warning for each clip whose frames first differ in size.
-
-        ``sizes`` are the name of a clip, and width and height of one of its frames.
-        """
-        texts = []
-        for clip, width, height in sizes:
-            known = self._sizes.setdefault(clip, (width, height))
-            if known is not None and known != (width, height):
-                self._sizes[clip] = None  # one warning for each clip
-                texts.append(
-                    f"source.clips=true: clip {clip} has frames of {known[0]} x {known[1]} and of {width} x {height} "
-                    "pixels; expected frames of one scene; set source.clips=false if they are different photographs"
-                )
-        return tuple(texts)
