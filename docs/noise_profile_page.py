@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from unprocess_gen.config.interpretation import branch_of, row_of_stop
+from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.option_files import option_summary
 from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
@@ -88,7 +88,7 @@ def number_at(form: Any, iso: float, gain: float | None) -> Any:
     if kind == "by_iso":
         return dict(zip(numbers[::2], numbers[1::2], strict=True)).get(iso)
     assert kind == "by_stop", kind
-    rows = numbers[row_of_stop(iso) :][:2]
+    rows = numbers[int(2 * math.log2(iso / 100) + 1e-9) :][:2]  # two for each full stop from ISO 100
     if isinstance(rows[0], list):
         return [sum(pair) / 2 for pair in zip(*rows, strict=True)]
     return sum(rows) / 2

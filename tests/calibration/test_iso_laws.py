@@ -33,8 +33,5 @@ def test_numbers_of_several_isos_are_a_table() -> None:
 
 
 def test_black_errors_of_unequal_steps_keep_their_iso() -> None:
-    """Rows divide the range of ln ISO into equal parts."""
-    law = black_law([100, 125, 1600], [[1.0], [2.0], [3.0]], by_colour=False)
-    assert law[0] == "by_log_iso"
-    rows = law[1:]
-    assert [rows[0][0], rows[int(0.0805 * len(rows))][0], rows[-1][0]] == [1, 2, 3]
+    assert black_law([100, 125], [[1.0], [2.0]]) == ["by_iso", 100, 1, 125, 2]
+    assert black_law([100, 125], [[1.0] * 4, [2.0] * 4]) == ["by_iso", 100, [1] * 4, 125, [2] * 4]

@@ -25,7 +25,7 @@ from omegaconf import OmegaConf, open_dict
 from unprocess_gen.config import distributions
 from unprocess_gen.config.composition import compose_node, load_config
 from unprocess_gen.config.distributions import parse_distribution
-from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
+from unprocess_gen.config.forms import DISTRIBUTION_FORMS
 from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.config.schema import Config, all_settings, replaced
@@ -42,7 +42,6 @@ from unprocess_gen.config.yaml_files import parse_yaml_mapping
 from unprocess_gen.core import tone_curves
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import FLOAT32, MOSAIC, PACKED, UINT16, Facts
-from unprocess_gen.planning import noise_profile
 from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.simulation.reference import cfa, unprocess
 from unprocess_gen.sources.image.decode import ICC_CHOICES
@@ -392,8 +391,8 @@ HOSTILE = [
     *("x", "", "../../etc", "a\nb", "${oc.env:HOME}", [], {}, [1], ["x"], [["x"]], {"a": 1}, [{"a": -1, "b": 2}]),
     *(["uniform", 1, 2], ["uniform", -1e300, 1e300], ["choice", 1e300], ["choice", 1, math.nan], [100, 200]),
     *(["truncated_normal", 0, 1e-300, -1e-300, 1e-300], ["log_uniform", 1e-320, 1e308]),
-    *(["log_linear_in_a", 10, 50, 10], ["per_iso", 1e9], ["root", 0, 0, 1e9], ["line", 1e9, 1e9, 1e9]),
-    ["by_log_iso", [1e300] * 4],
+    *(["log_linear_in_a", 10, 50, 10], ["line", 1e9, 1e9, 1e9]),
+    ["by_iso", 100, [1e300] * 4],
 ]
 """Values that a careless or hostile editor could write anywhere in a ``config.yaml``."""
 
@@ -520,4 +519,3 @@ def test_every_setting_has_a_meaning_and_none_is_needed_without_docstrings() -> 
 
 def test_forms_match_their_implementations() -> None:
     assert set(DISTRIBUTION_FORMS) == set(distributions.DISTRIBUTIONS)
-    assert set(ISO_FORMS) == {*noise_profile.FORMS, "by_stop", "by_log_iso", "by_colour"}

@@ -10,7 +10,6 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 
-from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.dataset.manifest import plan_from_row, read_rows
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.reference.light import LIGHTS, chromaticity
@@ -56,11 +55,6 @@ def test_other_draws_do_not_move(settings: Settings) -> None:
     one, other = (plan_image(settings(gains), "0" * 64) for gains in ("gains=brooks2019", "gains=by_light"))
     assert (one.camera.rgb2cam, one.camera.inverse_rgb_gain) == (other.camera.rgb2cam, other.camera.inverse_rgb_gain)
     assert one.noise == other.noise and one.camera.light == "" and one.camera.cct_k == 0
-
-
-def test_scene_light_is_recorded_where_it_is_used(settings: Settings) -> None:
-    assert "tungsten" not in dataset_yaml(settings("scene=night"))
-    assert "tungsten" in dataset_yaml(settings("scene=night", "gains=by_light"))
 
 
 def test_rows_have_light_and_temperature(make: Make, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unprocess_gen.config.forms import value_at
 from unprocess_gen.config.interpretation import provenance_at
 from unprocess_gen.config.schema import PHYSICAL_NUMBERS, BranchConfig, Config, ProvenanceConfig, replaced
 from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
@@ -59,62 +60,20 @@ def close(value: float, expected: Any, rel: float = 1e-15) -> bool:
     return bool(mpmath.almosteq(mpmath.mpf(value), expected, rel_eps=rel, abs_eps=0))
 
 
-def tukey_std(shape: float) -> Any:
-    """Return the standard deviation of the Tukey-lambda distribution at scale 1, by integration."""
-    with mpmath.workdps(40):
-        if shape == 0:
-            return mpmath.pi / mpmath.sqrt(3)
-        power = mpmath.mpf(shape)
-        return mpmath.sqrt(2 / power**2 * (1 / (1 + 2 * power) - mpmath.beta(power + 1, power + 1)))
-
-
 # Forms ----------------------------------------------------------------------------------------------------------------
-
-
-@given(iso=st.floats(1, 1e6), slope=st.floats(1e-6, 10), intercept=st.floats(0, 10))
-def test_per_iso_is_linear_in_iso(iso: float, slope: float, intercept: float) -> None:
-    with mpmath.workdps(40):
-        assert close(evaluate(["per_iso", slope], iso=iso), mpmath.mpf(slope) * iso)
-        expected = mpmath.mpf(slope) * iso + intercept
-        assert close(evaluate(["per_iso", slope, intercept], iso=iso), expected)
-
-
-@given(iso=st.floats(1, 1e6), numbers=st.lists(st.floats(1e-9, 1e3), min_size=1, max_size=3))
-def test_root_is_standard_deviation_of_a_polynomial_variance(iso: float, numbers: list[float]) -> None:
-    with mpmath.workdps(40):
-        variance = sum(mpmath.mpf(one) * mpmath.mpf(iso) ** power for power, one in enumerate(numbers))
-        assert close(evaluate(["root", *numbers], iso=iso), mpmath.sqrt(variance))
-
 
 uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) * 2.0**-52)
 
 
-@given(gain=st.floats(1e-4, 100), slope=st.floats(-2, 2), intercept=st.floats(-3, 3), std=st.floats(0, 1), u=uniforms)
+@given(iso=st.floats(1, 1e6), slope=st.floats(-2, 2), intercept=st.floats(-3, 3), std=st.floats(0, 1), u=uniforms)
 def test_line_is_linear_in_logarithms_with_normal_scatter(
-    gain: float, slope: float, intercept: float, std: float, u: float
+    iso: float, slope: float, intercept: float, std: float, u: float
 ) -> None:
     with mpmath.workdps(40):
         normal = mpmath.sqrt(2) * mpmath.erfinv(2 * mpmath.mpf(u) - 1)
-        expected = mpmath.exp(slope * mpmath.log(gain) + intercept + std * normal)
-        assert close(evaluate(["line", slope, intercept, std], iso=100, gain=gain, uniform=u), expected)
-
-
-@given(gain=st.floats(1e-4, 100), shape=st.floats(-0.4, 2).filter(lambda one: abs(one) > 1e-3))
-def test_scale_line_is_line_times_standard_deviation_at_scale_1(gain: float, shape: float) -> None:
-    with mpmath.workdps(40):
-        expected = mpmath.exp(mpmath.mpf(0.5) * mpmath.log(gain) + mpmath.mpf(0.25)) * tukey_std(shape)
-        assert close(evaluate(["scale_line", 0.5, 0.25, 0], iso=100, gain=gain, shape=shape), expected)
-
-
-def test_rows_of_black_errors_divide_the_range_of_ln_iso(settings: Settings) -> None:
-    config = on_its_own_sensor(settings, "nikon_d850", 100)
-    table = [[float(row), 0.0, 0.0, -float(row)] for row in range(6)]
-    branch = replace(config.noise.branches[0], iso=[100, 6400], black_error_dn=["by_log_iso", *table])
-    config = replace(config, noise=replace(config.noise, branches=[branch]))
-    for iso in (100, 150, 199, 201, 399, 401, 1599, 1601, 3199, 3201, 6400):
-        config = replaced(config, {"noise.iso": iso})
-        row = min(int(math.log2(iso / 100)), 5)
-        assert physics(config).black_error_dn == (row, 0.0, 0.0, -row)
+        middle = slope * mpmath.log(iso) + intercept
+        assert close(evaluate(["line", slope, intercept, std], iso, u), mpmath.exp(middle + std * normal))
+        assert close(evaluate(["line", slope, intercept], iso, u), mpmath.exp(middle))
 
 
 ISOS = [(100.0, 1.0), (200.0, 1.5), (800.0, 4.0), (6400.0, 20.0)]
@@ -122,7 +81,8 @@ ISOS = [(100.0, 1.0), (200.0, 1.5), (800.0, 4.0), (6400.0, 20.0)]
 
 @pytest.mark.parametrize(("iso", "value"), ISOS)
 def test_table_by_iso_gives_its_values(iso: float, value: float) -> None:
-    assert evaluate(["by_iso", *itertools.chain(*ISOS)], iso=iso) == value
+    assert evaluate(["by_iso", *itertools.chain(*ISOS)], iso) == value
+    assert math.isclose(value_at(["by_iso", *itertools.chain(*ISOS)], iso), value)
 
 
 @given(iso=st.floats(200, 800))
@@ -130,36 +90,18 @@ def test_standard_deviation_between_two_isos_is_interpolated_in_logarithms(iso: 
     with mpmath.workdps(40):
         share = mpmath.log(mpmath.mpf(iso) / 200) / mpmath.log(4)
         expected = mpmath.mpf(1.5) * (mpmath.mpf(4) / 1.5) ** share
-        assert close(evaluate(["by_iso", *itertools.chain(*ISOS)], iso=iso), expected)
+        assert close(evaluate(["by_iso", *itertools.chain(*ISOS)], iso), expected)
+        assert close(value_at(["by_iso", *itertools.chain(*ISOS)], iso), expected, 1e-12)
 
 
-def test_shapes_between_two_isos_are_interpolated_linearly(settings: Settings) -> None:
-    table = ["by_iso", 100, 0.1, 400, -0.3, 6400, -0.1]
+def test_shapes_and_black_errors_between_two_isos_are_interpolated_linearly(settings: Settings) -> None:
+    shapes = ["by_iso", 100, 0.1, 400, -0.3, 6400, -0.1]
+    errors = ["by_iso", 100, 0.0, 400, [4.0, 8.0, -4.0, 0.0], 6400, [4.0, 8.0, -4.0, 2.0]]
     config = on_its_own_sensor(settings, "canon_70d", 100)
-    for iso, shape in ((100, 0.1), (200, -0.1), (400, -0.3), (1600, -0.2), (6400, -0.1)):
-        config = replaced(config, {"noise.iso": iso})
-        assert math.isclose(physics(with_branch(config, read_shape=table)).read_shape, shape, abs_tol=1e-16)
-
-
-@pytest.mark.parametrize(
-    ("iso", "row"),
-    [(100, 0), (141.4, 0), (141.5, 1), (160, 1), (200, 2), (399.9, 3), (400, 4), (800, 6), (3200, 10), (6400, 12)],
-)
-def test_table_by_stop_has_two_rows_for_each_full_stop(settings: Settings, iso: float, row: int) -> None:
-    """Row ⌊2·log2(ISO / 100)⌋: at full stops, where the logarithm is an integer, without rounding."""
-    config = on_its_own_sensor(settings, "canon_70d", iso)
-    table = [[float(one), 0.0, -float(one), 0.5] for one in range(16)]
-    shapes = [one / 64 for one in range(16)]
-    made = physics(with_branch(config, black_error_dn=["by_stop", *table], read_shape=["by_stop", *shapes]))
-    assert made.black_error_dn == tuple(table[row])
-    assert made.read_shape == shapes[row]
-
-
-def test_table_by_stop_does_not_depend_on_the_range_of_the_branch(settings: Settings) -> None:
-    config = on_its_own_sensor(settings, "canon_70d", 800)
-    table = [[float(one)] * 4 for one in range(16)]
-    made = physics(with_branch(config, black_error_dn=["by_stop", *table], iso=[400, 1600]))
-    assert made.black_error_dn == (6.0,) * 4
+    for iso, shape, error in ((100, 0.1, (0, 0, 0, 0)), (200, -0.1, (2, 4, 0, -2)), (1600, -0.2, (4, 8, 1, -4))):
+        made = physics(with_branch(replaced(config, {"noise.iso": iso}), read_shape=shapes, black_error_dn=errors))
+        assert math.isclose(made.read_shape, shape, abs_tol=1e-16)
+        assert made.black_error_dn == pytest.approx(error, abs=1e-15)  # sites of RGGB from R, G1, B, G2
 
 
 COLOURS = {"RGGB": ("R", "G1", "G2", "B"), "BGGR": ("B", "G2", "G1", "R")}
@@ -168,47 +110,23 @@ COLOURS |= {"GRBG": ("G1", "R", "B", "G2"), "GBRG": ("G2", "B", "R", "G1")}
 
 
 @pytest.mark.parametrize("pattern", COLOURS)
-@pytest.mark.parametrize("form", [(), ("by_stop",), ("by_log_iso",)], ids=str)
-def test_black_errors_by_colour_follow_the_pattern(settings: Settings, pattern: str, form: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("table", [False, True])
+def test_black_errors_follow_the_pattern(settings: Settings, pattern: str, table: bool) -> None:
     errors = {"R": 1.0, "G1": 2.0, "B": 3.0, "G2": 4.0}
+    config = replaced(on_its_own_sensor(settings, "canon_70d", 800), {"sensor.pattern": pattern})
     four = list(errors.values())
-    config = on_its_own_sensor(settings, "canon_70d", 800)
-    config = replaced(config, {"sensor.pattern": pattern})
-    value = ["by_colour", *form, *([four] * 16 if form else four)]
-    assert physics(with_branch(config, black_error_dn=value)).black_error_dn == tuple(
-        errors[colour] for colour in COLOURS[pattern]
-    )
-
-
-@pytest.mark.parametrize("pattern", COLOURS)
-def test_black_errors_by_site_ignore_the_pattern(settings: Settings, pattern: str) -> None:
-    config = on_its_own_sensor(settings, "canon_70d", 800)
-    config = replaced(config, {"sensor.pattern": pattern})
-    assert physics(with_branch(config, black_error_dn=[1, 2, 3, 4])).black_error_dn == (1, 2, 3, 4)
+    made = physics(with_branch(config, black_error_dn=["by_iso", 100, four, 6400, four] if table else four))
+    assert made.black_error_dn == tuple(errors[colour] for colour in COLOURS[pattern])
 
 
 # Scatter --------------------------------------------------------------------------------------------------------------
 
 
-def scattered(physics: Physics) -> tuple[float, ...]:
-    return physics.read_shape, physics.read_std_dn, physics.row_std_dn
-
-
 def scatter_of(settings: Settings, *overrides: str, bodies: int = 1) -> list[tuple[float, ...]]:
-    """Return the numbers of 40 images, of as many bodies as given."""
-    config = drawn_shapes(settings("noise=canon_70d", *overrides))
-    numbers = []
-    for image in range(40):
-        numbers.append(scattered(physics(config, image, sensor_unit=(image % bodies + 0.5) / bodies)))
-    return numbers
-
-
-SHAPES = ["choice", 0.1429, 0.1143, 0.0286, -0.1000, -0.0857, -0.1714, -0.1571]
-
-
-def drawn_shapes(config: Config) -> Config:
-    """Return a config whose shapes are drawn, and whose line is that of a Tukey scale."""
-    return with_branch(config, read_shape=SHAPES, read_std_dn=["scale_line", 0.486806, 1.46427, 0.382006])
+    """Return the read and row noise of 40 images, of as many bodies as given."""
+    config = with_branch(settings("noise=canon_70d", *overrides), read_std_dn=["line", 0.486806, 1.46427, 0.382006])
+    images = [physics(config, image, sensor_unit=(image % bodies + 0.5) / bodies) for image in range(40)]
+    return [(made.read_std_dn, made.row_std_dn) for made in images]
 
 
 @pytest.mark.parametrize(("units", "bodies"), [("1", 1), ("4", 4), ("image", 40)])
@@ -220,7 +138,7 @@ def test_a_unit_has_the_same_deviates_at_all_isos(units: str, bodies: int, setti
     )
     assert len(np.unique(low, axis=0)) == bodies
     np.testing.assert_allclose((high / low).std(axis=0), 0, atol=1e-13)
-    assert (high[:, 1:] > low[:, 1:]).all()
+    assert (high > low).all()
 
 
 @pytest.mark.parametrize("profile", ["canon_5d4", "canon_70d", "canon_700d", "nikon_d850", "sony_a7s2", "oppo_reno10x"])
@@ -237,24 +155,13 @@ def test_by_default_a_profile_has_the_noise_of_its_line(profile: str, settings: 
         assert (np.diff([min(same) for same in stds]) > 0).all()
 
 
-def test_without_scatter_lines_and_the_median_shape_remain(settings: Settings) -> None:
-    config = drawn_shapes(settings("noise=canon_70d", "noise.scatter=off", "noise.iso=3200"))
-    branch = config.noise.branches[0]
-    gain, shape = branch.dn_per_e[1] * 3200, sorted(branch.read_shape[1:])[len(branch.read_shape[1:]) // 2]
-    scale = (4095 - 240) / (15303 - 2048)
-    expected = line_of(branch.read_std_dn, gain) * tukey_std(shape) * scale, line_of(branch.row_std_dn, gain) * scale
+def test_without_scatter_lines_remain(settings: Settings) -> None:
     (numbers,) = set(scatter_of(settings, "noise.scatter=off", "noise.iso=3200"))
-    assert numbers[0] == shape
-    assert all(close(number, one, 1e-14) for number, one in zip(numbers[1:], expected, strict=True))
+    expected = mpmath.exp(0.486806 * mpmath.log(3200) + 1.46427) * (4095 - 240) / (15303 - 2048)
+    assert close(numbers[0], expected, 1e-14)
 
 
 # Profiles in conf/ ----------------------------------------------------------------------------------------------------
-
-
-def line_of(form: list[Any], gain: Any) -> Any:
-    """Return the value of a line without scatter."""
-    with mpmath.workdps(40):
-        return mpmath.exp(mpmath.mpf(form[1]) * mpmath.log(gain) + form[2])
 
 
 @pytest.mark.parametrize(
@@ -433,45 +340,27 @@ def test_inconsistent_physical_profiles_are_refused(
             {"read_std_dn": ["cubic", 1]},
             "branches[0].read_std_dn=[cubic, 1]: expected a number of 0 or more, up to 1e+09, or a form",
         ),
-        ({"read_std_dn": ["per_iso", 1]}, "or a form: root, line, scale_line"),
-        ({"read_std_dn": ["line", 1, 2]}, "line takes 3 finite numbers"),
-        ({"read_std_dn": ["root"]}, "root takes 1 to 3 finite numbers"),
-        ({"read_std_dn": ["root", -1]}, "expected numbers of 0 or more"),
+        ({"read_std_dn": ["line", 1]}, "line takes 2 or 3 finite numbers"),
+        ({"read_std_dn": ["line", 9.0, 0.0, 0.0]}, "exceeds 1e+09 within the ISO range; expected slope, intercept"),
         ({"read_std_dn": -1}, "branches[0].read_std_dn=-1: expected a number of 0 or more"),
         ({"read_std_dn": None}, "branches[0].read_std_dn=null: expected a number of 0 or more"),
-        ({"row_std_dn": ["scale_line", 1, 2, 0]}, "branches[0].row_std_dn=[scale_line, 1, 2, 0]: expected a number"),
-        ({"dn_per_e": ["per_iso", 1, 2, 3]}, "per_iso takes 1 to 2 finite numbers"),
         ({"dn_per_e": 0}, "branches[0].dn_per_e=0: expected a gain above 0"),
-        ({"dn_per_e": ["per_iso", 0.0]}, "branches[0].dn_per_e=[per_iso, 0.0]: expected a gain above 0"),
-        ({"black_error_dn": ["by_log_iso", None]}, "expected a number, four (the 2x2 sites)"),
-        ({"read_shape": -0.5}, "branches[0].read_shape=-0.5: expected more than -0.5, where the Tukey-lambda"),
-        ({"read_shape": ["choice", 0.1, -0.6]}, "expected more than -0.5, where the Tukey-lambda"),
+        ({"dn_per_e": ["line", 0, -99.0]}, "branches[0].dn_per_e=[line, 0, -99.0]: expected a gain above 0"),
+        ({"read_shape": -0.5}, "branches[0].read_shape=-0.5: expected a shape of more than -0.5, where the Tukey-"),
         ({"read_law": "cauchy"}, "branches[0].read_law=cauchy: expected one of gaussian, tukey"),
-        ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), [by_colour, R, G1, B, G2]"),
-        (
-            {"black_error_dn": ["by_colour", ["by_stop", 1, 2, 3, 4]]},
-            "branches[0].black_error_dn=[by_colour, [by_stop, 1, 2, 3, 4]]: expected a number, four",
-        ),
-        ({"black_error_dn": ["by_stop", "by_colour", *[[1, 2, 3, 4]] * 16]}, "black_error_dn=[by_stop, by_colour, [1,"),
-        (
-            {"black_error_dn": ["by_stop", *[[1, 2, 3, 4]] * 12]},
-            "has 12 rows from ISO 100; the branch, ISO 400 to 6400",
-        ),
-        ({"read_shape": ["by_stop", *[0.1] * 12]}, "needs 13; expected two rows for each full stop"),
-        ({"read_shape": ["by_stop", *[-0.6] * 13]}, "expected more than -0.5, where the Tukey-lambda"),
-        ({"read_shape": ["by_iso", 400, 0.1, 6400, "x"]}, "expected pairs of ISO and shape"),
-        ({"read_shape": ["by_iso", 400, 0.1, 6400, 10]}, "expected more than -0.5, where the Tukey-lambda"),
+        ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (R, G of the red rows, B, G of the blue rows)"),
+        ({"black_error_dn": ["by_iso", 400, [1, 2], 6400, 1]}, "expected a number, four (R, G of the red rows, B,"),
+        ({"read_shape": ["by_iso", 400, 0.1, 6400, "x"]}, "expected a shape of more than -0.5"),
+        ({"read_shape": ["by_iso", 400, 0.1, 6400, 10]}, "expected a shape of more than -0.5"),
         ({"read_std_dn": ["by_iso", 400, 1.0, 6400]}, "expected pairs of ISO and value, ISOs in ascending order"),
         ({"read_std_dn": ["by_iso", 6400, 1.0, 400, 2.0]}, "expected pairs of ISO and value, ISOs in ascending order"),
         ({"read_std_dn": ["by_iso", 400, 1.0, 6400, 0]}, "expected numbers above 0, up to 1e+09"),
         ({"row_std_dn": ["by_iso", 800, 1.0, 6400, 2.0]}, "has ISO 800 to 6400; expected values for the ISOs of the"),
-        (
-            {"dn_per_e": ["root", 1.0]},
-            "expected a number of 0 or more, up to 1e+09, or a form: per_iso, by_iso",
-        ),
-        ({"iso": [50, 6400]}, "has 16 rows from ISO 100; the branch, ISO 50 to 6400, needs 13"),
         ({"read_law": "tukey_lambda", "read_shape": -0.46}, "read_shape=-0.46: draws of 32 bits lack more than 12 %"),
-        ({"read_law": "tukey_lambda", "read_shape": ["choice", 0.1, -0.49]}, "expected shapes of -0.45 or more"),
+        (
+            {"read_law": "tukey_lambda", "read_shape": ["by_iso", 1, 0.1, 6400, -0.49]},
+            "expected shapes of -0.45 or more",
+        ),
         ({"iso": [800, 100]}, "branches[0].iso=[800, 100]: expected the lowest and the highest ISO"),
     ],
 )

@@ -57,11 +57,11 @@ NUMBERS = {"dn_per_e": "gain", "read_std_dn": "read", "row_std_dn": "row"}
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("iso", [*ISOS, 200, 2000, 12800, 25600])
 def test_numbers_of_a_profile_are_those_of_the_source_that_its_provenance_names(iso: float, name: str) -> None:
-    """Numbers of the IMX385 are published as rounded to 1e-4, others have the digits of their source."""
+    """Those of the IMX385 are published as rounded to 1e-4; tables of the Oppo are interpolated between half stops."""
     physics = profile_at(physical_profiles()[name], iso)
     for number in NUMBERS if physics is not None else ():
         made, values = getattr(physics, number), published_values(name, iso, number)
-        tolerance = 1e-4 if name == "imx385" else 1e-14
+        tolerance = {"imx385": 1e-4, "oppo_reno10x": 5e-3}.get(name, 1e-8)
         agrees = any(value is None or math.isclose(made, value, rel_tol=tolerance) for value in values)
         assert agrees if values else made == 0, number
 

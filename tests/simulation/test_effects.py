@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.configs import with_branch
 from helpers.datasets import Settings
 from helpers.flats import (
     BLACK,
     COUNT,
-    SHA256,
     SILENT,
     SPAN,
     bounds_off,
@@ -30,7 +28,6 @@ from helpers.flats import (
 )
 from helpers.moments import REACH, bernstein
 
-from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
@@ -352,29 +349,6 @@ def test_black_error_depends_on_cfa_site_alone() -> None:
     plan = plan_with("black_error", black_error_dn=(1.0, -2.0, 3.0, -4.0))
     assert noisy_dn(plan, 0, 4, 5).tolist() == [[1, -2, 1, -2, 1], [3, -4, 3, -4, 3]] * 2
     assert (make_pair(flat(0, 2, 2), plan, (1, 1)).noisy.astype(int) - BLACK).tolist() == [[-4, 3], [-2, 1]]
-
-
-@pytest.mark.parametrize(
-    ("iso", "row"), [(100, 0), (141, 0), (142, 1), (199, 1), (201, 2), (282, 2), (283, 3), (400, 3)]
-)
-def test_black_error_table_divides_iso_range_evenly_in_logarithm(settings: Settings, iso: int, row: int) -> None:
-    config = settings("noise=nikon_d850", f"noise.iso={iso}")
-    config = with_branch(config, iso=[100, 400])
-    config = with_branch(config, black_error_dn=["by_log_iso", *([n, 10 * n, -n, 0.5] for n in range(4))])
-    validate_config(config)
-    physics = plan_image(config, SHA256, facts=facts_of(picture())).noise.physics
-    scale = (4095 - 240) / (16150 - 400)
-    assert physics is not None
-    assert physics.black_error_dn == pytest.approx([scale * one for one in (row, 10 * row, -row, 0.5)], rel=1e-12)
-
-
-def test_black_error_table_accepts_a_single_iso(settings: Settings) -> None:
-    config = settings("noise=nikon_d850", "noise.iso=100")
-    config = with_branch(config, iso=[100, 100])
-    validate_config(config)
-    physics = plan_image(config, SHA256, facts=facts_of(picture())).noise.physics
-    assert physics is not None
-    assert physics.black_error_dn[0] < 0
 
 
 def test_full_well_clips_clean_and_noisy_frames() -> None:

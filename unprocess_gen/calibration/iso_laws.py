@@ -11,8 +11,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from unprocess_gen.calibration.gain import SIGNIFICANT, Estimate
 
 MODE_RATIO = 0.85
@@ -49,23 +47,10 @@ def table(isos: Sequence[float], values: Sequence[float], digits: int = DIGITS) 
     return ["by_iso", *itertools.chain(*zip(isos, written, strict=True))]
 
 
-def black_law(isos: Sequence[float], blacks: Sequence[Sequence[float]], by_colour: bool) -> Any:
-    """Return black errors (R, G1, B, G2, or one) as numbers, or as a table by equal parts of ln ISO."""
-    words = ["by_colour"] if by_colour else []
-    rows = [[round(value, 4) for value in black] for black in blacks]
-    if len(isos) == 1:
-        return [*words, *rows[0]] if by_colour else rows[0][0]
-    logs = np.log(np.array(isos) / isos[0]) / math.log(isos[-1] / isos[0])
-    for parts in range(len(isos), 257):
-        places = np.minimum((logs * parts + 1e-9).astype(int), parts - 1)
-        if len(set(places.tolist())) == len(isos):
-            break
-    middles = (np.arange(parts) + 0.5) / parts
-    nearest = [int(np.argmin(np.abs(logs - middle))) for middle in middles]
-    for iso, place in enumerate(places):
-        nearest[place] = iso
-    fours = [rows[iso] if by_colour else rows[iso][:1] * 4 for iso in nearest]
-    return [*words, "by_log_iso", *fours]
+def black_law(isos: Sequence[float], blacks: Sequence[Sequence[float]]) -> Any:
+    """Return black errors (R, G1, B, G2, or one) as numbers, or as a table ``by_iso``."""
+    values = [[round(value, 4) for value in black] if len(black) > 1 else round(black[0], 4) for black in blacks]
+    return values[0] if len(isos) == 1 else ["by_iso", *itertools.chain(*zip(isos, values, strict=True))]
 
 
 def rounded(value: float, digits: int = DIGITS) -> float:

@@ -173,7 +173,7 @@ def _branch(results: Sequence[IsoResult], sensor: Sensor) -> dict[str, Any]:
     # of red, both greens and blue; a monochrome sensor has one
     places = [1 + names.index(name) for name in ("R", "Gr", "B", "Gb")] if names else [0]
     blacks = [[result.numbers["black_error_dn"][place].value for place in places] for result in results]
-    return branch | {"black_error_dn": black_law(isos, blacks, bool(names))}
+    return branch | {"black_error_dn": black_law(isos, blacks)}
 
 
 def _common_keys(calibration: Calibration) -> dict[str, Any]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import bisect
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,39 +38,34 @@ DISTRIBUTION_FORMS: Mapping[str, Form] = {
 """Distributions that a parameter can be drawn from, by kind."""
 
 ISO_FORMS: Mapping[str, Form] = {
-    "per_iso": Form(("slope", "intercept"), "slope · ISO + intercept (0 if it is left out)", optional=1),
-    "root": Form(("c0", "c1", "c2"), "the square root of the variance c0 + c1 · ISO + c2 · ISO²", optional=2),
     "line": Form(
         ("slope", "intercept", "scatter"),
-        "the standard deviation σ with ln σ = slope · ln K + intercept + scatter · n, where K is `dn_per_e` and n a "
-        "standard normal deviate, drawn for each camera body with `noise.scatter=unit`",
-    ),
-    "scale_line": Form(
-        ("slope", "intercept", "scatter"),
-        "the same line for the scale of Tukey's lambda distribution; the scale is multiplied by the standard deviation "
-        "at scale 1",
+        "a gain or standard deviation x with ln x = slope · ln ISO + intercept + scatter · n (0 if it is left out), "
+        "where n is a standard normal deviate, drawn for each camera body with `noise.scatter=unit`",
+        optional=1,
     ),
     "by_iso": Form(
         ("ISO", "value", "…"),
-        "values at these ISOs in ascending order; between them, standard deviations are interpolated in ln σ, shapes "
-        "linearly, both against ln ISO",
-    ),
-    "by_stop": Form(
-        ("row", "…"),
-        "a table with two rows for each full stop from ISO 100: row ⌊2·log₂(ISO / 100)⌋, counted from 0; a row is a "
-        "shape, or four black-level errors",
-    ),
-    "by_log_iso": Form(
-        ("[four]", "…"),
-        "black-level errors of the four sites, for equal parts of the branch's range of ln ISO, lowest ISO first",
-    ),
-    "by_colour": Form(
-        ("R", "G1", "B", "G2"),
-        "black-level errors of the red, the green of the red rows, the blue, and the green of the blue rows, for any "
-        "CFA pattern; before `by_stop` or `by_log_iso`, each row of four numbers has this order",
+        "values at these ISOs in ascending order; between them, gains and standard deviations are interpolated in "
+        "their logarithms, shapes and black-level errors linearly, both against ln ISO; a value of `black_error_dn` is "
+        "one number, or four: R, G of the red rows, B, G of the blue rows",
     ),
 }
 """Functions of ISO that the number of a branch can be; `planning.noise_profile` evaluates them."""
+
+
+def value_at(form: Any, iso: float) -> float:
+    """Return a gain or standard deviation at an ISO without scatter, to the precision of the C library."""
+    match form:
+        case ["line", slope, intercept, *_]:
+            return math.exp(slope * math.log(iso) + intercept)
+        case ["by_iso", *pairs]:
+            isos, values = ([math.log(number) for number in pairs[start::2]] for start in (0, 1))
+            above = min(bisect.bisect_left(isos, math.log(iso)), len(isos) - 1)
+            low = max(above - 1, 0)
+            share = (math.log(iso) - isos[low]) / (isos[above] - isos[low]) if above else 0.0
+            return math.exp(values[low] + share * (values[above] - values[low]))
+    return float(form)
 
 
 def spelled(name: str, form: Form) -> str:

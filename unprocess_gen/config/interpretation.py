@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from fractions import Fraction
 from typing import Any
 
 from unprocess_gen.config import limits
@@ -104,24 +103,6 @@ def is_physical(noise: NoiseConfig) -> bool:
 def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
     """Find the numbers of a physical profile at an ISO."""
     return next((branch for branch in noise.branches if branch.iso[0] <= iso <= branch.iso[1]), None)
-
-
-@functools.lru_cache(maxsize=256)
-def row_of_stop(iso: float) -> int:
-    """Return the row of a table ``by_stop``: ⌊2·log2(ISO / 100)⌋, in exact arithmetic; 0 below ISO 100.
-
-    Rows 2k and 2k + 1 are for ISO 100·2^k to 100·2^(k + 1).
-    """
-    ratio = (Fraction(iso) / 100) ** 2
-    return max((ratio.numerator // ratio.denominator).bit_length() - 1, 0)
-
-
-def table_words(value: Any) -> tuple[list[str], list[Any]]:
-    """Split a number of a branch into its leading words and the rest."""
-    if not isinstance(value, list | tuple):
-        return [], [value]
-    count = next((place for place, entry in enumerate(value) if not isinstance(entry, str)), len(value))
-    return list(value[:count]), list(value[count:])
 
 
 def provenance_at(noise: NoiseConfig, isos: Sequence[float]) -> list[ProvenanceConfig]:

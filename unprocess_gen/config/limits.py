@@ -228,13 +228,10 @@ EXPOSURE_RATIO = Drawn(SCENE_KINDS, 1e-3, 1e6)
 """Ranges of the values of a scene. Chosen: far beyond cameras."""
 
 
-READ_SHAPE = Drawn(
-    ("choice",),
-    math.nextafter(-0.5, 0),
-    math.nextafter(10.0, 0),
-    "more than -0.5, where the Tukey-lambda distribution has a variance, and less than 10",
+READ_SHAPE = Limit(
+    "a shape of more than -0.5, where the Tukey-lambda distribution has a variance, and less than 10, or a table, "
+    "[by_iso, ISO, shape, …]"
 )
-READ_SHAPE.text += "; or by ISO: by_stop, by_iso"
 
 PATCH = Limit(
     "null, a side, [grid, side], [grid, side, stride] or [random, side, count]; side and stride are even, "
@@ -248,8 +245,7 @@ DIGEST = Limit(
 )
 ISO_RANGE = Limit("the lowest and the highest ISO, [100, 6400]")
 BLACK_ERROR = Limit(
-    "a number, four (the 2x2 sites), [by_colour, R, G1, B, G2], or a table, [by_stop, [four], …] or [by_log_iso, "
-    "[four], …], whose fours are in the order R, G1, B, G2 if by_colour precedes it"
+    "a number, four (R, G of the red rows, B, G of the blue rows), or a table of such values, [by_iso, ISO, value, …]"
 )
 
 
@@ -280,8 +276,7 @@ WHITE_LEVEL = LevelRange(
 
 
 class IsoForm(Limit):
-    """A number, or one of some forms of `forms.ISO_FORMS`; `noise_validation` checks it."""
+    """A number, or one of `forms.ISO_FORMS`; `noise_validation` checks it."""
 
-    def __init__(self, forms: tuple[str, ...]) -> None:
-        self.forms = forms
-        super().__init__(f"a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: {', '.join(forms)}")
+    def __init__(self) -> None:
+        super().__init__(f"a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: line, by_iso")

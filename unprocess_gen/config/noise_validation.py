@@ -12,8 +12,8 @@ import numpy as np
 
 from unprocess_gen.config import limits
 from unprocess_gen.config.distributions import highest, lowest, parse_drawn
-from unprocess_gen.config.forms import ISO_FORMS
-from unprocess_gen.config.interpretation import branch_of, is_physical, noise_distributions, row_of_stop, table_words
+from unprocess_gen.config.forms import value_at
+from unprocess_gen.config.interpretation import branch_of, is_physical, noise_distributions
 from unprocess_gen.config.limits import ISO_RANGE, MAX_BRANCH_NUMBER
 from unprocess_gen.config.schema import (
     ASSUMABLE,
@@ -118,16 +118,13 @@ def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
 def _check_branch(key: str, branch: BranchConfig, span: int) -> None:
     if not _is_range(branch.iso):
         raise refusal(f"{key}.iso", branch.iso, f"expected {ISO_RANGE}")
-    gains: list[float] = []
     for name, setting in settings_of(BranchConfig).items():
         value = getattr(branch, name)
         if isinstance(setting.limit, limits.IsoForm) and not (value is None and setting.null):
-            _check_form(f"{key}.{name}", value, setting.limit, branch, gains)
-        if name == "dn_per_e":
-            gains = [_gain_at(branch, iso) for iso in branch.iso]
-            if not gains[0] * MAX_ELECTRONS >= span:
-                expected = f"expected a gain above 0, with at most {MAX_ELECTRONS:g} electrons at white"
-                raise refusal(f"{key}.{name}", value, expected)
+            _check_form(f"{key}.{name}", value, setting.limit, branch)
+        if name == "dn_per_e" and not min(value_at(value, iso) for iso in branch.iso) * MAX_ELECTRONS >= span:
+            expected = f"expected a gain above 0, with at most {MAX_ELECTRONS:g} electrons at white"
+            raise refusal(f"{key}.{name}", value, expected)
         setting.check(f"{key}.{name}", value)
     _check_shape(f"{key}.read_shape", branch)
     _check_black_error(f"{key}.black_error_dn", branch)
@@ -145,50 +142,32 @@ def well_ends_first(noise: NoiseConfig, scene: SceneConfig) -> bool:
     low, high = lowest(drawn), highest(drawn)
     branches = [branch for branch in noise.branches if branch.iso[0] <= high and low <= branch.iso[1]]
     return bool(
-        noise.full_well_e * min(_gain_at(branch, max(low, branch.iso[0])) for branch in branches) < _span(noise)
+        noise.full_well_e * min(value_at(branch.dn_per_e, max(low, branch.iso[0])) for branch in branches)
+        < _span(noise)
     )
-
-
-def _gain_at(branch: BranchConfig, iso: float) -> float:
-    """Return the system gain at an ISO, DN per electron."""
-    match branch.dn_per_e:
-        case ["by_iso", *pairs]:
-            return math.exp(np.interp(math.log(iso), np.log(pairs[::2]), np.log(pairs[1::2])))
-        case [_, slope, *intercept]:
-            return float(slope * iso + sum(intercept))
-    return float(branch.dn_per_e)
 
 
 # --------------------------------------------------------------------------------------- numbers that depend on ISO
 
 
-def _check_form(key: str, value: Any, limit: limits.IsoForm, branch: BranchConfig, gains: Sequence[float]) -> None:
-    """Raise ConfigError unless a value is a number or an allowed form; ``gains`` are those at which lines are used."""
-    if is_number(value) and 0 <= value <= MAX_BRANCH_NUMBER:
-        return
-    words, numbers = table_words(value)
-    form = words[0] if len(words) == 1 else ""
-    if form not in limit.forms:
-        raise refusal(key, value, f"expected {limit}")
-    if form == "by_iso":
-        if not all(is_number(number) and 0 < number <= MAX_BRANCH_NUMBER for number in numbers):
-            raise refusal(key, value, f"expected numbers above 0, up to {MAX_BRANCH_NUMBER:g}")
-        _check_isos(key, value, branch)
-        return
-    most = len(ISO_FORMS[form].numbers)
-    fewest = most - ISO_FORMS[form].optional
-    if not fewest <= len(numbers) <= most or not all(_is_branch_number(number) for number in numbers):
-        count = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-        raise refusal(key, value, f"{form} takes {count} finite numbers of at most {MAX_BRANCH_NUMBER:g}")
-    if form in ("per_iso", "root"):
-        if min(numbers) < 0:
-            raise refusal(key, value, "expected numbers of 0 or more")
-        return
-    slope, intercept, scatter = numbers
-    largest = max(slope * math.log(gain) for gain in gains) + intercept + FARTHEST_NORMAL * abs(scatter)
-    if largest > math.log(MAX_BRANCH_NUMBER):
-        line = "slope, intercept and scatter of ln(standard deviation) against ln(gain)"
-        raise refusal(key, value, f"exceeds {MAX_BRANCH_NUMBER:g} DN within the ISO range; expected {line}")
+def _check_form(key: str, value: Any, limit: limits.IsoForm, branch: BranchConfig) -> None:
+    """Raise ConfigError unless a value is a number or an allowed form."""
+    match value:
+        case ["line", *numbers]:
+            if len(numbers) not in (2, 3) or not all(map(_is_branch_number, numbers)):
+                raise refusal(key, value, f"line takes 2 or 3 finite numbers of at most {MAX_BRANCH_NUMBER:g}")
+            slope, intercept, scatter = (*numbers, 0.0)[:3]
+            largest = max(slope * math.log(iso) for iso in branch.iso) + intercept + FARTHEST_NORMAL * abs(scatter)
+            if largest > math.log(MAX_BRANCH_NUMBER):
+                line = "slope, intercept and scatter of ln(value) against ln(ISO)"
+                raise refusal(key, value, f"exceeds {MAX_BRANCH_NUMBER:g} within the ISO range; expected {line}")
+        case ["by_iso", *pairs]:
+            if not all(is_number(number) and 0 < number <= MAX_BRANCH_NUMBER for number in pairs):
+                raise refusal(key, value, f"expected numbers above 0, up to {MAX_BRANCH_NUMBER:g}")
+            _check_isos(key, value, branch)
+        case _:
+            if not (is_number(value) and 0 <= value <= MAX_BRANCH_NUMBER):
+                raise refusal(key, value, f"expected {limit}")
 
 
 def _is_branch_number(value: Any) -> bool:
@@ -198,21 +177,13 @@ def _is_branch_number(value: Any) -> bool:
 def _check_isos(key: str, value: Sequence[Any], branch: BranchConfig) -> None:
     """Raise ConfigError unless the ISOs of a table ``by_iso`` ascend and contain the range of the branch."""
     isos = value[1::2]
-    if len(value) % 2 == 0 or not isos or any(low >= high for low, high in itertools.pairwise(isos)):
+    ascend = all(map(is_number, isos)) and all(low < high for low, high in itertools.pairwise(isos))
+    if len(value) % 2 == 0 or not isos or not ascend:
         raise refusal(key, value, "expected pairs of ISO and value, ISOs in ascending order")
     first, last = branch.iso
     if not isos[0] <= first <= last <= isos[-1]:
         expected = f"expected values for the ISOs of the branch, {first:g} to {last:g}"
         raise refusal(key, value, f"has ISO {isos[0]:g} to {isos[-1]:g}; {expected}")
-
-
-def _check_stops(key: str, value: Any, rows: Sequence[Any], branch: BranchConfig) -> None:
-    """Raise ConfigError unless a table ``by_stop`` has a row for every ISO of the branch."""
-    first, last = branch.iso
-    needed = row_of_stop(last) + 1
-    if first < 100 or len(rows) < needed:
-        has = f"has {len(rows)} rows from ISO 100; the branch, ISO {first:g} to {last:g}, needs {needed}"
-        raise refusal(key, value, f"{has}; expected two rows for each full stop")
 
 
 def _check_shape(key: str, branch: BranchConfig) -> None:
@@ -221,37 +192,28 @@ def _check_shape(key: str, branch: BranchConfig) -> None:
     The variance of ``tukey_lambda`` with heavier tails is mostly in values that are never drawn.
     """
     value = branch.read_shape
-    match value:
-        case ["by_iso", *pairs]:
-            if not all(map(is_number, pairs)):
-                raise refusal(key, value, "expected pairs of ISO and shape")
-            _check_isos(key, value, branch)
-            drawn = parse_drawn(key, ["choice", *pairs[1::2]], limits.READ_SHAPE)
-        case ["by_stop", *rows]:
-            _check_stops(key, value, rows, branch)
-            drawn = parse_drawn(key, ["choice", *rows], limits.READ_SHAPE)
-        case _:
-            drawn = parse_drawn(key, value, limits.READ_SHAPE)
-    if branch.read_law == "tukey_lambda" and lowest(drawn) < HEAVIEST_TAILS:
+    shapes = _table_values(key, value, branch)
+    if not all(is_number(shape) and -0.5 < shape < 10 for shape in shapes):
+        raise refusal(key, value, f"expected {limits.READ_SHAPE}")
+    if branch.read_law == "tukey_lambda" and min(shapes) < HEAVIEST_TAILS:
         lacking = "draws of 32 bits lack more than 12 % of the variance"
         raise refusal(key, value, f"{lacking}; expected shapes of {HEAVIEST_TAILS:g} or more")
 
 
+def _table_values(key: str, value: Any, branch: BranchConfig) -> Sequence[Any]:
+    """Return the values of a table ``by_iso``, whose ISOs are checked, or the value itself."""
+    if not isinstance(value, list | tuple) or value[:1] not in (["by_iso"], ("by_iso",)):
+        return [value]
+    _check_isos(key, value, branch)
+    return value[2::2]
+
+
 def _check_black_error(key: str, branch: BranchConfig) -> None:
     value = branch.black_error_dn
-    if value is None or _is_branch_number(value):
-        return
-    words, rest = table_words(value)
-    table = words[1:] if words[:1] == ["by_colour"] else words
-    rows = rest if table else [rest]
-    if table not in ([], ["by_stop"], ["by_log_iso"]) or not rows or not all(map(_is_four, rows)):
-        raise refusal(key, value, f"expected {limits.BLACK_ERROR}")
-    if table == ["by_stop"]:
-        _check_stops(key, value, rows, branch)
-
-
-def _is_four(row: Any) -> bool:
-    return isinstance(row, list | tuple) and len(row) == 4 and all(map(_is_branch_number, row))
+    for error in () if value is None else _table_values(key, value, branch):
+        four = error if isinstance(error, list | tuple) else [error] * 4
+        if len(four) != 4 or not all(map(_is_branch_number, four)):
+            raise refusal(key, value, f"expected {limits.BLACK_ERROR}")
 
 
 # ------------------------------------------------------------------------------------------- numbers of the profile

@@ -330,7 +330,7 @@ def _limit(number: Number) -> Limit:
     if number.kind in (SHAPE, SITES):
         return limits.READ_SHAPE if number.kind == SHAPE else limits.BLACK_ERROR
     if number.in_branch:
-        return Choice(*number.words) if number.words else IsoForm(number.forms)
+        return Choice(*number.words) if number.words else IsoForm()
     numbers = Numbers(number.low, number.high)
     return numbers if number.count == 1 else NumberList(number.count, numbers)
 

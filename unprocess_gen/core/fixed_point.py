@@ -134,15 +134,13 @@ def exponential(exponent: int, error: int) -> tuple[int, int, int]:
     return _exp_of_step(step) * series >> BITS, 3 * (error + abs(doublings)) + 28, doublings
 
 
-def nearest_exp(exponent: int, error: int, factor: int = ONE) -> float | None:
-    """Return the float64 next to an exponential, times a factor.
+def nearest_exp(exponent: int, error: int) -> float | None:
+    """Return the float64 next to an exponential.
 
     Parameters
     ----------
     exponent, error : int
         Exponent, fixed-point, and its error including `DECIMAL_ERROR`.
-    factor : int
-        Positive number, fixed-point, within one unit.
 
     Returns
     -------
@@ -152,8 +150,6 @@ def nearest_exp(exponent: int, error: int, factor: int = ONE) -> float | None:
     if abs(exponent) > MAX_EXPONENT or error > MAX_EXPONENT_ERROR:
         return None
     mantissa, error, doublings = exponential(exponent, error)
-    if factor != ONE:
-        mantissa, error = mantissa * factor >> BITS, (error * factor >> BITS) + 4
     error += mantissa >> ROUNDED_BITS
     top, bottom = (1 << doublings, ONE) if doublings >= 0 else (1, ONE << -doublings)
     low, high = (mantissa - error) * top / bottom, (mantissa + error) * top / bottom
@@ -312,10 +308,8 @@ def normal_quantile(p: int, error: int) -> tuple[int, int] | None:
 # ------------------------------------------------------------------------------------------------------- distributions
 
 
-def nearest_log_linear(
-    uniform: float, x: float, slope: float, intercept: float, std: float, factor: int = ONE
-) -> float | None:
-    """Return the float64 next to e**(slope · ln x + intercept + std · n) · factor, where n is a normal quantile.
+def nearest_log_linear(uniform: float, x: float, slope: float, intercept: float, std: float) -> float | None:
+    """Return the float64 next to e**(slope · ln x + intercept + std · n), where n is a normal quantile.
 
     Parameters
     ----------
@@ -325,8 +319,6 @@ def nearest_log_linear(
         Positive number.
     slope, intercept, std : float
         Numbers of the line.
-    factor : int
-        Positive number, fixed-point, within one unit.
 
     Returns
     -------
@@ -339,4 +331,4 @@ def nearest_log_linear(
         return None
     line = times(logarithm_x, slope) + times(ONE, intercept) + times(normal[0], std)
     error = times(error, abs(slope)) + times(normal[1], abs(std)) + 8 + DECIMAL_ERROR
-    return nearest_exp(line, error, factor)
+    return nearest_exp(line, error)

@@ -16,7 +16,7 @@ class BlackErrorNumbers(EffectNumbers):
         "error of the black level",
         unit="DN",
         kind=SITES,
-        forms=("by_colour", "by_stop", "by_log_iso"),
+        by_iso=True,
         count=4,
         columns={
             f"black_error_dn_{i}{j}": f"black-level error of the 2x2 CFA pattern, row {i}, column {j}"

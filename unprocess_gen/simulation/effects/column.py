@@ -15,9 +15,7 @@ from unprocess_gen.simulation.slots import LineOffsets, SlotWords
 class ColumnNumbers(EffectNumbers):
     """Standard deviation of column offsets, DN."""
 
-    column_std_dn: float = number_in_dn(
-        "standard deviation of column offsets", forms=("root", "line", "by_iso"), counter=3
-    )
+    column_std_dn: float = number_in_dn("standard deviation of column offsets", by_iso=True, counter=3)
 
 
 class ColumnNoise(Effect):

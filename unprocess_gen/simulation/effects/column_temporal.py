@@ -17,7 +17,7 @@ class ColumnTemporalNumbers(EffectNumbers):
 
     column_temporal_std_dn: float = number_in_dn(
         "standard deviation of the part of column offsets that is new in every frame",
-        forms=("root", "line"),
+        by_iso=True,
         counter=4,
     )
 

@@ -46,8 +46,10 @@ class Number:
         What null means if the effect is simulated without the number; empty if it needs the number.
     required : bool
         Whether null is refused.
-    forms, words : tuple of str
-        Forms of `config.forms`, and words, that the key allows; a key with any belongs to the branches of a profile.
+    by_iso : bool
+        Whether the key belongs to the branches of a profile, and its value may depend on ISO (`config.forms`).
+    words : tuple of str
+        Words that the key allows instead of numbers.
     count : int
         Numbers in the value; a list if more than 1.
     counter : int
@@ -69,7 +71,7 @@ class Number:
     key_default: Any = None
     optional: str = ""
     required: bool = False
-    forms: tuple[str, ...] = ()
+    by_iso: bool = False
     words: tuple[str, ...] = ()
     count: int = 1
     counter: int = -1
@@ -85,7 +87,7 @@ class Number:
     @property
     def in_branch(self) -> bool:
         """True for a key of the branches, false for a key of the profile."""
-        return bool(self.forms or self.words)
+        return self.by_iso or bool(self.words)
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)

@@ -24,15 +24,14 @@ class ReadNumbers(EffectNumbers):
         0.0,
         "shape of Tukey's lambda distribution",
         kind=SHAPE,
-        forms=("choice", "by_stop", "by_iso"),
+        by_iso=True,
         key_default=0.0,
-        counter=0,
         lowest=-0.5,
         highest=10.0,
     )
     read_std_dn: float = number_in_dn(
         "standard deviation of the read noise",
-        forms=("root", "line", "scale_line", "by_iso"),
+        by_iso=True,
         required=True,
         counter=1,
     )

@@ -15,7 +15,7 @@ from unprocess_gen.simulation.slots import LineOffsets
 class RowNumbers(EffectNumbers):
     """Standard deviation of row offsets, DN, and correlation of the offsets of neighbouring rows."""
 
-    row_std_dn: float = number_in_dn("standard deviation of row offsets", forms=("root", "line", "by_iso"), counter=2)
+    row_std_dn: float = number_in_dn("standard deviation of row offsets", by_iso=True, counter=2)
     row_correlation: float = number(
         0.0,
         "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the effect row",

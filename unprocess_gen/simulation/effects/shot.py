@@ -13,7 +13,7 @@ class ShotNumbers(EffectNumbers):
     """System gain K, DN per electron."""
 
     dn_per_e: float = number(
-        1.0, "system gain K", unit="DN per electron", kind=DN, forms=("per_iso", "by_iso"), required=True, highest=1e20
+        1.0, "system gain K", unit="DN per electron", kind=DN, by_iso=True, required=True, highest=1e20
     )
 
 
