@@ -77,8 +77,8 @@ def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.Mo
     """Call ``action`` once a run of this process has committed ``number`` shards."""
     commit, done = worker.commit_shard, []
 
-    def commits(storage: Storage, made: Any) -> ShardReport:
-        report = commit(storage, made)
+    def commits(storage: Storage, made: Any, columns: Any) -> ShardReport:
+        report = commit(storage, made, columns)
         done.append(made.shard)
         if len(done) == number:
             action()

@@ -20,10 +20,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import operator
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,21 +37,17 @@ from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import MAX_BYTES, parse_json
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.dataset_json import FORMAT, check_dataset_json, check_format, check_format_of
+from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.manifest import header_text, read_rows
 from unprocess_gen.pipeline.run_records import INDEX, ShardRecords, recorded_sources, write_listing
 from unprocess_gen.pipeline.storage import WORK, Storage, cannot_write
 from unprocess_gen.pipeline.tasks import Tally
-from unprocess_gen.sources.reading import content_sha256
 
 REPORT = "report.html"
 """The page of a dataset, a file in its folder that is not part of the dataset."""
 
 DIFFERENCES_SHOWN = 3
 """Differences named in an error; the others are counted."""
-
-
-PresentDigest = Callable[[Source, str | None], str | None]
-"""Function of a source and its known SHA-256 that returns the present SHA-256, None if it is not known."""
 
 
 class Workspace:
@@ -113,15 +108,11 @@ class Workspace:
             raise DamageError(f"{error}; gen-dataset verify {self.out} --repair restores it") from error
 
     def check_begun(self, sources: Sequence[Source], root: str | None) -> None:
-        """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences.
-
-        Files that the earlier run hashed, because others had their size and end, are hashed again: if one of them has
-        changed, another one can have another number among identical files, and so other noise.
-        """
+        """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences."""
         self._check_same_settings(root)
         known = partial(recorded_sources, self.storage)
         if next(known(), None) is not None:
-            self._check_same_sources(known, sources, partial(_digest_if_recorded, root))
+            self._check_same_sources(known, sources, _is_listed_alike)
 
     def begin(self, sources: Sequence[Source], shards: int) -> None:
         """Start a dataset of some shards, or continue one that an earlier run began and `check_begun` has accepted.
@@ -161,7 +152,7 @@ class Workspace:
             )
         self._check_same_settings()
         known = partial(_sources_of_rows, any_path(self.out) / "manifest.csv")
-        self._check_same_sources(known, sources, lambda source, _: source.sha256)
+        self._check_same_sources(known, sources, _is_alike)
         facts = self.facts()
         assert facts is not None
         sizes = {f"shards/{name}": size for name, size in (self.storage / "shards").entries().items()}
@@ -196,18 +187,18 @@ class Workspace:
             )
 
     def _check_same_sources(
-        self, known: Callable[[], Iterator[Source]], sources: Sequence[Source], digest: PresentDigest
+        self, known: Callable[[], Iterator[Source]], sources: Sequence[Source], same: Callable[[Source, Source], bool]
     ) -> None:
         """Raise ConfigError if the sources are not those that are known; name the differences.
 
         Both are in the order of the listing, so equal ones are compared without holding the known ones: a million take
         0.4 GB.
         """
-        pairs = itertools.zip_longest(_first_of_files(known()), _first_of_files(sources))
-        if all(old and new and old.name == new.name and _is_same(old, new, digest) for old, new in pairs):
+        pairs = itertools.zip_longest(known(), sources)
+        if all(old and new and old.name == new.name and same(old, new) for old, new in pairs):
             return
         files, listed = ({source.name: source for source in side} for side in (known(), sources))
-        changes = (_change(name, files.get(name), listed.get(name), digest) for name in listed | files)
+        changes = (_change(name, files.get(name), listed.get(name), same) for name in listed | files)
         differing = [change for change in changes if change]
         if differing:
             raise ConfigError(
@@ -249,42 +240,36 @@ class Workspace:
             yield record.csv
 
 
-def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:
-    """Return the digest of a source whose digest was recorded; hash the file if this listing did not.
-
-    An object of a store is not hashed, because its ETag is compared.
-    """
-    if root is None or not source.size_bytes or not recorded or source.etag:
-        return source.sha256
-    return content_sha256(root, source)
-
-
 def _sources_of_rows(manifest: AnyPath) -> Iterator[Source]:
-    """Yield the source of every row, with name, size and digest only."""
-    for index, row in enumerate(read_rows(manifest)):
-        size, name = row["source_bytes"], str(row["source"])
-        yield Source(index, name, name, size if isinstance(size, int) else None, sha256=str(row["source_sha256"]))
+    """Yield the source of every image, with name, size and digest only."""
+    for index, rows in enumerate(group_by_image(read_rows(manifest))):
+        size, name = rows[0]["source_bytes"], str(rows[0]["source"])
+        sha256 = str(rows[0]["source_sha256"])
+        yield Source(index, name, name, size if isinstance(size, int) else None, sha256=sha256)
 
 
-def _first_of_files(sources: Iterable[Source]) -> Iterator[Source]:
-    """Yield the first of consecutive sources that are in one file."""
-    return (next(group) for _, group in itertools.groupby(sources, key=operator.attrgetter("name")))
-
-
-def _change(name: str, file: Source | None, source: Source | None, digest: PresentDigest) -> str:
+def _change(name: str, old: Source | None, new: Source | None, same: Callable[[Source, Source], bool]) -> str:
     """Describe how a source differs from the known file of its name; empty if it does not."""
-    if file is None or source is None:
-        return f"{name} is new" if file is None else f"{name} was deleted"
-    if source.size_bytes != file.size_bytes:
-        return f"{name} has {source.size_bytes} bytes, had {file.size_bytes}"
-    return "" if _is_same(file, source, digest) else f"{name} has other bytes than it had"
+    if old is None or new is None:
+        return f"{name} is new" if old is None else f"{name} was deleted"
+    if new.size_bytes != old.size_bytes:
+        return f"{name} has {new.size_bytes} bytes, had {old.size_bytes}"
+    return "" if same(old, new) else f"{name} has other bytes than it had"
 
 
-def _is_same(file: Source, source: Source, digest: PresentDigest) -> bool:
-    """Check whether a source has the size of the known one, and its digest and ETag if both are known."""
-    if source.size_bytes != file.size_bytes or (file.etag and source.etag not in (None, file.etag)):
-        return False
-    return not file.sha256 or digest(source, file.sha256) in (None, file.sha256)
+def _is_alike(old: Source, new: Source) -> bool:
+    """Check whether a source has the size of the one in the manifest, and its digest if the listing hashed it."""
+    return new.size_bytes == old.size_bytes and (not old.sha256 or new.sha256 in (None, old.sha256))
+
+
+def _is_listed_alike(old: Source, new: Source) -> bool:
+    """Check whether a source was listed before with the same size, digest and ETag.
+
+    A listing hashes the files that could be identical. If one of them has changed, another one can have another number
+    among identical files, and so other noise.
+    """
+    same_etag = not old.etag or new.etag in (None, old.etag)
+    return (new.size_bytes, new.sha256) == (old.size_bytes, old.sha256) and same_etag
 
 
 def dataset_facts(
