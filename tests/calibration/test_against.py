@@ -62,11 +62,9 @@ def test_gain_of_darks_alone_is_not_compared(config: Config, tmp_path: Path) -> 
     assert (verdicts["dn_per_e"], verdicts["read_std_dn"]) == ("not compared", "agrees")
 
 
-@pytest.mark.parametrize(
-    "flags", ["--to list.csv", "--against frames --noise", "--against no_folder", "--against frames --to ds/list.csv"]
-)
+@pytest.mark.parametrize("flags", ["--against frames --noise", "--against no_folder"])
 def test_wrong_use_is_refused(flags: str, run_main: RunMain, dataset: Path) -> None:
-    done = run_main("verify", dataset, *flags.replace("ds/", f"{dataset}/").split())
+    done = run_main("verify", dataset, *flags.split())
     assert (done.code, len(done.err.splitlines())) == (2, 1), done.err
 
 
@@ -79,8 +77,8 @@ def test_frames_of_another_iso_are_refused(config: Config, tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [*CHANGES, "none"])
-def test_planted_differences_are_named_in_all_of_100_runs(number: str, config: Config, tmp_path: Path) -> None:
-    for seed in range(100):
+def test_planted_differences_are_named_in_all_of_20_runs(number: str, config: Config, tmp_path: Path) -> None:
+    for seed in range(20):
         found = compare_frames(config, draw(tmp_path / f"{seed}", CHANGES.get(number, Numbers()), seed, 256))
         named = {one.measured.name for one in found.differences}
         assert named == ({number} if number in CHANGES else set()), (seed, [str(one) for one in found.differences])

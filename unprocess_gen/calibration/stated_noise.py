@@ -74,11 +74,6 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     isos = _by_iso([_stated_iso(path, tags) for path, tags in stated.items()])
     pattern = next(iter(stated.values())).pattern
     sensor = Sensor(int(white).bit_length(), round(sum(blacks) / 4), round(white), pattern or "RGGB", (0, 0))
-    if (spread := max(_spreads(isos).values())) > SAME:
-        notes.append(
-            f"NoiseProfile: the planes differ by up to {spread:.1%}; the profile has the variance of green, and the "
-            "gains of red and blue relative to it"
-        )
     return StatedNoise(isos, _modes(isos), sensor, model or "an unknown camera", sha256, len(stated), notes)
 
 
@@ -139,14 +134,6 @@ def _modes(isos: Sequence[StatedIso]) -> list[list[StatedIso]]:
     return modes
 
 
-def _spreads(isos: Sequence[StatedIso]) -> dict[str, float]:
-    """Return the largest relative difference of a and of b from a and b of green."""
-    return {
-        "a": max(abs(value / record.a[1] - 1) for record in isos for value in record.a),
-        "b": max(abs(value - record.b[1]) / max(*record.b, 1e-300) for record in isos for value in record.b),
-    }
-
-
 def stated_json(stated: StatedNoise) -> str:
     """Return the list of estimates as JSON; the tags state no intervals."""
     named = []
@@ -168,13 +155,10 @@ def stated_yaml(stated: StatedNoise, name: str) -> str:
         read = table(own, [math.sqrt(record.b[1]) for record in mode], DIGITS)
         branch = {"iso": [own[0], own[-1]], "dn_per_e": gain, "read_law": "gaussian", "read_std_dn": read}
         profile["branches"].append(branch)
-    spreads = _spreads(stated.isos)
-    if spreads["a"] > SAME:
-        middle = stated.isos[len(isos) // 2]
-        profile["gain_by_colour"] = [rounded(value / middle.a[1], DIGITS) for value in middle.a]
-    differ = ", ".join(f"{number} by {spread:.1%}" for number, spread in spreads.items())
+    gains = stated.isos[len(isos) // 2].a
+    if max(gains) > min(gains) * (1 + SAME):
+        profile["gain_by_colour"] = [rounded(gain / gains[1], DIGITS) for gain in gains]
     source = f"{FORM}, tags of {stated.camera}, {stated.files} files, SHA-256 {stated.sha256[:16]}"
-    uncertainty = f"the tags state none; planes differ from green, {differ}"
-    profile["provenance"] = [provenance(["dn_per_e", "read_std_dn"], isos, source, uncertainty)]
+    profile["provenance"] = [provenance(["dn_per_e", "read_std_dn"], isos, source, "the tags state none")]
     start = f"Read {MARK} from the NoiseProfile tags of {stated.camera}, {stated.files} files"
     return profile_yaml(f"{start}, ISO {', '.join(f'{iso:g}' for iso in isos)}", stated.sha256, stated.notes, profile)
