@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from unprocess_gen.dataset.training import noise_std, pack, random_crop, to_light
     from unprocess_gen.pipeline.live import LivePairs, LiveSample
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "CameraNoise",
