@@ -118,16 +118,6 @@ def test_out_that_cannot_be_resolved_is_refused(flags: tuple[str, ...], run_main
     assert "UG_NOT_SET" in done.err
 
 
-def test_glob_expands_to_matching_options(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    assert run_main("-m", "camera=glob(s*)", "source.root=p", "out=sweep", "n_jobs=1").code == 0
-    assert sorted(os.listdir(tmp_path / "sweep")) == [
-        "camera=sony_a7r",
-        "camera=sony_a7s2",
-        "camera=sony_rx100",
-        "sweep.csv",
-    ]
-
-
 def test_failed_images_are_counted_and_exit_code_is_the_worst(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     (source / "001.png").write_bytes(b"")
     assert run_main("-m", "gains.red=1,2", "source.root=p", "out=sweep", "n_jobs=1").code == 3

@@ -15,7 +15,7 @@ from helpers.datasets import TreeHash, sweep_rows
 from helpers.photographs import fill
 
 from unprocess_gen.config.composition import OptionFolders
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.sweep_expansion import expand
 
 PARAMS = {"camera": "sony_a7r,nexus_6p", "gains.red": "2,2.2"}
@@ -115,17 +115,6 @@ def test_all_forms_of_values_are_expanded(mine: Path) -> None:
     ]
 
 
-def test_interpolations_in_params_are_resolved(mine: Path) -> None:
-    write(mine / "sweep/two.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"seed": "${n_jobs},7"}}}})
-    assert jobs("+sweep=two", "n_jobs=3", own=mine) == ["n_jobs=3,seed=3", "n_jobs=3,seed=7"]
-
-
-def test_experiment_without_params_stays_in_the_names() -> None:
-    assert jobs("+experiment=ipol_demo", "seed=1,2", multirun=True) == [
-        "+experiment=ipol_demo,seed=1", "+experiment=ipol_demo,seed=2",
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(
     "repeated",
     [
@@ -189,18 +178,7 @@ def test_sweep_file_without_package_line_is_refused_with_advice(mine: Path, run_
     )
 
 
-def test_misspelt_sweep_has_a_suggestion(run_main: RunMain) -> None:
-    done = run_main("+sweep=camera")
-    assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "sweep=camera: no such option; expected one of camera_by_iso, cameras, " in done.err
-    assert done.err.endswith("did you mean cameras?\n")
-
-
 SHIPPED = {"iso_ladder": 5, "cameras": 4, "camera_by_iso": 20, "gain_extremes": 8, "paper_figure6": 4}
-
-
-def test_shipped_sweeps_are_those_of_the_contract() -> None:
-    assert group_options("sweep") == sorted(SHIPPED)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -88,8 +88,3 @@ def test_own_body_uses_its_own_options(tmp_path: Path) -> None:
 def test_wrong_bodies_are_refused(override: str, message: str, run_main: RunMain, tmp_path: Path) -> None:
     done = run_main("plan", override, f"out={tmp_path}/ds")
     assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1
-
-
-def test_plan_names_what_a_body_lacks(run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("plan", "body=oppo_reno10x", "source.limit=1", f"out={tmp_path}/ds")
-    assert "body=oppo_reno10x: no colour matrix of it is published, so camera=convex applies" in done.out

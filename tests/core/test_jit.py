@@ -99,14 +99,6 @@ def test_another_process_loads_the_machine_code(compiled: Copy) -> None:
     assert compiled.call() == "True 2.0 1"
 
 
-@pytest.mark.slow
-def test_editing_other_packages_keeps_machine_code(copy: Copy) -> None:
-    copy.write("cli/main.py", "x = 2")
-    copy.write("cli/new.py", "y = 3")
-
-    assert copy.call() == "True 2.0 1"
-
-
 def test_editing_a_called_kernel_recompiles_its_callers(copy: Copy) -> None:
     """Machine code of the earlier sources is removed."""
     copy.write("simulation/library.py", LIBRARY.replace("/ 2", "/ 4"))
@@ -217,13 +209,6 @@ def test_a_set_has_run_after_it_is_noted(tmp_path: Path, monkeypatch: pytest.Mon
     note_run("gaussian")
     assert has_run("gaussian")
     assert not has_run("electrons")
-
-
-def test_without_a_cache_no_set_has_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for folder in (None, tmp_path / "removed"):
-        monkeypatch.setattr(jit, "kernel_cache_folder", lambda folder=folder: folder)
-        note_run("gaussian")
-        assert not has_run("gaussian")
 
 
 # Kernels chosen by class ----------------------------------------------------------------------------------------------

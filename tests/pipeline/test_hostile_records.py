@@ -131,7 +131,6 @@ def test_edited_record_names_file_problem_and_remedy(folder: Path, run_main: Run
 
     assert done.code == 5
     assert done.err == (
-        f"gen-dataset: ds/{PLAN}: cannot be read (parts: expected `int`, got `float`); "
-        "delete ds/.work and run again\n"
+        f"gen-dataset: ds/{PLAN}: cannot be read (parts: expected `int`, got `float`); delete ds/.work and run again\n"
     )
     assert file_sha256(folder / "ds" / INDEX) == plan["listing_sha256"]

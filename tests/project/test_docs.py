@@ -51,10 +51,6 @@ def test_generated_files_follow_from_the_code(name: str) -> None:
     assert (ROOT / name).read_text(encoding="utf-8") == update_reference.GENERATED_FILES[name]()
 
 
-def test_readme_is_short() -> None:
-    assert len(README.splitlines()) <= 200
-
-
 def linked_files(page: Path) -> list[Path]:
     targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
     return [(page.parent / target).resolve() for target in targets]

@@ -24,9 +24,6 @@ from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.dark_current import HEAT
 
-NO_DARK_FRAMES = {f"noise.dark_frames{ending}": None for ending in ("", "_sha256", "_black_dn")}
-"""Settings of a run without dark frames."""
-
 # ---------------------------------------------------------------------------------------------------- distributions
 
 
