@@ -1,8 +1,7 @@
 """Describe settings: `key` declares a field of the schema, `settings_of` returns what it declared.
 
 The field's metadata has the description, whose words are those of the docstring of the group (`documented`). Checks and
-messages (`validation`), ``--help`` and shell completion (`cli`), and ``docs/reference/settings.md`` read it. OmegaConf
-ignores the metadata.
+messages (`validation`), ``--help`` and ``docs/reference/settings.md`` read it. OmegaConf ignores the metadata.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -70,21 +68,12 @@ def settings_of(group: Any) -> Mapping[str, Setting]:
 
 
 def documented(group: GroupType) -> GroupType:
-    """Take the meanings of a group's keys from its docstring, and add units and allowed values to the docstring.
+    """Take the meanings of a group's keys from the section Attributes of its docstring.
 
-    The section Attributes has the name of each key and, indented, its meaning. Fields that are added to the group have
-    a meaning already.
+    Fields that are added to the group have a meaning already. ``python -OO`` removes docstrings.
     """
-    summary, title, section = inspect.cleandoc(group.__doc__ or "").partition("\n\nAttributes\n----------\n")
-    if title:  # python -OO removes docstrings
-        meanings = {name: " ".join(text.split()) for name, text in re.findall(r"^(\w+)\n((?: .+\n?)+)", section, re.M)}
-        types = {field.name: str(field.type) for field in dataclasses.fields(group)}
-        lines = [summary, "", "Attributes", "----------"]
-        for name, setting in settings_of(group).items():
-            setting.meaning = setting.meaning or meanings[name]
-            details = [setting.meaning, f"unit: {setting.unit}"] if setting.unit else [setting.meaning]
-            details += [f"allowed: {setting.allowed}"]
-            details += [f"null: {setting.null}"] if setting.null else []
-            lines += [f"{name} : {types[name]}", textwrap.indent("; ".join(details) + ".", "    ")]
-        group.__doc__ = "\n".join(lines) + "\n"
+    section = inspect.cleandoc(group.__doc__ or "").partition("\n\nAttributes\n----------\n")[2]
+    meanings = {name: " ".join(text.split()) for name, text in re.findall(r"^(\w+)\n((?: .+\n?)+)", section, re.M)}
+    for name, setting in settings_of(group).items():
+        setting.meaning = setting.meaning or meanings.get(name, "")
     return group
