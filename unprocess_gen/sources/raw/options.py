@@ -59,16 +59,17 @@ def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ..
         "pattern": f"{pattern} at the corner of the visible part",
     }
     model = " ".join((frame.metadata.model or "a camera without a name").split())
-    heads = [f"# {model}. {MARK}.\n# {file.name}, SHA-256 {file_sha256(file)}.\n"] * 2
-    for number, names in enumerate((("matrix", "gains"), ("levels", "pattern"))):
-        heads[number] += "".join(f"# {name}: {sources[name]}\n" for name in names)
+    facts = tuple(f"{fact}: {source}" for fact, source in sources.items())
+    head = f"# {model}. {MARK}.\n# {file.name}, SHA-256 {file_sha256(file)}.\n" + "".join(
+        f"# {fact}\n" for fact in facts
+    )
     entries = ", ".join(f"{entry:.6g}" for entry in matrix)
     levels = f"black_level_dn: {sensor.black_level_dn}\nwhite_level_dn: {sensor.white_level_dn}\n"
     options = {
-        "camera": f"{heads[0]}name: {name}\nlaw: custom\nxyz2cam: [{entries}]\n",
-        "sensor": f"{heads[1]}bits: {sensor.bits}\n{levels}pattern: {pattern}\nsaturated: auto\n",
+        "camera": f"{head}name: {name}\nlaw: custom\nxyz2cam: [{entries}]\n",
+        "sensor": f"{head}bits: {sensor.bits}\n{levels}pattern: {pattern}\nsaturated: auto\n",
     }
-    return options, tuple(f"{name}: {source}" for name, source in sources.items())
+    return options, facts
 
 
 def _matrix_source(tags: RawMetadata) -> str:
