@@ -55,7 +55,6 @@ def test_pairs_are_those_without_the_filter(photos: Path, make: Make, tmp_path: 
     every = {row["source"]: row["noisy_xxh3"] for row in text_rows(tmp_path / "all")}
     large = {row["source"]: row["noisy_xxh3"] for row in text_rows(tmp_path / "large") if row["status"] == "ok"}
     assert large == {name: digest for name, digest in every.items() if name not in SMALL}
-    assert "min_side" not in (tmp_path / "all/config.yaml").read_text()
     assert "filtered" not in (tmp_path / "all/dataset.json").read_text()
 
 
