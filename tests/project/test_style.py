@@ -37,9 +37,6 @@ BANNED = {
 }
 """Words of the 0.1 dialect, as regular expressions that match complete words, and what to write instead."""
 
-RECORDED = "  # recorded: decides bytes of datasets"
-"""Marks a line whose text is data of 0.1 datasets and therefore stays as it is."""
-
 BAD_STARTS = re.compile(r"(As|Of|Do so|The same|By|Where|What|Whether|Which|How|That)\b")
 NUMPYDOC_CODES = {"PR01", "PR02", "PR03", "RT01", "GL06", "GL07", "SS03"}
 """Parameters documented, known and in order; returns documented; sections known and in order; summary with a period."""
@@ -58,12 +55,10 @@ def prose(path: Path) -> Iterator[tuple[int, str]]:
     if path.suffix != ".py":
         yield from enumerate(text.splitlines(), start=1)
         return
-    lines = text.splitlines()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == tokenize.COMMENT or (token.type == tokenize.STRING and " " in token.string):
             for offset, line in enumerate(token.string.splitlines()):
-                if not lines[token.start[0] - 1 + offset].endswith(RECORDED):
-                    yield token.start[0] + offset, line
+                yield token.start[0] + offset, line
         elif token.type == tokenize.NAME and token.string.startswith("test_"):
             yield token.start[0], token.string.replace("_", " ")
 

@@ -50,10 +50,7 @@ from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
 
 CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
-"""Settings that `noise_validation` checks if the noise profile uses them, as version 0.1 did.
-
-Recorded configs may contain any other value of them, and their datasets must stay usable.
-"""
+"""Settings that `noise_validation` checks if the noise profile uses them."""
 
 SWITCHES = tuple(
     name for name, setting in settings_of(EffectsConfig).items() if setting.limit is SWITCH and name != "all"

@@ -25,7 +25,7 @@ REASONS = {
     "truncated": "the end of the file is missing",
     "corrupt": "the content of the file contradicts itself or cannot be decoded",
     "too_large": "the image has more pixels than `source.max_pixels`, or is larger than the decoder reads",
-    "too_small": "no patch, square of `source.downscale` or 2 x 2 tile fits (`unsupported` up to version 0.2); with "
+    "too_small": "no patch, square of `source.downscale` or 2 x 2 tile fits; with "
     "status `filtered`, a side is shorter than `source.min_side`",
     "cmyk": "the pixels are printing inks",
     "alpha": "pixels are transparent, or could be",

@@ -13,8 +13,8 @@ Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 
     word 3   epoch * 2**18 + frame
 
 Pixel x takes output word x % 64 // 16. The layout does not depend on the image width, and 16 neighbouring pixels use 16
-consecutive counters, which vectorises. The epoch
-is 0 in every stored dataset; live pairs have others. Alternatives: ``docs/design/random_numbers.md``.
+consecutive counters, which vectorises. The epoch is 0 in every stored dataset; live pairs have others. Alternatives:
+``docs/design/random_numbers.md``.
 
 This module is the NumPy reference; `simulation.kernels.philox` contains the compiled form.
 """
@@ -115,7 +115,7 @@ def body_key(seed: int, profile: str, unit: str) -> int:
     profile : str
         Name of the noise profile.
     unit : str
-        Name of the camera body (``noise.sensor_unit``).
+        Name of the camera body (column ``sensor_unit``).
 
     Returns
     -------

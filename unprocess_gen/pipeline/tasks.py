@@ -100,7 +100,8 @@ class RunContext:
     core_to_spare : bool
         Whether each worker hashes and writes in a second thread (more cores than workers).
     counts_deaths : bool
-        Whether the deaths of workers at a shard are counted below ``out`` (`deaths`), because nothing else sees them.
+        Whether the deaths of workers at a shard are counted below ``out`` (`run_records.Deaths`), because nothing else
+        sees them.
     """
 
     settings: PairSettings

@@ -51,7 +51,7 @@ DIFFERENCES_SHOWN = 3
 
 
 class Workspace:
-    """Hold an output folder for this process, from `open` until `close`.
+    """Hold an output folder for this process, from `open` until the context ends.
 
     ``config_yaml`` is the text of the dataset's ``config.yaml``; ``records`` are the committed shards.
     """

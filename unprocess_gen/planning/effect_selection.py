@@ -95,9 +95,7 @@ class Prediction:
         """Reason that rows record for a skipped effect."""
         if self.forced:
             return self.why
-        return (
-            f"{self.predicted_dn:.3g} DN in the {self.statistic} are {self.why}"  # recorded: decides bytes of datasets
-        )
+        return f"{self.predicted_dn:.3g} DN in the {self.statistic} are {self.why}"
 
     @property
     def ratio(self) -> float:
@@ -105,11 +103,11 @@ class Prediction:
         return ratio_to_noise(self.predicted_dn, self.masking_dn)
 
 
-NOT_ROUNDED = "float output is not rounded"  # recorded: decides bytes of datasets
+NOT_ROUNDED = "float output is not rounded"
 """Reason for which float32 frames skip ``quantise``."""
 
 
-IN_DARK_FRAMES = "contained in the dark frames"  # recorded: decides bytes of datasets
+IN_DARK_FRAMES = "contained in the dark frames"
 """Reason for which effects of the read-out are skipped if their noise is sampled from dark frames."""
 
 
@@ -290,12 +288,12 @@ def _prediction(
     contribution = frame.contribution(effect, level_dn, masking)
     predicted_dn = math.sqrt(contribution.variances[index] + contribution.offset_dn * contribution.offset_dn)
     simulated, outliers = effect in on, frame.outliers(effect, on)
-    why = f"{ratios[index]:.3g} of the noise there"  # recorded: decides bytes of datasets
+    why = f"{ratios[index]:.3g} of the noise there"
     if BY_NAME[effect].has_outliers:
-        why += f", {outliers:.3g} outliers"  # recorded: decides bytes of datasets
+        why += f", {outliers:.3g} outliers"
     if simulated and ratios[index] <= tolerance and outliers < MIN_OUTLIERS:
         why += ", too much together with the omitted effects"
-    why += f" (tolerance {tolerance:g})"  # recorded: decides bytes of datasets
+    why += f" (tolerance {tolerance:g})"
     masking_dn = math.sqrt(masking / frame.counts[index])
     return Prediction(
         effect,

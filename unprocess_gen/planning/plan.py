@@ -421,11 +421,11 @@ def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tup
     noise = config.noise.name
     rounded = not interpretation.is_normalised(config)
     last = ("quantise",) if rounded else ()
-    skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)  # recorded: decides bytes of datasets
+    skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)
     if interpretation.effect_switch(config.effects, "heteroscedastic") == "off":
-        return last, ("heteroscedastic: switched off", *skipped)  # recorded: decides bytes of datasets
+        return last, ("heteroscedastic: switched off", *skipped)
     if max(a_dn * span_dn + b_dn2, b_dn2) <= 0:
         numbers = f"a_dn={a_dn!r}, b_dn2={b_dn2!r}"
-        none = f"heteroscedastic: noise={noise} has no variance ({numbers})"  # recorded: decides bytes of datasets
+        none = f"heteroscedastic: noise={noise} has no variance ({numbers})"
         return last, (none, *skipped)
     return ("heteroscedastic", *last), skipped

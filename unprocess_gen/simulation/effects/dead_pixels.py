@@ -33,7 +33,7 @@ class DeadPixelNumbers(EffectNumbers):
 class DeadPixels(Effect):
     """Pixels that read the black level, or a lower value.
 
-    A pixel without light and without noise reads the black level, which the readout adds; version 0.2 set it to 0.
+    A pixel without light and without noise reads the black level, which the readout adds.
     """
 
     name = "dead_pixels"

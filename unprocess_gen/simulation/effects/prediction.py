@@ -51,7 +51,7 @@ class FrameFacts:
     black_level_dn : float
         Black level of the sensor, DN.
     converter_dn : float
-        Highest value of the converter, DN above black; infinity if it limits nothing, as in rules of 0.2.
+        Highest value of the converter, DN above black; infinity if it limits nothing.
 
     Attributes
     ----------

@@ -330,7 +330,7 @@ def _build_columns(context: Any, builder: Any, call: Any, arguments: Any) -> Any
 
 @_compiled(lambda table, starts, index: types.UniTuple(_FLOAT64, 3), _build_columns)
 def load_columns(table: Pointer, starts: Pointer, index: Index) -> tuple[Vector, Vector, Vector]:
-    """Load the first three of four columns of eight rows of a float64 table; they begin at ``starts[at]`` and so on."""
+    """Load the first three of four columns of eight rows of a float64 table; the first begins at ``starts[index]``."""
     rows = table[starts[index : index + VECTOR_WIDTH].astype(np.int64)[:, None] + np.arange(3)]
     return rows[:, 0], rows[:, 1], rows[:, 2]
 

@@ -1,0 +1,34 @@
+"""Two small datasets have the bytes that format 1 began with."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.promise_report import Figure
+
+import unprocess_gen as ug
+from unprocess_gen.core.files import file_sha256
+
+RECORDED = Path(__file__).parent / "format_1.json"
+"""SHA-256 of the files of each dataset, by `digests`. A change of bytes records them again, and gives the reason."""
+
+SETTINGS = {
+    "two_numbers": ["source.limit=2", "output.pairs_per_shard=1", "source.patch=[random,64,2]", "noise.draws=2"],
+    "physical": ["source.limit=2", "source.patch=[random,64,1]", "body=sony_a7s2", "scene=night", "sensor.units=2"],
+}
+
+
+def digests(name: str, folder: Path) -> dict[str, str]:
+    """Make a dataset, and return the SHA-256 of each file except ``dataset.json``."""
+    ug.generate(ug.load_config([*SETTINGS[name], "seed=7", f"out={folder}", "n_jobs=1"]))
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "dataset.json")
+    return {path.relative_to(folder).as_posix(): file_sha256(path) for path in files}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_pinned_dataset_has_the_recorded_bytes(name: str, tmp_path: Path, figure: Figure) -> None:
+    recorded = json.loads(RECORDED.read_text())[name]
+    assert digests(name, tmp_path / "ds") == recorded
+    figure("pinned-builds", f"{name}: {len(recorded)} of {len(recorded)} files have the recorded SHA-256")
