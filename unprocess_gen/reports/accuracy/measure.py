@@ -64,21 +64,15 @@ SAMPLES, SAMPLED_PIXELS = 8, 384 * 512
 """Photographs whose pairs are compared, and most pixels of each."""
 
 
-class Deviation(NamedTuple):
-    """Errors of frames: fraction of the sites that differ, largest and RMS error in DN and in σ of the noise."""
-
-    changed_share: float
-    max_dn: float
-    rms_dn: float
-    max_std: float
-    rms_std: float
-
-
-NO_DEVIATION = Deviation(0.0, 0.0, 0.0, 0.0, 0.0)
+Deviation = tuple[float, float, float, float, float]
+"""Errors of frames: the last five values of a `Measurement`."""
 
 
 class Measurement(NamedTuple):
-    """Time and error of a stage in a tier: one row of ``accuracy.csv``. None means that a time was not measured."""
+    """Time and error of a stage in a tier: one row of ``accuracy.csv``. None means that a time was not measured.
+
+    Errors are the fraction of the sites that differ, and the largest and RMS error in DN and in σ of the noise.
+    """
 
     tier: str
     stage: str
@@ -149,7 +143,7 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
     rows: list[Measurement] = []
     for tier in TIERS:
         clean, noisy = deviations(pairs[tier], pairs[REFERENCE], plans)
-        errors = dict(zip(STAGES, (NO_DEVIATION, clean, noisy, NO_DEVIATION, noisy), strict=True))
+        errors = dict(zip(STAGES, ((0.0,) * 5, clean, noisy, (0.0,) * 5, noisy), strict=True))
         for stage in STAGES:
             ns, exact_ns = (stage_ns[name][stage] if name in stage_ns else None for name in (tier, EXACT))
             ratio = ns / exact_ns if ns is not None and exact_ns else None  # a stage can be too short to be measured
@@ -283,8 +277,9 @@ def deviations(pairs: Sequence[Pair], reference: Sequence[Pair], plans: Sequence
 
 
 def _deviation(in_dn: Float, in_std: Float) -> Deviation:
-    sizes = [float(size) for errors in (in_dn, in_std) for size in (np.abs(errors).max(), np.sqrt(np.mean(errors**2)))]
-    return Deviation(np.count_nonzero(in_dn) / in_dn.size, *sizes)
+    max_dn, max_std = (float(np.abs(errors).max()) for errors in (in_dn, in_std))
+    rms_dn, rms_std = (float(np.sqrt(np.mean(errors**2))) for errors in (in_dn, in_std))
+    return np.count_nonzero(in_dn) / in_dn.size, max_dn, rms_dn, max_std, rms_std
 
 
 # ----------------------------------------------------------------------------------------------------------- conditions
@@ -297,6 +292,5 @@ def _conditions(config: Config, command: str) -> dict[str, str]:
         "date": time.strftime("%Y-%m-%d %H:%M %Z"),
         "machine": platform.platform(),
         "versions": ", ".join(f"{name} {version(name)}" for name in ("unprocess_gen", "numpy", "numba", "llvmlite")),
-        "photographs": str(config.source.place or "built-in scenes"),
         "settings": f"{config.sensor.bits} bits, noise {config.noise.name}, scene {config.scene.name}",
     }
