@@ -12,9 +12,6 @@ from unprocess_gen.calibration.measure import Watch, measure_iso
 from unprocess_gen.calibration.profile import (
     MARK,
     Calibration,
-    estimates,
-    estimates_json,
-    measured_yaml,
     unknown_numbers,
 )
 from unprocess_gen.config.limits import NAME
@@ -49,11 +46,6 @@ def measure_all(captures: CaptureSet, watch: Watch, gains: Mapping[float, Estima
     darks = {capture.path: capture for capture in captures.captures if capture.kind == "dark"}
     notes = [*captures.notes, *(note for result in results for note in result.notes), *unknown_numbers(body)]
     return Calibration(captures, results, body, common(darks, "temperature_c"), notes)
-
-
-def write_profile(calibration: Calibration, to: Path) -> None:
-    """Write the profile and, with the suffix .json, the list of all estimates."""
-    write_files(to, measured_yaml(calibration, to.stem), estimates_json(estimates(calibration)))
 
 
 def write_files(to: Path, profile: str, listed: str) -> None:

@@ -122,8 +122,8 @@ class CaptureSet(NamedTuple):
         return sorted({capture.iso for capture in self.captures})
 
 
-def read_captures(folder: Path, kind: str = "", default: Sensor | None = None) -> CaptureSet:
-    """List the frames of a folder; ``kind`` is for raw files whose names state none, ``default`` for the sensor.
+def read_captures(folder: Path, default: Sensor | None = None) -> CaptureSet:
+    """List the frames of a folder; ``default`` has the levels that no file states.
 
     Raises ConfigError or MachineError.
     """
@@ -135,7 +135,7 @@ def read_captures(folder: Path, kind: str = "", default: Sensor | None = None) -
         elif (folder / EMVA).is_file():
             captures = list(_from_emva(folder))
         else:
-            captures = list(_from_names(folder, kind))
+            captures = list(_from_names(folder))
         if not captures:
             expected = f"expected darks and flats as {', '.join(SUFFIXES)}"
             raise ConfigError(f"calibrate: {folder}: contains no raw frame; {expected}")
@@ -181,13 +181,12 @@ def _from_list(folder: Path) -> Iterator[Capture]:
         yield _listed(folder, f"{path}, line {number}", {name: value or "" for name, value in row.items() if name})
 
 
-def _from_names(folder: Path, default: str) -> Iterator[Capture]:
+def _from_names(folder: Path) -> Iterator[Capture]:
     """Yield the raw files of a folder; their names, or the names of their folders, state the kind."""
     for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
         name = str(file.relative_to(folder))
         kinds = [kind for kind, words in KIND_NAMES.items() if any(word in name.lower() for word in words)]
-        kind = kinds[0] if len(kinds) == 1 else "" if kinds else default
-        yield _listed(folder, f"calibrate: {file}", {"file": name, "kind": kind})
+        yield _listed(folder, f"calibrate: {file}", {"file": name, "kind": kinds[0] if len(kinds) == 1 else ""})
 
 
 def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:

@@ -22,6 +22,7 @@ from unprocess_gen.calibration.frame_sums import (
 )
 from unprocess_gen.calibration.gain import (
     LEAST_LEVELS,
+    RANGES,
     Estimate,
     Transfer,
     estimate,
@@ -38,8 +39,6 @@ Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""
 
 LEAST_FRAMES = 2
-DARKEST_LEVEL = 0.1
-"""Largest signal of the darkest level, as a fraction of white."""
 FULL_SHARE = 1e-4
 """Largest share of values at white in a level that is fitted."""
 ROUNDED_STD_DN = 0.7
@@ -207,8 +206,8 @@ def _levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> list[Flat]:
         problem = f"has {len(levels)} levels of {LEAST_FRAMES} flats that are not saturated; expected {LEAST_LEVELS}"
     elif darkest <= 0:
         problem = "has flats that are not brighter than the darks; correct kind"
-    elif darkest > DARKEST_LEVEL:
-        problem = f"has a darkest level of {darkest:.0%} of white; expected one below {DARKEST_LEVEL:.0%}"
+    elif darkest > RANGES[0]:
+        problem = f"has a darkest level of {darkest:.0%} of white; expected one below {RANGES[0]:.0%}"
     else:
         return levels
     raise ConfigError(f"calibrate: ISO {iso:g} {problem}")

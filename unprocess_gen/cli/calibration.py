@@ -44,7 +44,8 @@ def _state(folder: Path, to: Path) -> Sequence[float]:
 
 def _measure(folder: Path, to: Path, page: str | None) -> Sequence[float]:
     """Write the profile of flats and darks, and a page about them; return its ISOs."""
-    from unprocess_gen.calibration.calibrate import calibrate, write_profile
+    from unprocess_gen.calibration.calibrate import calibrate, write_files
+    from unprocess_gen.calibration.profile import estimates, estimates_json, measured_yaml
     from unprocess_gen.pipeline.progress import with_bar
 
     if page is not None:
@@ -53,7 +54,7 @@ def _measure(folder: Path, to: Path, page: str | None) -> Sequence[float]:
         check_page(Path(page))
     calibration = calibrate(folder, partial(with_bar, unit="frame"))
     _report_notes(calibration.notes)
-    write_profile(calibration, to)
+    write_files(to, measured_yaml(calibration, to.stem), estimates_json(estimates(calibration)))
     for result in calibration.isos:
         gain, read, row = (result[name] for name in ("dn_per_e", "read_std_dn", "row_std_dn"))
         print_results(

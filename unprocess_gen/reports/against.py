@@ -102,7 +102,7 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
     """
     sensor = config.sensor
     default = Sensor(sensor.bits, sensor.black_level_dn, sensor.white_level_dn, sensor.pattern, (0, 0))
-    captures = read_captures(frames, "dark", default)
+    captures = read_captures(frames, default)
     with_flats = {capture.iso for capture in captures.captures if capture.kind == "flat"}
     profile = Profile(config, captures.sensor, captures.isos)
     dark_only = [iso for iso in captures.isos if iso not in with_flats]
