@@ -62,7 +62,7 @@ def cut_up(sources: Path, make: Make) -> Path:
 
 
 def pair_of(row: dict[str, Any]) -> tuple[Any, ...]:
-    return row["source"], int(row["level"]), int(row["draw"])
+    return row["source"], int(row.get("level") or 0), int(row.get("draw") or 0)
 
 
 def assert_cut_outs(patched: Path, full: Path) -> int:
