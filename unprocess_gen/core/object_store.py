@@ -171,7 +171,7 @@ class ObjectPath:
 
     def is_file(self) -> bool:
         """True if an object has this key."""
-        return self._head() is not None
+        return self.size() is not None
 
     def exists(self) -> bool:
         """True if an object has this key or is below it."""
@@ -181,41 +181,30 @@ class ObjectPath:
 
     def entry(self) -> Entry:
         """Describe this prefix or object; raise FileNotFoundError if there is none."""
-        if self.is_dir():
-            return Entry(self.name, None, EntryKind.FOLDER)
-        entry = self._head()
-        if entry is None:
-            raise FileNotFoundError(2, "no such object", str(self))
-        return entry
+        return Entry(self.name, None, EntryKind.FOLDER) if self.is_dir() else self._object()
 
     def size(self) -> int | None:
         """Size of the object in bytes, None if there is no such object."""
-        entry = self._head()
-        return None if entry is None else entry.size
+        with suppress(FileNotFoundError):
+            return self._object().size
+        return None
 
     def stat(self) -> SimpleNamespace:
         """Return the size of the object as ``st_size``; FileNotFoundError if there is none."""
-        size = self.size()
-        if size is None:
-            raise FileNotFoundError(2, "no such object", str(self))
-        return SimpleNamespace(st_size=size)
+        return SimpleNamespace(st_size=self._object().size)
 
-    def _head(self) -> Entry | None:
+    def _object(self) -> Entry:
+        """Describe the object; FileNotFoundError if there is none."""
         if not self.key:
-            return None
-        try:
-            with _request(self) as (obstore, store):
-                facts = obstore.head(store, self.key)
-        except FileNotFoundError:
-            return None
+            raise FileNotFoundError(2, "no such object", str(self))
+        with _request(self) as (obstore, store):
+            facts = obstore.head(store, self.key)
         return Entry(self.name, facts["size"], etag=facts["e_tag"])
 
     # ------------------------------------------------------------------------------------------------------ reading
 
     def open(self, mode: str = "rb") -> io.BufferedReader:
         """Open the object as a seekable binary file for reading."""
-        if mode != "rb":
-            raise ValueError(f"mode={mode}: objects are opened for reading only")
         return io.BufferedReader(_Reader(self), BUFFER)
 
     @contextmanager
