@@ -7,6 +7,7 @@ mount small file systems; without permission to mount they are skipped, and run 
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -46,6 +47,7 @@ from helpers.processes import (
 from helpers.promise_report import Figure
 from PIL import Image
 
+from unprocess_gen.core import paths
 from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import worker
@@ -418,18 +420,21 @@ def test_read_only_disk_is_refused_with_2(name: str, six: Path, empty_disk: Disk
 
 @pytest.mark.parametrize("number", [1, FULL_COUNT])
 def test_disk_that_becomes_read_only_ends_the_run_with_5(
-    number: int, six: Path, six_undisturbed: str, empty_disk: Disk, run_main: RunMain, make: Make, tree_hash: TreeHash,
+    number: int, six: Path, six_undisturbed: str, run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """The kernel remounts a file system read-only if it finds an error in it."""
-    out = empty_disk.folder / "ds"
-    after_commits(number, lambda: empty_disk.remount("ro"), monkeypatch)
-    done = run_main(f"source.root={six}", f"out={out}", ONE, "n_jobs=1")
+
+    def refuse(temporary: Path, path: Path) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    with monkeypatch.context() as patch:
+        after_commits(number, lambda: patch.setattr(paths, "commit_file", refuse), patch)
+        done = run_main(f"source.root={six}", ONE, "n_jobs=1")
     assert (done.code, done.out, len(messages(done.err))) == (5, "", 1), done.err
     assert "Read-only file system" in done.err
-    empty_disk.remount("rw")
-    make(six, out, ONE)
-    assert tree_hash(out) == six_undisturbed
+    make(six, tmp_path / "ds", ONE)
+    assert tree_hash(tmp_path / "ds") == six_undisturbed
 
 
 # Deleted folders ------------------------------------------------------------------------------------------------------
