@@ -70,7 +70,8 @@ def fit_pair(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | Non
         return None
     variances = np.stack([bins.sums(z**2) / (bins.count * bins.precision) for z in (own, repeated)])
     fourth_moment = float(bins.sums((repeated**2 - 1) ** 2).sum() / bins.count.sum())
-    spread = 2 * fourth_moment / (bins.count * bins.precision**2) + noise.rounding_dn2**2
+    spread = 2 * fourth_moment / (bins.count * bins.precision**2)
+    spread += noise.rounding_dn2 * (noise.rounding_dn2 + plan.noise.variance_line[0] ** 2)
     by_point = influence(np.stack([bins.signal, np.ones_like(bins.signal)]), 1 / spread)
     expected, drawn = np.array(plan.noise.variance_line), bins.count >= LEAST_SITES_OF_POINT
     return NoiseFit(

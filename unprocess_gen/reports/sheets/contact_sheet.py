@@ -152,7 +152,7 @@ def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> 
     detail = pair.noisy[window].astype(np.float64) - pair.clean[window]
     differences = (averages[1] - averages[0]).mean(axis=-1), detail
     limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(dn * dn))), 1.0) for dn in differences]
-    note = f"{limits[0]:.3g} DN (averaged), {limits[1]:.3g} DN (detail) around grey"
+    note = f"+-{limits[0]:.3g} DN, detail +-{limits[1]:.3g} DN"
     pictures = ((dn / limit + 1) / 2 for dn, limit in zip(differences, limits, strict=True))
     return [*drawn, SheetPanel("noisy - clean", note, *pictures)]
 
