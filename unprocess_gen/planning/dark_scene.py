@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 
 from unprocess_gen.config.distributions import highest, lowest, parse_drawn
@@ -14,21 +13,18 @@ from unprocess_gen.config.values import value_range
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 
-def dark_scene_warning(config: Config, ratios: Sequence[float] = ()) -> str:
+def dark_scene_warning(config: Config) -> str:
     """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text."""
     if is_physical(config.noise):
         return ""
-    if not ratios:
-        drawn = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
-        ratios = lowest(drawn), highest(drawn)
-    if max(ratios) <= 1:
+    ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
+    if highest(ratio) <= 1:
         return ""
-    ratios = [float(f"{ratio:.3g}") for ratio in ratios]
     iso = parse_drawn("scene.iso", config.scene.iso, ISO)
+    ratios, isos = (value_range((lowest(drawn), highest(drawn))) for drawn in (ratio, iso))
     return (
-        f"scene={config.scene.name}: light is divided by {value_range(ratios)}, but noise={config.noise.name} "
-        f"ignores ISO {value_range((lowest(iso), highest(iso)))}; physical profiles follow the scene: "
-        f"{', '.join(physical_profiles())}"
+        f"scene={config.scene.name}: light is divided by {ratios}, but noise={config.noise.name} ignores ISO {isos}; "
+        f"physical profiles follow the scene: {', '.join(physical_profiles())}"
     )
 
 

@@ -98,7 +98,6 @@ def noise_lines(
     plans = [plan for source in estimates for plan in source.levels]
     if not plans:
         return []
-    ratios = [plan.scene.exposure_ratio for plan in plans]
     is_physical = interpretation.is_physical(config.noise)
     return [
         *_labelled("accuracy", [config.accuracy]),
@@ -109,7 +108,7 @@ def noise_lines(
         *_labelled("dark", [_dark_frames_sentence(config, dark_frames) if dark_frames else ""]),
         *_labelled("numbers", _number_sources(config, plans) if with_numbers else []),
         *_labelled("source", [_source_noise_sentence(config, [source.noise_ratio for source in estimates])]),
-        *_labelled("warning", [dark_scene_warning(config, ratios), _rounding_warning(plans), sensor_warning(config)]),
+        *_labelled("warning", [dark_scene_warning(config), _rounding_warning(plans), sensor_warning(config)]),
         *(_effect_table if is_physical else _effect_lines)(config, estimates),
     ]
 
