@@ -75,10 +75,11 @@ def test_tags_of_own_files_give_back_their_numbers(run_main: RunMain, tmp_path: 
         assert gain == pytest.approx(a, rel=FLOAT32)
         assert read**2 == pytest.approx(b, rel=FLOAT32)
         assert listed(profile)["b_dn2", iso, None]["value"] == pytest.approx(b, rel=FLOAT32)
-    done = run_main("plan", "--config-dir", profile.parents[1], "noise=mine", "scene.iso=100", "source.limit=1")
+    settings = ["--config-dir", profile.parents[1], "noise=mine"]
+    done = run_main("plan", "--numbers", *settings, "scene.iso=100", "source.limit=1")
     assert "calibrate --from noise_profile" in done.out
     assert "the tags state none" in done.out
-    done = run_main("plan", "--config-dir", profile.parents[1], "noise=mine", "scene.iso=1800")  # the gain mode changes
+    done = run_main("plan", *settings, "scene.iso=1800")  # the gain mode changes
     assert (done.code, "100 to 1600, 3200 to 25600" in done.err) == (2, True)
 
 

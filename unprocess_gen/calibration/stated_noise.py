@@ -7,11 +7,13 @@ one gain mode both are interpolated; nothing is extrapolated.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from unprocess_gen.calibration.captures import Sensor, common, joined_sha256
 from unprocess_gen.calibration.gain import Estimate
@@ -71,10 +73,12 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     if without := [path for path in files if path not in stated]:
         notes.append(f"{without[0]}: has no NoiseProfile tag; left out ({len(without)} of {len(files)} raw files)")
     model, blacks, white = (common(stated, name) for name in ("model", "black_dn", "white_dn"))
-    isos = _by_iso([_stated_iso(path, tags) for path, tags in stated.items()])
+    modes = _modes(_stated_iso(path, tags) for path, tags in stated.items())
     pattern = next(iter(stated.values())).pattern
     sensor = Sensor(int(white).bit_length(), round(sum(blacks) / 4), round(white), pattern or "RGGB", (0, 0))
-    return StatedNoise(isos, _modes(isos), sensor, model or "an unknown camera", sha256, len(stated), notes)
+    return StatedNoise(
+        list(itertools.chain(*modes)), modes, sensor, model or "an unknown camera", sha256, len(stated), notes
+    )
 
 
 def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
@@ -99,29 +103,23 @@ def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
     )
 
 
-def _by_iso(stated: Sequence[StatedIso]) -> list[StatedIso]:
-    """Return a record for each ISO; ConfigError names a file that differs from another one of its ISO."""
-    result: dict[float, StatedIso] = {}
-    for record in sorted(stated, key=lambda record: record.iso):
-        first = result.setdefault(record.iso, record)
-        for own, other in zip(record.a + record.b, first.a + first.b, strict=True):
-            if abs(own - other) > SAME * other:
-                raise ConfigError(
-                    f"calibrate: {record.path}: NoiseProfile differs from that of {first.path.name}, of the same ISO "
-                    f"{record.iso:g}; expected files of one camera and mode; remove those that differ"
-                )
-    return list(result.values())
+def _modes(stated: Iterable[StatedIso]) -> list[list[StatedIso]]:
+    """Return a record of each ISO by gain mode, which begins where the variance without light falls or is no longer 0.
 
-
-def _modes(isos: Sequence[StatedIso]) -> list[list[StatedIso]]:
-    """Return the ISOs of each gain mode, which begins where the variance without light falls, or is no longer 0.
-
-    ConfigError for variances that no sensor has: all others rise with ISO.
+    ConfigError for files of one ISO that differ, and for variances that no sensor has: all others rise with ISO.
     """
-    modes, falls = [[isos[0]]], [False]
-    for low, high in pairwise(isos):
+    first, *others = sorted(stated, key=lambda record: record.iso)
+    modes, falls = [[first]], [False]
+    for high in others:
+        low = modes[-1][-1]
         where = f"calibrate: {high.path}: NoiseProfile at ISO {high.iso:g}"
         expected = f"than at ISO {low.iso:g} ({low.path.name}); expected a rise with ISO; remove the wrong file"
+        if high.iso == low.iso:
+            if not np.allclose(high.a + high.b, low.a + low.b, rtol=SAME, atol=0):
+                raise ConfigError(
+                    f"{where} differs from that of {low.path.name}; expected files of one camera and mode"
+                )
+            continue
         for name, before, after in zip(COLOUR_NAMES, low.a, high.a, strict=True):
             if after <= before * (1 + SAME):
                 raise ConfigError(f"{where}: the variance of {name} has no larger slope {expected}")
