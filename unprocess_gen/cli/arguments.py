@@ -157,6 +157,8 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
 
     Everything after ``--`` is a word, even with a leading hyphen.
     """
+    from unprocess_gen.core.paths import any_path  # --help needs no paths
+
     cut = arguments.index("--") if "--" in arguments else len(arguments)
     parsed, rest = flag_parser(verb).parse_known_args(arguments[:cut])
     for word in rest:
@@ -177,18 +179,8 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
         if argument.required and argument.key not in values:
             problem = f"{argument.names[-1]} is missing; give {argument.spelled}: {argument.help}"
             raise ConfigError(f"{verb.name}: {problem}")
-    if verb.composes:
-        hydra = {flag.names[-1]: values.pop(flag.key) for flag in HYDRA_FLAGS if flag.key in values}
-        return Call(verb, values, _any_path(path), others, hydra)
-    return Call(verb, values, _any_path(path))
-
-
-def _any_path(path: str | None) -> AnyPath | None:
-    if path is None:
-        return None
-    from unprocess_gen.core.paths import any_path  # --help needs no paths
-
-    return any_path(path)
+    hydra = {flag.names[-1]: values.pop(flag.key) for flag in HYDRA_FLAGS if flag.key in values}
+    return Call(verb, values, None if path is None else any_path(path), others, hydra)
 
 
 def _read(argument: Argument, spelling: str, text: Any) -> Any:

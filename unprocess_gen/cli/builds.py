@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,7 +47,7 @@ def build(call: Call) -> int:
     shown = [str(damage) for damage in itertools.islice(differences, DIFFERENCES_LISTED)]
     more = sum(1 for _ in differences)
     for text in [*shown, *([f"and {more} more differences"] if more else [])]:
-        report(f"{folder}: {text}", logging.ERROR)
+        report(f"{folder}: {text}")
     if shown:
         return DamageError.exit_code
     print_results(f"{folder} is the build {name}, bit for bit")

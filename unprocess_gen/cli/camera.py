@@ -28,6 +28,6 @@ def camera(call: Call) -> int:
         with machine_errors(path):
             LocalPath(path).write(options[group].encode(), str(path.parent))
     chosen = " ".join(f"{group}={path.stem}" for group, path in paths.items())
-    print_results(sources)
+    print_results(*sources)
     print_results(f"{to}: use it with --config-dir {shlex.quote(str(to.parent.parent))} {chosen}")
     return 0

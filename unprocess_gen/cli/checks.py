@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -80,7 +79,7 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
     root, dark = source_root(manifest, call.values.get("source.root")), dark_frames_of(manifest, call)
     for step in repair(local_path(folder, refusal), root, dark):
         if step.exit_code:
-            report(step.text, logging.ERROR)
+            report(step.text)
         else:
             print_results(step.text)
         codes.append(step.exit_code)
@@ -149,7 +148,7 @@ def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
     """Report damages on stderr; return them as text."""
     texts = [str(damage) for damage in damages]
     for text in texts:
-        report(f"{folder}: {text}", logging.ERROR)
+        report(f"{folder}: {text}")
     return texts
 
 
@@ -166,7 +165,7 @@ def replay(call: Call) -> int:
         written |= result.written
         unknown += not result.compared
         if result.complaint:
-            report(_complaint(result), logging.ERROR)
+            report(_complaint(result))
     same = codes.count(0) - unknown
     others = len(codes) - codes.count(0)
     print_results(

@@ -8,7 +8,6 @@ Design: ``docs/design/command_line.md``.
 from __future__ import annotations
 
 import itertools
-import logging
 import os
 import re
 import signal
@@ -120,5 +119,5 @@ def _report_signal(number: int, arguments: Sequence[str]) -> int:
     except ConfigError:
         resumes = False
     what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-    report(f"{what}; {RESUME}" if resumes else what, logging.WARNING)
+    report(f"{what}; {RESUME}" if resumes else what)
     return 128 + number

@@ -33,18 +33,16 @@ def report_error(error: BaseException, job: str = "") -> int:
         path = os.fsdecode(error.filename)
         error = MachineError(f"{path}: {error.strerror}; expected read and write permissions")
     if isinstance(error, UnprocessGenError):
-        report(f"{job}{error}", logging.ERROR)
+        report(f"{job}{error}")
         return error.exit_code
     traceback.print_exception(error)
     return 1
 
 
-def report(message: str, level: int = logging.WARNING) -> None:
-    """Show a message on stderr, also before the logger has been set up."""
-    if LOGGER.handlers:
-        LOGGER.log(level, "%s", message)
-    else:
-        print(f"gen-dataset: {message}", file=sys.stderr)
+def report(message: object) -> None:
+    """Show a message on stderr, after the name of the program."""
+    with REDIRECTED:
+        print(f"gen-dataset: {message}", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -63,12 +61,11 @@ def logging_to_stderr(quiet: bool = False) -> Iterator[None]:
 
 
 class _StderrHandler(logging.Handler):
-    """Print each message on the current ``sys.stderr``, after the name of the program."""
+    """Report each message."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one message."""
-        with REDIRECTED:
-            print(f"gen-dataset: {record.getMessage()}", file=sys.stderr, flush=True)
+        """Report one message."""
+        report(record.getMessage())
 
 
 class _Stream:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import shlex
 from functools import partial
@@ -35,7 +34,7 @@ def _prepare(config: Config, label: str = "", *, parts: int) -> tuple[int, None,
     if run is None:
         return DONE, None, [f"{config.out} is complete; nothing to do"]
     for warning in run.warnings():
-        report(warning, logging.WARNING)
+        report(warning)
     out = shlex.quote(config.out)
     shards = counted(len(run.tasks()), "shard")
     counts = f"{counted(len(run.sources), 'source')}, {shards}, {counted(parts, 'part')}"
