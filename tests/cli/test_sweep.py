@@ -154,9 +154,9 @@ from unprocess_gen.pipeline import worker
 commit, made = worker.commit_shard, []
 
 
-def commits(storage, shard):
-    report = commit(storage, shard)
-    made.append(shard)
+def commits(*arguments):
+    report = commit(*arguments)
+    made.append(report)
     if len(made) == 6:
         os.kill(os.getpid(), signal.SIGKILL)
     return report
