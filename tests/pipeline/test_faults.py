@@ -595,7 +595,7 @@ def test_signal_in_a_library_callback_ends_the_run(sent: signal.Signals, tmp_pat
     assert "finished shards are kept; run the same command again to resume" in done.stderr
 
 
-@pytest.mark.parametrize("number", [3, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [1, pytest.param(40, marks=pytest.mark.slow)])
 def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
     number: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:

@@ -315,6 +315,7 @@ def test_wrong_out_is_refused_before_anything_is_written(
     assert sorted(bucket.walk_entries()) == before
 
 
+@pytest.mark.slow
 def test_signal_ends_a_run_without_leftovers(
     twelve: Path, bucket: ObjectPath, proxy: Proxy, scratch: Path, tmp_path: Path
 ) -> None:

@@ -400,7 +400,7 @@ SENT = [
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(sent, marks=() if sent in SENT[:2] else pytest.mark.slow) for sent in SENT],
+    params=[pytest.param(sent, marks=() if sent == SENT[0] else pytest.mark.slow) for sent in SENT],
     ids=[f"{number.name} to the {whom}, {sources}" for number, whom, sources in SENT],
 )
 def stopped(request: pytest.FixtureRequest, forty: Path, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
