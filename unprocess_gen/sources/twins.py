@@ -10,8 +10,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
-import xxhash
-
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Source
@@ -35,7 +33,7 @@ def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
             by_size.setdefault(source.size_bytes, []).append(source)
     groups = [group for group in by_size.values() if len(group) > 1]
     candidates = list(_sharing_tails(root, groups))
-    digests = any_path(root).map(partial(_complete_digest, root), candidates)
+    digests = any_path(root).map(partial(_digest, root), candidates)
     numbered, seen = {source.index: source for source in sources}, Counter[str]()
     for source, digest in zip(candidates, digests, strict=True):
         if digest is not None:
@@ -49,22 +47,18 @@ def _sharing_tails(root: str, groups: Iterable[Sequence[Source]]) -> Iterator[So
     groups = list(groups)
     tails = any_path(root).map(partial(_tail_digest, root), itertools.chain.from_iterable(groups))
     for group in groups:
-        group_tails = list(itertools.islice(tails, len(group)))
-        counts = Counter(group_tails)
-        yield from (
-            source for source, tail in zip(group, group_tails, strict=True) if tail is not None and counts[tail] > 1
-        )
+        pairs = list(zip(group, itertools.islice(tails, len(group)), strict=True))
+        counts = Counter(tail for _, tail in pairs)
+        yield from (source for source, tail in pairs if tail is not None and counts[tail] > 1)
 
 
-def _tail_digest(root: str, source: Source) -> int | None:
+def _tail_digest(root: str, source: Source) -> str | None:
     """Digest of a file's last `TAIL_BYTES`, None if it cannot be read."""
-    with suppress(SourceError), opened(root, source, max(0, (source.size_bytes or 0) - TAIL_BYTES)) as file:
-        return xxhash.xxh3_64_intdigest(file.read(TAIL_BYTES))
-    return None
+    return _digest(root, source, max(0, (source.size_bytes or 0) - TAIL_BYTES))
 
 
-def _complete_digest(root: str, source: Source) -> str | None:
-    """SHA-256 of a file, None if it cannot be read."""
-    with suppress(SourceError), opened(root, source) as file:
+def _digest(root: str, source: Source, first: int = 0) -> str | None:
+    """SHA-256 of a file from a byte on, None if it cannot be read."""
+    with suppress(SourceError), opened(root, source, first) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
     return None
