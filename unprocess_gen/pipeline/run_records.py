@@ -212,10 +212,6 @@ class ShardRecords:
         names = (self._storage / ROWS).entries()
         return {shard for shard in shards if Path(record_name(shard)).name in names}
 
-    def is_committed(self, shard: int) -> bool:
-        """Check whether a shard is committed."""
-        return self._is_committed(shard, (self._storage / f"shards/{shard_name(shard)}").size())
-
     def _is_committed(self, shard: int, size: int | None) -> bool:
         try:
             entry = _parse_shard(shard, self._storage.read_bytes(record_name(shard))).entry

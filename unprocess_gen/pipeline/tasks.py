@@ -115,10 +115,6 @@ class RunContext:
         """The config of the run."""
         return self.settings.config
 
-    def report_compiling(self) -> None:
-        """Report that this process is about to compile kernels."""
-        self.compiling_path.touch()
-
     @property
     def compiling_path(self) -> Path:
         """The file that a worker creates before it compiles kernels."""

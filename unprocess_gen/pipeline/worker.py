@@ -198,7 +198,7 @@ def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
     needed = (kernels_for(context.config.output.targets, plan) for plan in plans)
     for kernels in dict.fromkeys(itertools.chain.from_iterable(needed)):
         if not self_test.are_compiled(kernels):
-            context.report_compiling()
+            context.compiling_path.touch()
         if context.config.self_test == "stop":
             self_test.check(kernels, ", or set self_test=go_on")
         failures += self_test.failures(kernels)
