@@ -12,8 +12,6 @@ from unprocess_gen.core.paths import any_path
 CHOOSING = {"--config-dir", "--config-name", "--config-path"}
 """Flags of Hydra that choose where options are; the others make no sense for a page."""
 
-HIGHEST_PORT = 65535
-
 
 def explore(call: Call) -> int:
     """Serve a page on this machine until it is interrupted."""
@@ -21,9 +19,6 @@ def explore(call: Call) -> int:
         require(library, f"explore: the page needs {library}", "explore")
     if refused := sorted(call.hydra.keys() - CHOOSING):
         raise ConfigError(f"explore: {refused[0]}: a page shows one config; expected settings; leave it out")
-    port = call.values.get("port", 0)
-    if port > HIGHEST_PORT:
-        raise ConfigError(f"--port {port}: is no port; expected 0 to {HIGHEST_PORT}")
     check_overrides(call.overrides)
     from unprocess_gen.reports.explorer import server
     from unprocess_gen.reports.explorer.opening import open_place
@@ -35,7 +30,7 @@ def explore(call: Call) -> int:
         raise ConfigError(f"explore: {place}: is the folder of a sweep; expected one of its datasets")
     folders = option_folders(call.hydra)
     choices = open_place(place, call.values.get("keys"), call.overrides, call.hydra_arguments, folders)
-    server.serve(choices, port, "no_browser" not in call.values, _print_address)
+    server.serve(choices, call.values.get("port", 0), "no_browser" not in call.values, _print_address)
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
 import threading
 import webbrowser
@@ -24,8 +23,8 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
     try:
         with socket.create_server((HOST, port)) as probe:
             port = probe.getsockname()[1]
-    except OSError as error:
-        reason = os.strerror(error.errno or 0)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
         problem = f"cannot be used ({reason}); expected a free port; choose another, or leave --port out"
         raise ConfigError(f"--port {port}: {problem}") from None
     ready = threading.Event()
