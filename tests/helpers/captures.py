@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -140,16 +140,6 @@ def dark_row(camera: Camera) -> dict[str, Any]:
     return dict(camera.pair(0, 1.0, 0).row)
 
 
-def frames(
-    darks: int, flats: int, levels: Sequence[float], long_s: Sequence[float], bright: int
-) -> Iterator[tuple[str, float, float]]:
-    """Yield kind, light and exposure of each frame."""
-    yield from (("dark", 0.0, SHORT_S) for _ in range(darks))
-    yield from (("dark", 0.0, seconds) for seconds in long_s for _ in range(4))
-    yield from (("flat", light, SHORT_S) for light in levels for _ in range(flats))
-    yield from (("flat", 0.25, SHORT_S) for _ in range(bright))
-
-
 def record(
     folder: Path,
     *cameras: Camera,
@@ -158,31 +148,20 @@ def record(
     levels: Sequence[float] = LEVELS,
     long_s: Sequence[float] = (),
     bright: int = 0,
-    as_dng: bool = True,
 ) -> Path:
-    """Write the captures of cameras that differ in ISO into a folder, with captures.csv; return the folder.
+    """Write DNG files of cameras that differ in ISO into a folder, with captures.csv; return the folder.
 
     ``bright`` more flats at 25 % of white show fixed patterns.
     """
     folder.mkdir(parents=True)
-    lines = ["file,kind,iso,exposure_s,level" + ("" if as_dng else ",black_level_dn,white_level_dn,bits,pattern")]
+    frames = [("dark", 0.0, SHORT_S)] * darks + [("dark", 0.0, seconds) for seconds in long_s for _ in range(4)]
+    frames += [("flat", light, SHORT_S) for light in levels for _ in range(flats)] + [("flat", 0.25, SHORT_S)] * bright
+    lines = ["file,kind,iso,exposure_s,level"]
     for camera in cameras:
-        for number, (kind, light, seconds) in enumerate(frames(darks, flats, levels, long_s, bright)):
+        for number, (kind, light, seconds) in enumerate(frames):
             pair = camera.pair(light, seconds, number)
-            name = f"{camera.iso:g}_{kind}_{number:03d}.{'dng' if as_dng else 'npy'}"
-            if as_dng:
-                (folder / name).write_bytes(encode(pair.noisy, pair.row, "noisy"))
-            else:
-                np.save(folder / name, pair.noisy)
-            sensor = [pair.row[key] for key in ("black_level_dn", "white_level_dn", "bits", "pattern")]
-            facts = [
-                name,
-                kind,
-                f"{camera.iso:g}",
-                seconds,
-                light if kind == "flat" else "",
-                *([] if as_dng else sensor),
-            ]
-            lines.append(",".join(map(str, facts)))
+            name = f"{camera.iso:g}_{kind}_{number:03d}.dng"
+            (folder / name).write_bytes(encode(pair.noisy, pair.row, "noisy"))
+            lines.append(f"{name},{kind},{camera.iso:g},{seconds},{light if kind == 'flat' else ''}")
     (folder / "captures.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
