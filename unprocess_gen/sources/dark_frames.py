@@ -22,7 +22,7 @@ from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.raw_files import SUFFIXES
 from unprocess_gen.core.types import DarkFrame, DarkFrames, Raw
-from unprocess_gen.sources.mosaics import Mosaic, check_sha256, even_sides, map_mosaic, mosaic_sha256, read_mosaic
+from unprocess_gen.sources.raw.mosaics import Mosaic, check_sha256, even_sides, map_mosaic, mosaic_sha256, read_mosaic
 
 KEY = "noise.dark_frames"
 
