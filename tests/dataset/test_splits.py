@@ -113,7 +113,7 @@ def test_plan_and_report_show_the_splits(made: Path, run_main: RunMain) -> None:
     assert run_main("report", made, "--to", "page.html").code == 0
     counts = Counter(row["split"] for row in text_rows(made)).most_common()
     listed = ", ".join(f"{name} ({count})" for name, count in counts)
-    assert f"<td>split</td><td>{listed}</td>" in Path("page.html").read_text(encoding="utf-8")
+    assert f'<td>split</td><td class="w">{listed}</td>' in Path("page.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

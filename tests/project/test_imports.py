@@ -35,7 +35,7 @@ ONLY_IN = {
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng", "sources.raw.metadata"},
     "rawpy": {"sources.raw.decode", "sources.raw.metadata"},
-    "scipy": {"calibration.body", "calibration.frame_sums", "calibration.iso_laws", "calibration.shape"},
+    "scipy": {"calibration.body", "calibration.frame_sums", "calibration.shape"},
     "torch": {"torch"},
     "dask": {"pipeline.executors.dask"},
     "distributed": {"pipeline.executors.dask"},
