@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import logging
 import os
 import signal
 import subprocess
@@ -20,7 +19,7 @@ from helpers.photographs import fill
 from helpers.processes import WAIT_S, wait_for
 
 from unprocess_gen.cli import runs
-from unprocess_gen.cli.messages import _StderrHandler
+from unprocess_gen.cli.messages import report
 from unprocess_gen.sources.image.codec_messages import captured
 
 COMMANDS = {
@@ -233,8 +232,7 @@ def test_nohup_is_respected(tmp_path: Path) -> None:
 def test_line_of_another_thread_is_no_message_of_a_codec(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    line = logging.LogRecord("unprocess_gen", logging.INFO, "", 0, "1/3 images", None, None)
-    thread = threading.Thread(target=_StderrHandler().emit, args=(line,))
+    thread = threading.Thread(target=report, args=("1/3 images",))
     with open(2, "w", closefd=False) as stderr:
         monkeypatch.setattr("sys.stderr", stderr)
         with captured() as taken:

@@ -22,9 +22,8 @@ LOGGER = logging.getLogger("unprocess_gen")
 
 def print_results(*texts: object) -> None:
     """Print lines on stdout and flush: an error of stdout is raised here, not by a later step."""
-    for text in texts:
-        print(text)
-    sys.stdout.flush()
+    if texts:
+        print(*texts, sep="\n", flush=True)
 
 
 def report_error(error: BaseException, job: str = "") -> int:
@@ -48,7 +47,8 @@ def report(message: object) -> None:
 @contextmanager
 def logging_to_stderr(quiet: bool = False) -> Iterator[None]:
     """Show the messages of the logger ``unprocess_gen`` on stderr; with ``quiet``, only warnings and errors."""
-    handler = _StderrHandler()
+    handler = logging.Handler()
+    handler.emit = lambda record: report(record.getMessage())  # type: ignore[method-assign]
     LOGGER.addHandler(handler)
     LOGGER.setLevel(logging.WARNING if quiet else logging.INFO)
     LOGGER.propagate = False
@@ -58,14 +58,6 @@ def logging_to_stderr(quiet: bool = False) -> Iterator[None]:
         LOGGER.removeHandler(handler)
         LOGGER.setLevel(logging.NOTSET)
         LOGGER.propagate = True
-
-
-class _StderrHandler(logging.Handler):
-    """Report each message."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Report one message."""
-        report(record.getMessage())
 
 
 class _Stream:

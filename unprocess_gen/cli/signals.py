@@ -53,7 +53,6 @@ class Signals:
             return
         self._timer.cancel()
         self._timer = threading.Timer(REPEAT_S, os.kill, (os.getpid(), self.received))  # interrupts system calls
-        self._timer.daemon = True
         self._timer.start()
 
 
