@@ -11,10 +11,8 @@ from unprocess_gen.simulation.reference.cfa import MONO
 TILE = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Places of the CFA tile; a plane is the set of all sites at one of them."""
 NEIGHBOURS = {
-    "adjacent sites": ((0, 1), (1, 0)),
-    "diagonal sites": ((1, 1), (1, -1)),
-    "neighbours": ((0, 2), (2, 0)),
-    "diagonal neighbours": ((2, 2), (2, -2)),
+    "adjacent sites": ((0, 1), (1, 0), (1, 1), (1, -1)),
+    "neighbours": ((0, 2), (2, 0), (2, 2), (2, -2)),
 }
 """Distances of the sites of pairs in rows and columns, by the name of the check of their correlation."""
 

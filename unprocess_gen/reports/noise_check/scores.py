@@ -6,6 +6,7 @@ clean values are distributed symmetrically around 0. Derivations: ``docs/design/
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from unprocess_gen.reports.noise_check.repeat import Noise, Single
 from unprocess_gen.statistics.mosaics import NEIGHBOURS, TILE, plane_names
 from unprocess_gen.statistics.scores import Score
 
+SHARED_ROUNDING = 0.15
+"""Fraction of the rounding error that all clean values of a frame share."""
 LARGEST_DETAIL = 8.0
 """Bound of the detail of the clean frame, in standard deviations of the noise."""
 
@@ -39,8 +42,11 @@ def scores_of(noise: Noise, before: Residual | None = None) -> tuple[Scores, Res
     here, scores = residual_of(noise)
     scores |= _mean_scores(noise) | _clean_value_scores(noise, here)
     for name, distances in NEIGHBOURS.items():
-        rounding_dn2 = noise.rounding_dn2 / (2 if name == "adjacent sites" and _differs_by_colour(noise) else 1)
-        scores[name, ""] = _sum([_product_score(*_neighbours(here, *place), rounding_dn2) for place in distances])
+        products = []
+        for y, x in distances:
+            rounding_dn2 = noise.rounding_dn2 / (2 if (y + x) % 2 and _differs_by_colour(noise) else 1)
+            products.append(_product_score(*_neighbours(here, y, x), rounding_dn2))
+        scores[name, ""] = _sum(products)
     detail = _detail(noise)
     bound = noise.rounding_dn2 * float((noise.weight**2).sum(dtype=np.float64))
     scores["order of sites", ""] = _score(_by_row(here.z * detail), float((detail**2).sum()), bound)
@@ -141,6 +147,12 @@ class Bins:
         self.count = self.sums(np.ones_like(weight))
         self.precision = self.sums(weight**2) / self.count
 
+    def by_site(self, values: Float) -> Float:
+        """Give each used site the value of its clean value, [H, W]; 0 elsewhere."""
+        sites = np.zeros(self._used.shape)
+        sites[self._used] = values[self._number]
+        return sites
+
     def sums(self, sites: Any) -> Float:
         """Sum values of the sites, [H, W], by clean value, [N]."""
         return np.bincount(self._number, sites[self._used]).astype(np.float64)
@@ -154,16 +166,14 @@ def _clean_value_scores(noise: Noise, residual: Residual) -> Scores:
         if not len(bins.signal):
             continue
         signal, count, precision, sums = bins.signal, bins.count, bins.precision, bins.sums
-        weight, (own, repeated) = residual.weight[y::2, x::2], residual.z[:, y::2, x::2]
-        mean_dn = sums((own - repeated) * weight) / (count * precision)
+        own, repeated = residual.z[:, y::2, x::2]
         variance_dn2 = sums(own**2 - repeated**2) / (count * precision)
         cosine = sums(np.cos(own) - np.cos(repeated)) / count
-        by_mean = 1 / (2 / (count * precision) + noise.rounding_dn2)
         by_variance = 1 / (4 / (count * precision**2) + noise.rounding_dn2**2)
-        slope, gain = (values * (signal - values @ signal / values.sum()) for values in (by_mean, by_variance))
+        gain = by_variance * (signal - by_variance @ signal / by_variance.sum())
         bound = noise.rounding_dn2 * by_variance
         by_cosine = by_variance / precision
-        scores["signal", name] = _score(slope * mean_dn, float(slope @ signal))
+        scores["signal", name] = _signal_score(noise, bins, np.s_[y::2, x::2])
         scores["variance", name] = _score(by_variance * variance_dn2, float(by_variance.sum()), float(bound.sum()))
         scores["gain", name] = _score(
             gain * variance_dn2, float(gain @ signal), noise.rounding_dn2 * float(np.abs(gain).sum())
@@ -171,6 +181,21 @@ def _clean_value_scores(noise: Noise, residual: Residual) -> Scores:
         scores["shape", name] = _score(by_cosine * cosine, float(by_cosine.sum()), float(bound.sum()) / 3)
     together = {check: [score for (name, _), score in scores.items() if name == check] for check, _ in scores}
     return scores | {(check, ""): _sum(of_planes) for check, of_planes in together.items()}
+
+
+def _signal_score(noise: Noise, bins: Bins, part: Any) -> Score:
+    """Score of the mean noise against the signal.
+
+    Sites of a clean value share their rounding error, and those of a row its offset, so the spread is the larger one of
+    both. Histograms of light decrease, so all rounding errors can have a common part.
+    """
+    precision = bins.count * bins.precision
+    slope = bins.signal / (2 / precision + noise.rounding_dn2)
+    noise_dn = (noise.z[0][part] - noise.z[1][part]) * noise.weight[part]
+    bound = SHARED_ROUNDING * math.sqrt(noise.rounding_dn2) * float(slope.sum())
+    by_value = _score(slope / precision * bins.sums(noise_dn), float(slope @ bins.signal), bound)
+    by_row, r = (noise_dn * bins.by_site(slope / precision)).sum(axis=1), _row_correlation(noise)
+    return by_value._replace(variance=max(by_value.variance, float(by_row @ by_row) * (1 + r) / (1 - r)))
 
 
 # ------------------------------------------------------------------------------------------------------ pairs of sites
