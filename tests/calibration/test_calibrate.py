@@ -97,7 +97,7 @@ def test_numbers_of_the_body_are_measured(light: tuple[float, float, float], cal
         *(("hot_pixel_share", 0.004), ("hot_pixel_e_per_s", 200.0)),
     ):
         row = found[name, None, None]
-        low, high = (row["value"] + 2 * (row[end] - row["value"]) for end in ("low", "high"))  # 4 standard errors
+        low, high = (row["value"] + 2 * (end - row["value"]) for end in row["interval"])  # 4 standard errors
         assert low <= true <= high, row
     mean = sum((gains[0], 2 * gains[1], gains[2])) / 4
     if light == (1.0, 1.0, 1.0):  # less light leaves the gains of the planes equal within their errors
@@ -115,7 +115,7 @@ def test_fixed_pattern_is_neither_read_nor_column_noise(
     found = estimates(calibrated(with_levels(draw(tmp_path / "captures", numbers, 0, side=192))))
     for name, true in {"dn_per_e": 0.1, **truth}.items():
         row = found[name, 800, None]
-        low, high = (row["value"] + 2 * (row[end] - row["value"]) for end in ("low", "high"))  # 4 standard errors
+        low, high = (row["value"] + 2 * (end - row["value"]) for end in row["interval"])  # 4 standard errors
         assert low <= true <= high, row
         assert max(high - true, true - low) < 0.15 * max(true, read_std_dn), row  # no wide interval hides an error
     assert abs(found["read_shape", 800, None]["value"] - 0.1349) < 0.02
@@ -136,7 +136,7 @@ def test_page_shows_estimates_with_intervals_and_figures(calibrated: Any, tmp_pa
     page = tmp_path / "page.html"
     profile = calibrated(two_isos(tmp_path), "--report", str(page))
     text, gain = page.read_text(encoding="utf-8"), estimates(profile)["dn_per_e", 800, None]
-    assert all(short_number(gain[end], 4) in text for end in ("value", "low", "high"))
+    assert all(short_number(value, 4) in text for value in (gain["value"], *gain["interval"]))
     assert "Against ISO" in text and "photon transfer, residuals, histogram" in text
 
 
@@ -166,5 +166,6 @@ def test_real_frames_give_published_numbers(calibrated: Any) -> None:
     """K: 0.283 to 0.291 by the range of the fit; row noise 0.505 DN."""
     found = estimates(calibrated(EMVA))
     gain = found["dn_per_e", 100, None]
-    assert gain["low"] <= 0.283 <= 0.291 <= gain["high"]
+    low, high = gain["interval"]
+    assert low <= 0.283 <= 0.291 <= high
     assert found["row_std_dn", 100, None]["value"] == pytest.approx(0.505, rel=0.05)

@@ -84,9 +84,10 @@ def estimates_json(named: Sequence[NamedNumber], digits: int = DIGITS) -> str:
     """Return the list of estimates as JSON, an object a line; null where the captures do not show a number."""
     lines = []
     for one in named:
-        values = {end: getattr(one.number, end, math.inf) for end in ENDS}
-        ends = {end: rounded(value, digits) if math.isfinite(value) else None for end, value in values.items()}
-        lines.append({"name": one.name, "iso": one.iso, "site": one.site, **ends, "unit": one.unit})
+        values = [getattr(one.number, end, math.inf) for end in ENDS]
+        value, *interval = (rounded(value, digits) if math.isfinite(value) else None for value in values)
+        number = {"value": value, "interval": interval, "unit": one.unit}
+        lines.append({"name": one.name, "iso": one.iso, "site": one.site, **number})
     return "[\n" + ",\n".join(map(json.dumps, lines)) + "\n]\n"
 
 
