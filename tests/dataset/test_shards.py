@@ -30,7 +30,6 @@ from unprocess_gen.dataset.shards import (
     ShardWriter,
     map_array,
     read_index,
-    shard_name,
 )
 
 COUNTS = Counts(0, 0, 0, 0, 0, 0)
@@ -87,10 +86,6 @@ def test_arrays_of_any_layout_give_the_same_bytes(tmp_path: Path) -> None:
     written(tmp_path / "a.tar", one)
     written(tmp_path / "b.tar", other)
     assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
-
-
-def test_shards_are_numbered_with_five_digits_or_more() -> None:
-    assert [shard_name(number) for number in (0, 100_000)] == ["shard-00000.tar", "shard-100000.tar"]
 
 
 def test_a_digest_is_xxh3_of_the_little_endian_bytes() -> None:
@@ -215,14 +210,6 @@ def test_mapped_arrays_are_those_written(shard: Path) -> None:
 def test_truncated_shard_is_damage(kept: int, shard: Path) -> None:
     os.truncate(shard, kept)
     with pytest.raises(DamageError, match=r"a.tar: not a complete shard"):
-        read_index(shard)
-
-
-def test_a_header_that_changed_is_damage(shard: Path) -> None:
-    content = bytearray(shard.read_bytes())
-    content[0] ^= 1
-    shard.write_bytes(content)
-    with pytest.raises(DamageError, match="not a complete shard"):
         read_index(shard)
 
 

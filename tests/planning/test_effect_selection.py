@@ -45,7 +45,6 @@ RARE = {
 """Effects whose numbers few profiles have, and the key of each."""
 
 PROFILES = ("imx385", "sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x")
-ASSUMED = frozenset({"prnu", "dark_current", "hot_pixels", "dead_pixels"})
 TOLERANCE = 0.1
 
 
@@ -135,17 +134,6 @@ def test_omitted_effects_are_masked_by_the_noise(
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
     some = {name: pictures[name] for name in ("colour_chart-0", "dead_leaves-0", "gray 255", "cyan")}
     assert hold(config, some) > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("noise", PROFILES)
-def test_omitted_effects_are_masked_in_larger_frames(settings: Settings, noise: str, scene: str) -> None:
-    """Means over more sites reveal smaller effects."""
-    config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
-    names = ("highlights-0", "colour_chart-0", "dead_leaves-0")
-    pictures = {name: cut(name, 380, 440) for name in names} | {"cyan": flat(0, 200, 200, height=381, width=441)}
-    hold(config, pictures)
 
 
 def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
@@ -343,10 +331,6 @@ FACTS = Facts(768, 512, 256, 10, 255)
 LIGHT = SignalRange(10.0, 3000.0)
 
 
-def test_weak_effects_are_omitted(base: tuple[Config, Physics]) -> None:
-    assert chosen(*base, FACTS, LIGHT) == ("shot", "read", "quantise")
-
-
 @pytest.mark.parametrize(
     ("effect", "numbers"),
     [
@@ -425,36 +409,6 @@ def test_hot_pixels_are_simulated_from_a_tenth_of_an_outlier(
     )
     assert hot.simulated == (expected >= 0.1)
     assert math.isclose(hot.outliers, expected, rel_tol=0.01)  # what else is left out hid a little of it
-
-
-@pytest.mark.parametrize("mean_e", [0.05, 2.0, 40.0])
-def test_hot_pixel_outliers_are_as_frequent_as_predicted(mean_e: float) -> None:
-    """Counts that the sampler draws from exponential means, against the geometric distribution."""
-    rng = np.random.default_rng(1)
-    words = rng.integers(0, 2**32, 10**5, dtype=np.uint32)
-    counts = poisson(words, rng.exponential(mean_e, 10**5))
-    for least in (1, 4, 60):
-        share = (mean_e / (1 + mean_e)) ** least
-        margin = 6 * math.sqrt(share * (1 - share) / 1e5) + 1e-4
-        assert abs(float((counts >= least).mean()) - share) <= margin
-
-
-@given(share=st.floats(-12, -4), side=st.integers(10, 4000))
-def test_dead_pixels_are_simulated_from_a_tenth_of_an_outlier(
-    base: tuple[Config, Physics], share: float, side: int
-) -> None:
-    config, physics = base
-    physics, facts = replace(physics, dead_pixel_share=10**share), replace(FACTS, width=side, height=side)
-    assert ("dead_pixels" in chosen(config, physics, facts, LIGHT)) == (side * side * 10**share >= 0.1)
-
-
-def test_dead_pixels_of_black_images_differ_by_the_black_level(base: tuple[Config, Physics]) -> None:
-    config, physics = base
-    physics = replace(physics, dead_pixel_share=1e-4, dead_pixel_level=0.0)
-    dark = SignalRange(0.0, 0.0)
-    assert "dead_pixels" in chosen(config, physics, FACTS, dark)
-    config = replace(config, sensor=replace(config.sensor, black_level_dn=0))
-    assert "dead_pixels" not in chosen(config, physics, FACTS, dark)
 
 
 def test_dead_pixels_that_read_black_are_invisible_in_black_images_only(base: tuple[Config, Physics]) -> None:
@@ -737,24 +691,3 @@ def test_plan_prints_a_table_of_all_effects(run_main: RunMain, tmp_path: Path) -
         assert " of 3 " in words[effect]
     assert "3 of 3" in words["shot"]
     assert "outliers" in words["hot_pixels"]
-
-
-def test_table_counts_images_in_which_effects_are_simulated(run_main: RunMain, tmp_path: Path) -> None:
-    """A black image has no shot noise."""
-    import cv2
-
-    (tmp_path / "photos").mkdir()
-    for name, code in (("black", 0), ("gray", 100), ("white", 255)):
-        cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), flat(code, code, code))
-    done = run_main("plan", "source.root=photos", "noise=sony_a7s2", "scene=indoor")
-    assert done.code == 0
-    shot = next(line for line in done.out.splitlines() if line.startswith("shot"))
-    assert "2 of 3" in shot
-
-
-def test_profile_with_two_numbers_is_printed_without_table(run_main: RunMain, tmp_path: Path) -> None:
-    fill(tmp_path / "photos", 1)
-    done = run_main("plan", "source.root=photos", "noise=imx385_iso3200")
-    assert done.code == 0
-    assert "effects   heteroscedastic" in done.out
-    assert "noise there" not in done.out

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 
 from unprocess_gen.config import distributions
 from unprocess_gen.config.distributions import draw_parameter as draw
-from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
@@ -144,18 +143,6 @@ def test_paper_literal_gain_is_inverse_of_brooks_gain(uniform: float) -> None:
 # Cameras --------------------------------------------------------------------------------------------------------------
 
 
-@given(st.tuples(uniforms, uniforms, uniforms, uniforms))
-def test_weights_are_four_uniforms_divided_by_their_sum(drawn: tuple[float, ...]) -> None:
-    _, weights, matrix = plan_camera(Config().camera, named(**{f"weight_{i}": u for i, u in enumerate(drawn)}))
-    total = sum(Fraction(u) for u in drawn)
-    for weight, u in zip(weights, drawn, strict=True):
-        assert 0 <= weight <= 1
-        # Three additions and a quotient.
-        assert abs(Fraction(weight) - Fraction(u) / total) <= 4 * Fraction(u) / total / 2**53 * (1 + Fraction(1, 10**6))
-    assert abs(sum(Fraction(weight) for weight in weights) - 1) <= Fraction(4, 2**53) * (1 + Fraction(1, 10**6))
-    assert matrix == colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), weights))
-
-
 @pytest.mark.parametrize(
     ("uniform", "camera"), [(FIRST, 0), (0.25 - FIRST, 0), (0.25 + FIRST, 1), (0.75 - FIRST, 2), (LAST, 3)]
 )
@@ -171,17 +158,6 @@ def test_fixed_camera_has_weight_1(settings: Settings, name: str) -> None:
     assert plan.camera.name == name
     assert plan.camera.weights == tuple(float(name == other) for other in colour.CAMERAS)
     assert plan.camera.rgb2cam == colour.rgb2cam(colour.CAMERAS[name])
-
-
-def test_chosen_camera_equals_the_fixed_camera(settings: Settings) -> None:
-    plan = plan_of(settings, "camera=choice")
-    assert plan == plan_of(settings, f"camera={plan.camera.name}")
-
-
-def test_mixed_camera_is_named_convex(settings: Settings) -> None:
-    plan = plan_of(settings)
-    assert plan.camera.name == "convex"
-    assert all(0 < weight < 1 for weight in plan.camera.weights)
 
 
 def test_chosen_weights_are_divided_by_their_sum(settings: Settings) -> None:
@@ -298,12 +274,6 @@ def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
     assert (plan.noise.a_dn, plan.noise.b_dn2) == (a, b)
 
 
-def test_profile_with_black_included_is_converted_before_recording(settings: Settings) -> None:
-    plan = plan_of(settings, "noise=imx385_iso3200_rvdd")
-    assert plan.noise.a_dn == 8.0034
-    assert plan.noise.b_dn2 == -2043.51144 + 8.0034 * 240
-
-
 def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(settings: Settings) -> None:
     for sensor in ("imx385_12bit", "generic_10bit", "generic_16bit"):
         plan = plan_of(settings, "noise=heteroscedastic", "noise.a=1.25", "noise.b=7.5", f"sensor={sensor}")
@@ -321,12 +291,6 @@ def test_noise_without_variance_is_skipped_with_reason(settings: Settings, a: fl
     assert reason.startswith("heteroscedastic: noise=heteroscedastic has no variance")
 
 
-@pytest.mark.parametrize(("a", "b"), [(0.0, 0.1), (0.1, 0.0), (0.1, -5.0)])
-def test_noise_with_any_positive_variance_is_simulated(settings: Settings, a: float, b: float) -> None:
-    plan = plan_of(settings, "noise=heteroscedastic", f"noise.a={a}", f"noise.b={b}", "noise.negative_variance=clip")
-    assert "heteroscedastic" in plan.noise.effects
-
-
 def test_plan_contains_the_values_of_the_config(settings: Settings) -> None:
     plan = plan_of(
         settings, "sensor=generic_10bit", "sensor.pattern=GBRG", "sensor.clip=black", "isp=srgb", "gains=unity",
@@ -336,13 +300,6 @@ def test_plan_contains_the_values_of_the_config(settings: Settings) -> None:
     assert (plan.sensor.pattern, plan.noise.sensor_clip) == ("GBRG", "black")
     assert (plan.isp.tone, plan.isp.gamma) == ("none", "srgb")
     assert (plan.camera.highlight, plan.camera.highlight_threshold) == ("gray_mean", 0.75)
-
-
-@pytest.mark.parametrize(("isp", "gamma"), [("linear", 1.0), ("gamma22", 2.2), ("srgb", "srgb")])
-def test_gamma_is_number_or_srgb(settings: Settings, isp: str, gamma: float | str) -> None:
-    found = plan_of(settings, f"isp={isp}").isp.gamma
-    assert found == gamma
-    assert type(found) is type(gamma)
 
 
 def test_planning_imports_neither_numba_nor_opencv() -> None:

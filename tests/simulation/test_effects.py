@@ -14,7 +14,6 @@ from helpers.flats import (
     SILENT,
     SPAN,
     bounds_off,
-    dead,
     flat,
     hot_pixel_means,
     noisy_dn,
@@ -29,8 +28,6 @@ from helpers.flats import (
 from helpers.moments import REACH, bernstein
 
 from unprocess_gen.core.lookup_tables import exponential_levels
-from unprocess_gen.planning.effect_selection import facts_of
-from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects import EFFECTS, order
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.pair import make_pair
@@ -75,10 +72,6 @@ def test_shot_noise_is_poisson_count_of_electrons(code: int) -> None:
     assert_poisson(counts, signal_dn(code) / 8)
 
 
-def test_no_light_gives_no_shot_noise() -> None:
-    assert (noisy_dn(plan_with("shot"), 0) == 0).all()
-
-
 @pytest.mark.parametrize("code", [0, 300, 5000, 40000])
 def test_poisson_form_has_mean_variance_and_skewness(code: int) -> None:
     """Only counts have a third moment, a²·u. The fourth is that of a normal plus a⁴·rate; the sixth is a bound."""
@@ -113,11 +106,6 @@ def test_row_has_one_offset_of_given_standard_deviation() -> None:
     assert_normal_offsets(deviation[:, 0], 300.0)
 
 
-def test_row_offsets_differ_between_frames() -> None:
-    one, other = (noisy_dn(plan_with("row", row_std_dn=300.0, frame=frame), 0, OFFSETS, 1) for frame in (1, 2))
-    assert_normal_offsets((one - other)[:, 0] / math.sqrt(2), 300.0)
-
-
 @pytest.mark.parametrize("correlation", [0.9, 0.5, -0.7])
 def test_correlated_rows_are_an_autoregressive_process(correlation: float) -> None:
     """What a row adds to its share of the row before is independent, with variance 1 - r² of that of an offset."""
@@ -141,24 +129,10 @@ def test_temporal_column_offsets_are_new_in_every_frame() -> None:
     assert_normal_offsets((one - other)[0] / math.sqrt(2), 300.0)
 
 
-def test_average_of_frames_contains_no_temporal_column_offsets() -> None:
-    plan = plan_with("column_temporal", column_temporal_std_dn=300.0, fixed_pattern_in_clean=True)
-    assert (make_pair(flat(3000, 8, 64), plan).clean == np.rint(signal_dn(3000)) + BLACK).all()
-
-
 def test_column_has_one_offset_of_given_standard_deviation() -> None:
     deviation = noisy_dn(plan_with("column", column_std_dn=300.0), 0, 5, OFFSETS)
     assert (deviation == deviation[:1]).all()
     assert_normal_offsets(deviation[0], 300.0)
-
-
-def test_column_offsets_are_fixed_per_sensor_unit() -> None:
-    plan = plan_with("column", column_std_dn=300.0)
-    one, later, other = (
-        noisy_dn(one, 0, 1, OFFSETS) for one in (plan, replace(plan, stream_key=2), with_physics(plan, body_key=9))
-    )
-    assert (one == later).all()
-    assert_normal_offsets((one - other)[0] / math.sqrt(2), 300.0)
 
 
 def test_dsnu_is_a_fixed_offset_of_each_pixel_of_a_body() -> None:
@@ -190,11 +164,6 @@ def test_each_colour_counts_electrons_by_its_gain() -> None:
             assert (counts == np.rint(counts)).all()
             assert_poisson(counts, signal_dn(code) / (8 * relative))
     assert (make_pair(flat(code), plan).clean == make_pair(flat(code), plan_with("shot")).clean).all()
-
-
-def test_all_colours_saturate_at_the_dn_of_the_full_well() -> None:
-    plan = plan_with("shot", "full_well", "gain_by_colour", gain_by_colour=(0.5, 1.0, 2.0), full_well_e=2000.0)
-    assert noisy_dn(plan, 40000, 64, 64).max() == 16000
 
 
 def test_lens_shading_follows_its_polynomial_in_both_frames() -> None:
@@ -298,15 +267,6 @@ def test_hot_and_dead_pixels_are_fixed_per_sensor_unit() -> None:
     assert (one != later).any()
 
 
-def test_hot_and_dead_pixels_differ_between_sensor_units(hot: np.ndarray) -> None:
-    physics = replace(SILENT, hot_pixel_share=SHARE, hot_pixel_e=200.0, dead_pixel_share=SHARE)
-    other = replace(physics, body_key=9)
-    both = (hot > 0) & (hot_pixel_means(other, (1024, 1024)) > 0)
-    assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
-    both = dead(physics, (1024, 1024)) & dead(other, (1024, 1024))
-    assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
-
-
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
 def test_dead_pixels_read_a_fraction_of_black_and_have_given_fraction(level: float) -> None:
     plan = plan_with("read", "dead_pixels", dead_pixel_share=SHARE, dead_pixel_level=level, read_std_dn=30.0)
@@ -325,11 +285,6 @@ def test_prnu_has_mean_1_and_given_standard_deviation() -> None:
     assert bounds_off((pattern - 1) ** 2, 1e-4, 2e-8, (REACH * 0.01) ** 2) <= 1
 
 
-def test_prnu_response_is_never_negative() -> None:
-    pattern = response(replace(SILENT, prnu_std=0.5), (1024, 1024))
-    assert pattern.min() == 0
-
-
 @pytest.mark.parametrize("code", [0, 800, 20000, 50000])
 def test_prnu_scales_with_signal_and_is_fixed_between_frames(code: int) -> None:
     plan = plan_with("prnu", prnu_std=0.01)
@@ -337,12 +292,6 @@ def test_prnu_scales_with_signal_and_is_fixed_between_frames(code: int) -> None:
     frame = noisy_dn(plan, code)
     np.testing.assert_array_equal(frame, np.rint(signal_dn(code) * pattern + BLACK) - BLACK)
     np.testing.assert_array_equal(frame, noisy_dn(replace(plan, stream_key=2), code))
-
-
-def test_prnu_differs_between_sensor_units() -> None:
-    physics = replace(SILENT, prnu_std=0.01)
-    one, other = (response(replace(physics, body_key=key), (1024, 1024)) - 1 for key in (1, 2))
-    assert bounds_off(one * other, 0, 1e-8, (REACH * 0.01) ** 2) <= 1
 
 
 def test_black_error_depends_on_cfa_site_alone() -> None:
@@ -422,19 +371,3 @@ def test_mean_of_frames_does_not_exceed_full_well() -> None:
 
 
 # Sensor units ---------------------------------------------------------------------------------------------------------
-
-
-def test_each_image_has_its_own_sensor_unit_by_default(settings: Settings) -> None:
-    config = settings("noise=sony_a7s2")
-    facts = facts_of(picture())
-    bodies = {plan_image(config, f"{n:064x}", facts=facts).noise.physics.body_key for n in range(40)}  # type: ignore[union-attr]
-    assert len(bodies) == 40
-
-
-def test_images_share_given_number_of_sensor_units(settings: Settings) -> None:
-    config = settings("noise=sony_a7s2", "sensor.units=3")
-    facts = facts_of(picture())
-    physics = [plan_image(config, f"{n:064x}", facts=facts).noise.physics for n in range(40)]
-    bodies = {(one.sensor_unit, one.body_key) for one in physics if one is not None}
-    assert {unit for unit, _ in bodies} == {"0", "1", "2"}
-    assert len(bodies) == 3

@@ -211,18 +211,6 @@ def test_float32_is_within_its_error_on_sampled_colours(plan: Plan, camera: str,
     assert_within(int((apart > 0).sum()), int(apart.max()), apart.size)
 
 
-@pytest.mark.parametrize("camera", colour.CAMERAS)
-def test_float32_is_within_its_error_on_16_bit_grays(plan: Plan, camera: str) -> None:
-    """Each gray is tested on each of the four CFA sites."""
-    made = with_sensor(plan, 14).replace(rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]))
-    grays = np.arange(2**16, dtype=np.uint16).repeat(2)
-    codes = np.broadcast_to(grays[None, :, None], (2, grays.size, 3)).copy()
-
-    apart = np.abs(in_float32(codes, made).clean.astype(int) - make_pair(codes, made).clean)
-
-    assert_within(int((apart > 0).sum()), int(apart.max()), apart.size)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", colour.CAMERAS)
 def test_float32_is_within_its_error_on_all_colours(plan: Plan, camera: str, figure: Figure) -> None:
@@ -303,35 +291,6 @@ def test_float32_is_within_its_error_wherever_it_is_chosen(
         assert (apart > 0).mean() <= 1e-3
 
 
-@pytest.mark.parametrize("bits", SENSORS)
-def test_white_is_white_and_black_is_black_in_float32(plan: Plan, bits: int) -> None:
-    ends = np.array([[[255] * 3, [0] * 3], [[0] * 3, [255] * 3]], dtype=np.uint8)
-    for camera in colour.CAMERAS.values():
-        pair = in_float32(ends, with_sensor(plan, bits).replace(rgb2cam=colour.rgb2cam(camera)))
-
-        black, white = SENSORS[bits]
-        np.testing.assert_array_equal(pair.clean, [[white, black], [black, white]])
-        assert (pair.counts.saturated, pair.counts.clean_clipped_low, pair.counts.clean_clipped_high) == (2, 0, 0)
-
-
-def test_a_float32_crop_is_the_crop_of_the_frame(plan: Plan, scene: np.ndarray) -> None:
-    whole = in_float32(scene, plan)
-
-    for top, left, height, width in [(0, 0, 1, 1), (7, 63, 5, 2), (8, 64, 90, 65), (11, 1, 200, 296)]:
-        tile = in_float32(scene[top : top + height, left : left + width], plan, (top, left))
-        np.testing.assert_array_equal(tile.clean, whole.clean[top : top + height, left : left + width])
-        np.testing.assert_array_equal(tile.noisy, whole.noisy[top : top + height, left : left + width])
-
-
-def test_large_noise_is_clipped_in_float32(plan: Plan) -> None:
-    gray = np.full((32, 64, 3), 128, dtype=np.uint8)
-    wide = with_sensor(plan, 16).replace(a_dn=0.0, b_dn2=1e15)
-
-    apart = np.abs(in_float32(gray, wide).noisy.astype(int) - make_pair(gray, wide).noisy)
-
-    assert apart.max() <= COARSE_ERROR * np.sqrt(1e15)
-
-
 # Limits ---------------------------------------------------------------------------------------------------------------
 
 
@@ -348,13 +307,6 @@ def test_white_is_white_and_black_is_black(plan: Plan, highlight: str) -> None:
         np.testing.assert_array_equal(pair.clean, [[white, black], [black, white]], err_msg=str(made))
         assert pair.counts.saturated == 2, made
         assert pair.counts.clean_clipped_low == 0, made
-
-
-def test_white_without_gain_is_not_counted_as_clipped(plan: Plan) -> None:
-    white = np.full((64, 64, 3), 255, dtype=np.uint8)
-
-    for camera in colour.CAMERAS.values():
-        assert make_pair(white, plan.replace(rgb2cam=colour.rgb2cam(camera))).counts.clean_clipped_high == 0
 
 
 def test_the_input_is_not_modified(plan: Plan, scene: np.ndarray) -> None:
