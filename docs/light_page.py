@@ -62,9 +62,4 @@ def light_tables() -> str:
         for channel, preset in enumerate(presets):
             columns += [", ".join(f"{value:.2f}" for value in preset), _quantiles(together[:, channel])]
         lines.append(f"| {name} | {' | '.join(columns)} |")
-    heads = " | ".join(f"{name}, {colour}" for name in PRESETS for colour in ("red", "blue"))
-    lines += ["", "Each camera (5, 50, 95 %):", "", f"| camera | {heads} |", "|---" * (1 + 2 * len(PRESETS)) + "|"]
-    for camera in cameras:
-        cells = (_quantiles(drawn[name][camera][:, channel]) for name in PRESETS for channel in (0, 1))
-        lines.append(f"| `{camera}` | {' | '.join(cells)} |")
     return "\n".join(lines)
