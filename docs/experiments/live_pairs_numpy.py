@@ -56,7 +56,7 @@ class Camera:
         self.gains = np.array([inverse / row["red_gain"], inverse, inverse / row["blue_gain"]], np.float32)
         self.black, self.white = np.float32(row["black_level_dn"]), np.float32(row["white_level_dn"])
         self.span, self.exposure = self.white - self.black, np.float32(1 / row["exposure_ratio"])
-        body = np.random.default_rng(0 if row["body_key"] == "none" else int(row["body_key"], 16))
+        body = np.random.default_rng(int(row["body_key"] or "0", 16))
         if "prnu" in self.effects:
             self.response = np.maximum(1 + np.float32(row["prnu_std"]) * body.standard_normal(shape, np.float32), 0)
         if "hot_pixels" in self.effects:
