@@ -16,7 +16,6 @@ from helpers.processes import imported_first, kill_session, running, unfinished,
 
 import unprocess_gen as ug
 from unprocess_gen.config.option_files import build_names, manifests_dir
-from unprocess_gen.core import libraries
 from unprocess_gen.pipeline import builds
 from unprocess_gen.pipeline.builds import read_build
 
@@ -132,15 +131,6 @@ def test_wrong_arguments_are_refused_in_one_line(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_missing_extra_is_refused_in_one_line(
-    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(libraries, "find_spec", lambda name: None)
-    done = run_main("build", SMALL, "--to", "here")
-    assert (done.code, len(done.err.splitlines()), list(tmp_path.iterdir())) == (2, 1, [])
-    assert "the photographs need scikit-image; in the source folder, run: pip install '.[photos]'" in done.err
-
-
 def test_photograph_of_other_bytes_is_refused_in_one_line(
     run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -165,12 +155,6 @@ def test_cards_and_table_follow_from_the_scores(scores: ModuleType) -> None:
         assert (manifests_dir() / file).read_text(encoding="utf-8") == text, (
             f"{file}: run python manifests/measure.py DIR"
         )
-
-
-def test_denoiser_lowers_no_score_of_any_build(scores: ModuleType) -> None:
-    for line in scores.read_scores():
-        for name in scores.COLUMNS[:4]:
-            assert float(line[name.replace("noisy", "denoised")]) >= float(line[name]), (line["build"], line["dataset"])
 
 
 def test_scores_of_a_build_are_the_recorded_ones(scores: ModuleType, run_main: RunMain, tmp_path: Path) -> None:
