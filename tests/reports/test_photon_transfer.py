@@ -30,8 +30,8 @@ def scenes(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
         (),
         ("noise=brooks2019",),
         ("noise.law=poisson",),
-        ("noise=imx385", "noise.iso=12800", "effects.all=on", "effects.hot_pixels=off", "effects.dead_pixels=off"),
-        ("noise=sony_a7s2", "scene=low_light"),
+        pytest.param(("noise=imx385", "noise.iso=12800", "effects.all=on"), marks=pytest.mark.slow),
+        pytest.param(("noise=sony_a7s2", "scene=low_light"), marks=pytest.mark.slow),
         ("noise=oppo_reno10x", "noise.iso=1600", "sensor=generic_10bit"),
     ],
 )
