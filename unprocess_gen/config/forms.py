@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import bisect
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,20 +49,6 @@ ISO_FORMS: Mapping[str, Form] = {
     ),
 }
 """Functions of ISO that the number of a branch can be; `planning.noise_profile` evaluates them."""
-
-
-def value_at(form: Any, iso: float) -> float:
-    """Return a gain or standard deviation at an ISO without scatter, to the precision of the C library."""
-    match form:
-        case ["line", slope, intercept, *_]:
-            return math.exp(slope * math.log(iso) + intercept)
-        case ["by_iso", *pairs]:
-            isos, values = ([math.log(number) for number in pairs[start::2]] for start in (0, 1))
-            above = min(bisect.bisect_left(isos, math.log(iso)), len(isos) - 1)
-            low = max(above - 1, 0)
-            share = (math.log(iso) - isos[low]) / (isos[above] - isos[low]) if above else 0.0
-            return math.exp(values[low] + share * (values[above] - values[low]))
-    return float(form)
 
 
 def spelled(name: str, form: Form) -> str:

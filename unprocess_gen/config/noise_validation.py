@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ import numpy as np
 
 from unprocess_gen.config import limits
 from unprocess_gen.config.distributions import highest, lowest, parse_drawn
-from unprocess_gen.config.forms import value_at
 from unprocess_gen.config.interpretation import branch_of, is_physical, noise_distributions
 from unprocess_gen.config.limits import ISO_RANGE, MAX_BRANCH_NUMBER
 from unprocess_gen.config.schema import (
@@ -279,3 +279,17 @@ def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
         if rate > 0 and rate.ln() + doublings * Decimal(2).ln() > most:
             where = f"in {seconds:g} s at {celsius:g} degrees Celsius"
             raise refusal(f"noise.{key}", getattr(noise, key), f"more than {MAX_ELECTRONS:g} electrons {where}")
+
+
+def value_at(form: Any, iso: float) -> float:
+    """Return a gain or standard deviation at an ISO without scatter, to the precision of the C library."""
+    match form:
+        case ["line", slope, intercept, *_]:
+            return math.exp(slope * math.log(iso) + intercept)
+        case ["by_iso", *pairs]:
+            isos, values = ([math.log(number) for number in pairs[start::2]] for start in (0, 1))
+            above = min(bisect.bisect_left(isos, math.log(iso)), len(isos) - 1)
+            low = max(above - 1, 0)
+            share = (math.log(iso) - isos[low]) / (isos[above] - isos[low]) if above else 0.0
+            return math.exp(values[low] + share * (values[above] - values[low]))
+    return float(form)
