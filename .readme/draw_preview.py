@@ -11,7 +11,7 @@ import cv2
 
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 
-KEYS = "1,4"
+KEYS = "1,2"
 
 
 def main() -> None:

@@ -152,7 +152,8 @@ def accuracy_figure(rows: Sequence[Measurement]) -> bytes:
                 edges.append(min(edges[-1] + share * (run.ratio_to_exact or 0), LONGEST_BAR))
             lengths = [right - left for left, right in pairwise(edges)]
             axes.barh([line] * len(lengths), lengths, left=edges[:-1], color=[*STAGE_COLOURS.values()], height=0.7)
-            text = f"  {three_digits(run.ratio_to_exact)}; RMS {short_number(run.rms_std)} σ"
+            cut = ", bar cut" if edges[-1] == LONGEST_BAR else ""
+            text = f"  {three_digits(run.ratio_to_exact)}{cut}; RMS {short_number(run.rms_std)} σ"
             axes.text(edges[-1], line, text, va="center", fontsize=8)
         for stage, colour in STAGE_COLOURS.items():
             axes.barh(0, 0, color=colour, label=stage)
