@@ -36,7 +36,7 @@ def overrides_of(config: Config) -> dict[str, str]:
     given = {key: text for key, text in given.items() if default_options().get(key) != text}
     composition = load_config([f"{key}={text}" for key, text in given.items()])
     if left := [key for key, _ in _differing_settings(config, composition)]:
-        raise ConfigError(f"{', '.join(left)}: recorded settings that overrides cannot express; run gen-dataset again")
+        raise ConfigError(f"{', '.join(left)}: recorded settings that overrides cannot express; use gen-dataset again")
     return given
 
 
