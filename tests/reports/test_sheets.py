@@ -243,6 +243,20 @@ def test_preview_writes_the_sheets_of_the_keys(few: Path, run_main: RunMain, tmp
     assert names == {f"{key}{kind}.png" for key in ("00000000", "00000003") for kind in ("", ".stages")}
 
 
+def test_preview_refuses_a_folder_with_sheets_of_another_dataset(
+    few: Path, dataset: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    assert run_main("preview", few, "--keys", "3", "--to", "sheets").code == 0
+    assert run_main("preview", few, "--keys", "0", "--to", "sheets").code == 0  # more sheets of the same dataset
+    before = {path.name: path.read_bytes() for path in (tmp_path / "sheets").iterdir()}
+
+    done = run_main("preview", dataset, "--keys", "3", "--to", "sheets")
+
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert done.err.startswith(f"gen-dataset: --to sheets: 00000000.png is not a sheet of {dataset}; ")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "sheets").iterdir()} == before
+
+
 @pytest.mark.parametrize("inside", ["", "sheets"])
 def test_preview_refuses_the_folder_of_the_photographs(
     inside: str, few: Path, gray_world: Path, run_main: RunMain

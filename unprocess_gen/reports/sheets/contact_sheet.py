@@ -4,11 +4,15 @@ Sheets need only shards and manifest. The panel of the source is empty, with the
 available or differs from the row's. Each panel shows the complete frame, averaged, and a detail at one pixel per site.
 Raw frames are drawn from the black to the white level of the scene, square root. A sheet of stages shows the
 photograph after each step of unprocessing (Figure 1 of the article), computed with the reference functions.
+
+Each PNG file contains the digest of the manifest that it shows. A folder with sheets of another dataset is refused,
+because their names are keys: sheets of two datasets would replace each other or be mixed.
 """
 
 from __future__ import annotations
 
 import functools
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +21,7 @@ import numpy as np
 
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
@@ -39,6 +44,9 @@ PAIRS_SHOWN = 8
 """Number of pairs shown if no keys are given."""
 RMS_SHOWN = 4.0
 """Differences that are drawn black and white, in units of their RMS."""
+
+PNG_HEADER_BYTES = 33
+"""Bytes of the signature and the first chunk of a PNG file, behind which text may follow (PNG specification, 5.6)."""
 
 Load = Callable[[SourceConfig, Source], tuple[str, Photograph]]
 
@@ -104,18 +112,33 @@ def write_sheets(
 ) -> Iterator[SheetFiles]:
     """Write ``KEY.png`` for each pair, and ``KEY.stages.png`` if asked for; yield the files once they are written.
 
-    ConfigError if ``to`` is inside a dataset or is not a folder, and as for `selected_pairs`.
+    ConfigError if ``to`` is inside a dataset, is not a folder or contains sheets of another dataset, and as for
+    `selected_pairs`.
     """
     check_output_folder(to, f"--to {to}")
+    mark = _dataset_mark(folder)
+    for path in sorted(to.glob("[0-9]" * 8 + "*.png")):
+        if mark not in path.read_bytes():
+            raise ConfigError(
+                f"--to {to}: {path.name} is not a sheet of {folder}; expected a folder without sheets of other "
+                "datasets; choose another folder, or remove them"
+            )
     for pair in selected_pairs(folder, keys, source):
         key, window = str(pair.row["key"]), panels.detail_window(pair.clean.shape)
         heading = _heading(pair, window)
         drawn = {f"{key}.png": panels.lay_out(heading, _pair_panels(pair, window, panels.PANEL_PX), 3)}
         if with_stages and pair.source is not None:
             drawn[f"{key}.stages.png"] = panels.lay_out(heading, _stage_panels(pair, pair.source, window), 4)
-        contents = {name: picture_png(sheet) for name, sheet in drawn.items()}
+        pictures = {name: picture_png(sheet) for name, sheet in drawn.items()}
+        contents = {name: png[:PNG_HEADER_BYTES] + mark + png[PNG_HEADER_BYTES:] for name, png in pictures.items()}
         write_files(to, contents)
         yield SheetFiles(key, str(pair.row["source"]), tuple(to / name for name in contents), pair.missing_source)
+
+
+def _dataset_mark(folder: AnyPath) -> bytes:
+    """Text chunk of a PNG file (PNG specification, 11.3.3.2) that identifies a dataset."""
+    body = f"tEXtunprocess_gen\0manifest_sha256={file_sha256(folder / 'manifest.csv')}".encode("ascii")
+    return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
 
 
 def contact_sheet(folder: AnyPath, keys: str = "", source: AnyPath | None = None) -> Picture:
