@@ -108,7 +108,7 @@ def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
     [
         {"accuracy": FAST},
         {"accuracy": FAST, "highlight": "gray_mean", "saturated": "white"},
-        {"law": "poisson", "b_dn2": 3.0},
+        {"law": "poisson", "b_dn2": 3.0, "accuracy": FAST},
         {"physics": GOLDEN_PHYSICS, "effects": EFFECTS},
         {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
     ],

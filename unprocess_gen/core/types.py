@@ -486,8 +486,10 @@ class CleanPlan(NamedTuple):
 
     Attributes
     ----------
-    stream_key, source, scene, camera, isp, sensor, accuracy, output
+    stream_key, source, scene, camera, isp, sensor, output
         Parts of the plan.
+    accuracy : str
+        `Plan.clean_accuracy`.
     brightest : float
         Light at which the frame saturates.
     lens : tuple or None
@@ -582,9 +584,18 @@ class Plan:
         if noise.averaged:
             patterns = noise.physics, noise.effects, noise.sensor_clip
         return CleanPlan(
-            self.stream_key, self.source, self.scene, self.camera, self.isp, self.sensor, self.accuracy, self.output,
-            self.brightest, lens, patterns,
+            self.stream_key, self.source, self.scene, self.camera, self.isp, self.sensor,
+            self.clean_accuracy, self.output, self.brightest, lens, patterns,
         )  # fmt: skip
+
+    @property
+    def clean_accuracy(self) -> str:
+        """Accuracy tier of the clean frame: ``exact`` in place of ``fast`` for float32 frames and Poisson counts.
+
+        No drawn number decides it, so that all noise levels of an image have the same clean frame.
+        """
+        has_counts = self.noise.physics is not None or self.noise.law == "poisson"
+        return EXACT if self.accuracy == FAST and (has_counts or self.output.clean_normalised) else self.accuracy
 
     @property
     def brightest(self) -> float:

@@ -219,9 +219,8 @@ def pass_key(plan: Plan) -> tuple[object, ...]:
 
 
 def uses_scene32(plan: Plan) -> bool:
-    """True if a plan is rendered in float32: tier ``fast``, integer frames with one normal per site, no `is_steep`."""
-    is_fast = plan.accuracy == FAST and not plan.output.clean_normalised and not plan.noise.counts_electrons
-    return is_fast and not is_steep(plan)
+    """True if a plan is rendered in float32, which its clean frame alone decides."""
+    return plan.clean_accuracy == FAST and not is_steep(plan)
 
 
 @kernel
