@@ -16,7 +16,7 @@ NORMAL_STREAM = "heteroscedastic"
 
 @functools.lru_cache(maxsize=1024)
 def slots_of(plan: Plan) -> Slots:
-    """Return the slots of a plan whose noise counts electrons."""
+    """Return the slots of a plan; frames that share their patterns can be simulated in one pass."""
     black_dn, physics = float(plan.sensor.black_level_dn), plan.noise.physics
     if physics is None:
         return _two_numbers(plan, black_dn)
@@ -25,11 +25,6 @@ def slots_of(plan: Plan) -> Slots:
         filled |= effect.slots(plan)
     patterns = Patterns(**{name: filled.pop(name) for name in Patterns._fields if name in filled})
     return Slots(black_dn, physics.dn_per_e, patterns, **filled)
-
-
-def fixed_patterns(plan: Plan) -> Patterns:
-    """Return the fixed patterns of a plan; frames that share them can be simulated in one pass."""
-    return slots_of(plan).patterns if plan.noise.physics is not None else Patterns()
 
 
 def _two_numbers(plan: Plan, black_dn: float) -> Slots:

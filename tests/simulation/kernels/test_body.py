@@ -13,7 +13,7 @@ from unprocess_gen.simulation.effects import Physics
 from unprocess_gen.simulation.kernels import body
 from unprocess_gen.simulation.kernels.body import Body, body_of, forget_bodies
 from unprocess_gen.simulation.kernels.strips import SiteMap
-from unprocess_gen.simulation.plan_slots import fixed_patterns
+from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.slots import NormalPattern, Patterns
 
 CROPS = (
@@ -37,7 +37,7 @@ def _forgotten() -> Iterator[None]:
 def patterns_of(*on: str, **numbers: float) -> tuple[Patterns, Physics]:
     plan = plan_with(*on, **NUMBERS | numbers)
     assert plan.noise.physics is not None
-    return fixed_patterns(plan), plan.noise.physics
+    return slots_of(plan).patterns, plan.noise.physics
 
 
 def means_of(found: Body, shape: tuple[int, int], first: int) -> np.ndarray:

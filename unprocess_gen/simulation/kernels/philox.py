@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
-from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, frame_word
+from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, LOW, MULTIPLIERS, ROUNDS
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.kernels.simd import Pointer
 from unprocess_gen.simulation.kernels.strips import Strip
 
-LOW32, _32, _LANES = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(LANES)
+LOW32, _32, _LANES = np.uint64(LOW), np.uint64(32), np.uint64(LANES)
 KEY_STEP0, KEY_STEP1 = (np.uint64(step) for step in KEY_STEPS)
 _M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
 
@@ -27,18 +27,17 @@ PhiloxKey = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 _CounterBlock = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 
 
-def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> PhiloxKey:
-    """Return the key and counter words of a 64-bit stream key, as kernels take them."""
-    return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
+def philox_key(key: int) -> PhiloxKey:
+    """Return the 64-bit key of a body's patterns as kernels take it: level, draw, frame and epoch are 0."""
+    return np.uint64(key & LOW), np.uint64(key >> 32), np.uint64(0), np.uint64(0)
 
 
 def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
     """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
-    rows = []
-    for plan in plans:
-        key, noise = plan.stream_key, plan.noise
-        word = frame_word(noise.frame, noise.epoch)
-        rows.append((key & 0xFFFFFFFF, key >> 32, noise.level << 12 | noise.draw, word))
+    rows = [
+        (plan.stream_key & LOW, plan.stream_key >> 32, plan.noise.level << 12 | plan.noise.draw, plan.noise.frame_word)
+        for plan in plans
+    ]
     return np.array(rows, dtype=np.uint64)
 
 

@@ -7,7 +7,7 @@ The way of a strip through the read-out, once its noise is drawn (`draw_noise`):
       _round_and_list                                     pinned sites get the level of white
           rounded = rint(noise_dn)                        _normalise
           noisy_dn = base + rounded                           clip, then (dn - black) / span
-          noisy = clip(noisy_dn) as uint16                _write (or in place, see `_is_direct`)
+          noisy = clip(noisy_dn) as uint16                _write
           sites with |noise_dn - rounded| + error_dn > 1/2
           are uncertain
       _exact_site and _replace, for uncertain sites
@@ -270,23 +270,12 @@ def _count_equal(strip: Strip, values: Pointer, value: Any) -> int:
 def _read_normalised(readout: Unrounded, noise: Any, n: int, output: Output, strip: Strip, buffers: Buffers) -> None:
     limits, noisy_dn = load_limits(readout, n), buffers.exact_dn
     _fill_exact(noise, n, strip, buffers)
-    noisy = output.sites if _is_direct(readout, strip) else buffers.normalised
     if output.may_saturate and limits.pinned_from < np.inf:
         for x in range(strip.total):
             noisy_dn[x] = limits.pinned_dn if buffers.unrounded_dn[x] >= limits.pinned_from else noisy_dn[x]
-    if _normalise(readout, noisy_dn, limits.low, limits.high, strip, noisy):
+    if _normalise(readout, noisy_dn, limits.low, limits.high, strip, buffers.normalised):
         _count_clipped(output, strip, noisy_dn, limits.low, limits.high)
-    if not _is_direct(readout, strip):
-        _write(readout, strip, noisy, output.sites)
-
-
-@inner
-def _is_direct(readout: Any, strip: Strip) -> bool:
-    """True if a strip of float32 is computed in its frame: complete vectors of a mosaic.
-
-    A copy from a buffer takes 8 to 14 % of a pair in float32.
-    """
-    return bool(strip.total == strip.length and not readout.packed)
+    _write(readout, strip, buffers.normalised, output.sites)
 
 
 @inner
@@ -304,16 +293,14 @@ def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip:
 
 @inner
 def _write_normalised(readout: Any, output: Output, strip: Strip, buffers: Buffers) -> None:
-    clean = output.sites if _is_direct(readout, strip) else buffers.normalised
     low, high = readout.black_dn, readout.black_dn + readout.span_dn
     if readout.averaged:
         limits = load_limits(readout, np.int64(0))
         low, high = limits.low, limits.high
-    _normalise(readout, buffers.unrounded_dn, low, high, strip, clean)
+    _normalise(readout, buffers.unrounded_dn, low, high, strip, buffers.normalised)
     if output.may_saturate:
-        output.counts[SATURATED] += _count_equal(strip, clean, np.float32(readout.white))
-    if not _is_direct(readout, strip):
-        _write(readout, strip, clean, output.sites)
+        output.counts[SATURATED] += _count_equal(strip, buffers.normalised, np.float32(readout.white))
+    _write(readout, strip, buffers.normalised, output.sites)
 
 
 # --------------------------------------------------------------------------------------------------------------- frames

@@ -45,7 +45,7 @@ from unprocess_gen.simulation.kernels.readout import (
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
 from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, buffers_in, locate, scratch_of_thread
-from unprocess_gen.simulation.plan_slots import fixed_patterns, slots_of
+from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.slots import Slots
 
 CODES = 256, 65536
@@ -211,11 +211,7 @@ def _records(
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
     """Key that the plans of one pass have in common: the kernels, and the fixed patterns of the body."""
-    return (
-        plan.noise.averaged,
-        plan.noise.counts_electrons,
-        fixed_patterns(plan),
-    )
+    return plan.noise.counts_electrons, slots_of(plan).patterns
 
 
 def uses_scene32(plan: Plan) -> bool:
