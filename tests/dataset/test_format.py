@@ -100,7 +100,16 @@ def test_another_format_is_refused_by_every_reader(read: Callable[[Path], object
 
 
 @pytest.mark.parametrize(
-    "arguments", ["verify ds", "verify ds --repair", "replay ds/manifest.csv", "again ds out=new", "out=ds"]
+    "arguments",
+    [
+        "verify ds",
+        "verify ds --repair",
+        "replay ds/manifest.csv",
+        "again ds out=new",
+        "out=ds",
+        "merge ds",
+        "part ds 0",
+    ],
 )
 def test_another_format_is_refused_in_one_line(
     arguments: str, other: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
@@ -110,3 +119,4 @@ def test_another_format_is_refused_in_one_line(
     assert done.code == 4
     (line,) = messages(done.err)
     assert "expected a dataset of format 1" in line
+    assert "--repair" not in line

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SEVERITY = (0, 3, 11, 4, 2, 5, 1)
 """Exit codes from good to bad; a sweep exits with the worst code of its jobs."""
 
-NOT_IN_NAMES = (*("out", "n_jobs", "source.root", "source.list"), *("executor", "append", "self_test", "check_disk"))
+NOT_IN_NAMES = ("out", "n_jobs", "source.root", "source.list", "executor", "self_test", "check_disk")
 """Settings that do not decide a dataset's bytes, and so are not in the names of folders."""
 
 LONGEST_FOLDER_NAME = 200

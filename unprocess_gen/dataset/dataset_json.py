@@ -81,12 +81,8 @@ FORMAT = 1
 _START = f'{{\n "format": {FORMAT},'.encode()
 
 
-class FormatError(DamageError):
-    """Dataset of another format."""
-
-
 def check_format(folder: AnyPath) -> None:
-    """Raise FormatError if the ``dataset.json`` of a folder states another format, or none."""
+    """Raise DamageError if the ``dataset.json`` of a folder states another format, or none."""
     path = folder / "dataset.json"
     with contextlib.suppress(OSError, ValueError), path.open("rb") as stream:  # `verify` reports damage
         start = stream.read(len(_START))
@@ -95,10 +91,10 @@ def check_format(folder: AnyPath) -> None:
 
 
 def check_format_of(path: AnyPath, facts: Any) -> None:
-    """Raise FormatError if the contents of a ``dataset.json`` state another format, or none."""
+    """Raise DamageError if the contents of a ``dataset.json`` state another format, or none."""
     if isinstance(facts, dict) and facts.get("format") != FORMAT:
-        stated = f"format={str(facts['format'])[:40]}" if "format" in facts else "has no format"
-        raise FormatError(
+        stated = f"format={repr(facts['format'])[:40]}" if "format" in facts else "has no format"
+        raise DamageError(
             f"{path}: {stated}; expected a dataset of format {FORMAT}; regenerate it with this version of unprocess_gen"
         )
 

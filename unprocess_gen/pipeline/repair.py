@@ -23,7 +23,7 @@ from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.core.types import Array, Row
 from unprocess_gen.dataset.columns import columns_of
-from unprocess_gen.dataset.dataset_json import FormatError
+from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import has_frames, read_rows, write_rows
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, check_members, shard_name
@@ -59,10 +59,9 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
     with closing(Storage(folder)) as storage, machine_errors(folder):
         storage.hold()
         manifest, dataset = folder / "manifest.csv", folder / "dataset.json"
+        check_format(folder)
         try:
             facts: dict[str, Any] = read_dataset(dataset)
-        except FormatError:
-            raise
         except DamageError:
             facts = {}
             _check_proof(folder)

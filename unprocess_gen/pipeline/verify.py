@@ -22,7 +22,7 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.types import Row, Value
-from unprocess_gen.dataset.dataset_json import FormatError
+from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import has_frames, read_rows, row_json, without_empty
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
@@ -75,13 +75,12 @@ def _verify(folder: AnyPath) -> list[Damage]:
         )
     damages: list[Damage] = []
     facts: dict[str, Any] = {}
+    check_format(folder)
     try:
         if (folder / "dataset.json").exists():
             facts = read_dataset(folder / "dataset.json")
         else:
             damages.append(Damage("dataset.json", "is missing"))
-    except FormatError:
-        raise
     except DamageError as error:
         damages.append(Damage("dataset.json", _without_path(error)))
     damages += _check_files(folder, facts)

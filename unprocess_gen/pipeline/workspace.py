@@ -102,6 +102,7 @@ class Workspace:
         """Return the contents of ``dataset.json``, None without one; raise DamageError if it is damaged."""
         if (self.storage / "dataset.json").size() is None:
             return None
+        check_format(any_path(self.out))
         try:
             return read_dataset(any_path(self.out) / "dataset.json")
         except DamageError as error:
