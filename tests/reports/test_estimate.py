@@ -99,7 +99,7 @@ def test_every_effect_has_size_noise_and_reason(settings: Settings, tmp_path: Pa
     assert re.search(r"^read .* DN  pixel .* DN  2 of 2 +visible$", text, re.MULTILINE)
     assert re.search(r"^prnu .* 2 of 2 +visible \(assumed number\)$", text, re.MULTILINE)
     assert re.search(r"^dark_current .* 0 of 2 +too small to see$", text, re.MULTILINE)
-    assert re.search(r"^row .* 0 of 2 +switched off, though it would show$", text, re.MULTILINE)
+    assert re.search(r"^row .* 0 of 2 +switched off \(it would be visible\)$", text, re.MULTILINE)
     assert re.search(r"^dsnu +0 of 2 +noise=nikon_d850 gives no dsnu_std_e$", text, re.MULTILINE)
 
 

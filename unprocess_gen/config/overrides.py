@@ -23,7 +23,7 @@ NAMED_GROUPS = ("camera", "noise", "scene")
 def overrides_of(config: Config) -> dict[str, str]:
     """Return overrides by key from which a config of a dataset is composed again, without the place of its sources.
 
-    ConfigError if there are none.
+    ConfigError if overrides cannot express it.
     """
     names = {group: getattr(config, group).name for group in NAMED_GROUPS}
     given = {group: name for group, name in names.items() if (conf_dir() / group / f"{name}.yaml").is_file()}

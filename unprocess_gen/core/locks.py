@@ -2,7 +2,7 @@
 
 The system releases the lock of a process that ends, however it ends. Some network file systems have no locks, and
 object stores have none. Callers must therefore stay correct with two owners; `pipeline.workspace` does, because every
-writer makes the same bytes. Design: ``docs/design/platforms.md``.
+writer makes the same bytes. Design: ``docs/design/pipeline.md``.
 """
 
 from __future__ import annotations

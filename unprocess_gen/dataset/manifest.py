@@ -187,7 +187,7 @@ _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\
 
 
 def _plan_cells(plan: Plan) -> dict[str, Value]:
-    """Return the values of all columns that hold a plan; without a physical profile, or a dark frame, not theirs."""
+    """Return the values of a plan by column, with those of a physical profile or a dark frame if it has one."""
     noise, cells = plan.noise, dict[str, Value]()
     for record in (plan, *(getattr(plan, part) for part in PLAN_PARTS)):
         cells |= _cells(record)
@@ -557,7 +557,7 @@ def _typed(header: Sequence[str], line: bytes) -> Row:
 
 
 OTHERS = "others"
-"""The key under which a sample's JSON holds what the rows of other pairs than the first have otherwise."""
+"""Key of a sample's JSON for its other rows: the cells that differ from the first row."""
 
 
 def row_json(rows: Sequence[Row]) -> bytes:

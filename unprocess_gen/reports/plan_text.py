@@ -249,7 +249,7 @@ def _effect_table(config: Config, estimates: Estimates) -> list[str]:
 def _reason(prediction: Prediction, tolerance: float) -> str:
     is_visible = prediction.outliers >= MIN_OUTLIERS or prediction.ratio > tolerance
     if prediction.forced:
-        return f"{prediction.why}, though it would show" if is_visible and not prediction.simulated else prediction.why
+        return f"{prediction.why} (it would be visible)" if is_visible and not prediction.simulated else prediction.why
     if not prediction.simulated:
         return "too small to see"
     return "visible" if is_visible else "too much together with the omitted effects"

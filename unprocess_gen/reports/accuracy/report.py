@@ -93,7 +93,7 @@ def csv_text(rows: Sequence[Measurement]) -> str:
 
 
 NOISE_OF_TIMES = 0.05
-"""Difference of a ratio from 1 that says nothing."""
+"""Difference of a ratio from 1 that is within the error of the measurement."""
 
 
 def conclude(report: AccuracyReport) -> str:
