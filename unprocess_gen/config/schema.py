@@ -445,7 +445,7 @@ class NoiseConfig(EffectGroup):
         assumed keys whose numbers no source gives for any camera; their effects are simulated only if they are
         switched on
     provenance
-        source and uncertainty of the numbers, which plan prints
+        source and uncertainty of the numbers, which plan --numbers prints
     """
 
     name: str = key("none", limits.NAME, PROFILE)

@@ -31,7 +31,7 @@ REASONS = {
     "alpha": "pixels are transparent, or could be",
     "animated": "the file contains several pictures",
     "icc": "with `source.icc=refuse`: the colours are not those of sRGB",
-    "worker_died": "a worker process died twice at this shard, usually out of memory; the next run retries the shard",
+    "worker_died": "each worker process that tried this shard died, usually out of memory; the next run retries it",
 }
 """Reasons for which a source fails, the values of the manifest column ``reason``, with their explanations."""
 
