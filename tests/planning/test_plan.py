@@ -339,7 +339,7 @@ def test_plans_have_the_digits_of_decimal(
 def test_plans_do_not_depend_on_the_decimal_context(settings: Settings, iso: int) -> None:
     config = settings("noise=canon_5d4", f"noise.iso={iso}", "noise.assumed=[]")
     facts, narrow = Facts(128, 128, 256, 3, 250), plan_image(config, SHA, facts=Facts(128, 128, 256, 3, 250))
-    known = noise_profile._place, noise_profile._in_table, noise_profile._linear_in_table, noise_profile._on_line
+    known = noise_profile._logarithm, noise_profile._in_table, noise_profile._linear_in_table, noise_profile._on_line
     for function in known:
         function.cache_clear()  # type: ignore[attr-defined]
     with decimal.localcontext(prec=60):

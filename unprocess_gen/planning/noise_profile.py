@@ -144,8 +144,7 @@ def _in_table(iso: float, *pairs: float) -> float:
     if not share:
         return float(low)
     with localcontext(prec=DIGITS):
-        low_ln, high_ln = Decimal(low).ln(), Decimal(high).ln()
-        return float((low_ln + share * (high_ln - low_ln)).exp())
+        return float((_logarithm(low) + share * (_logarithm(high) - _logarithm(low))).exp())
 
 
 @functools.lru_cache(maxsize=256)
@@ -164,14 +163,15 @@ def _neighbours(iso: float, pairs: Sequence[Any]) -> tuple[Decimal, Any, Any]:
     above = bisect.bisect_left(isos, iso)
     if isos[above] == iso:
         return Decimal(0), values[above], values[above]
-    return _place(iso, isos[above - 1], isos[above]), values[above - 1], values[above]
+    low, high = isos[above - 1 : above + 1]
+    with localcontext(prec=DIGITS):
+        return _logarithm(iso, low) / _logarithm(high, low), values[above - 1], values[above]
 
 
 @functools.lru_cache(maxsize=256)
-def _place(iso: float, low: float, high: float) -> Decimal:
-    """Return the place of an ISO between two others, from 0 to 1 in ln ISO."""
-    with localcontext(prec=DIGITS):
-        return (Decimal(iso) / Decimal(low)).ln() / (Decimal(high) / Decimal(low)).ln()
+def _logarithm(x: float, unit: float = 0.0) -> Decimal:
+    """Return ln x, or ln (x / unit), in the decimal context of the callers; most are the same for all images."""
+    return (Decimal(x) / Decimal(unit) if unit else Decimal(x)).ln()
 
 
 @functools.lru_cache(maxsize=256)
