@@ -92,6 +92,11 @@ def test_estimate_fits_on_one_screen(overrides: str, run_main: RunMain, tmp_path
     assert max(map(len, lines)) <= 140
 
 
+def test_columns_of_the_table_of_effects_are_apart(settings: Settings, tmp_path: Path) -> None:
+    text = estimate_text(settings, tmp_path, "source.clips=true", "body=imx385", "scene=video_night")
+    assert re.search(r"^black_error .* DN  clip's plane \S+ DN  2 of 2 +visible$", text, re.MULTILINE)
+
+
 def test_every_effect_has_size_noise_and_reason(settings: Settings, tmp_path: Path) -> None:
     text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=daylight", "effects.row=off")
     for effect in EFFECTS:

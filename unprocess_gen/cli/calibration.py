@@ -75,6 +75,6 @@ def _report_notes(notes: Iterable[str]) -> None:
 
 def _usage(to: Path) -> str:
     """Return the settings with which a run uses the profile."""
-    if to.absolute().parent.name != "noise":
+    if to.parent.name != "noise":
         return f"noise={to.stem}, in a folder noise of --config-dir, and"
     return f"--config-dir {shlex.quote(str(to.parent.parent))} noise={to.stem}"

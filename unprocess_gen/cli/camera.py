@@ -29,5 +29,10 @@ def camera(call: Call) -> int:
             LocalPath(path).write(options[group].encode(), str(path.parent))
     chosen = " ".join(f"{group}={path.stem}" for group, path in paths.items())
     print_results(*sources)
-    print_results(f"{to}: use it with --config-dir {shlex.quote(str(to.parent.parent))} {chosen}")
+    folder = to.parent.parent
+    if all(path.parent == folder / group for group, path in paths.items()):
+        usage = f"--config-dir {shlex.quote(str(folder))} {chosen}"
+    else:
+        usage = f"{chosen}, in a folder {' and a folder '.join(paths)} of --config-dir"
+    print_results(f"{to}: use it with {usage}")
     return 0

@@ -213,7 +213,7 @@ def _source_noise_sentence(config: Config, ratios: Sequence[float | None]) -> st
 
 # -------------------------------------------------------------------------------------------------------------- effects
 
-_TABLE_LINE = "{:16}{:>13}  {:12}{:>11}  {:9}{}"
+_TABLE_LINE = "{:16}{:>13}  {:12} {:>11}  {:9}{}"
 
 
 def _effect_lines(config: Config, estimates: Estimates) -> list[str]:

@@ -151,6 +151,8 @@ def test_camera_of_a_file_is_used_unedited(third: bool, run_main: RunMain, tmp_p
     done = run_main("camera", "frame.dng", *own)
     assert (done.code, "ColorMatrix3, for a third light, is not used" in done.out) == (0, third), done
     assert "use it with --config-dir mine camera=phone sensor=phone" in done.out
+    done = run_main("camera", "frame.dng", "--to", "mine/phone.yaml")
+    assert "use it with camera=phone, in a folder camera of --config-dir" in done.out
     config = ug.load_config(["camera=phone", "sensor=phone"], config_dir=tmp_path / "mine")
     cold = (0.7662, -0.2686, -0.0660, -0.5240, 1.2965, 0.2530, -0.0796, 0.1508, 0.6167)  # white is above 6500 K
     assert config.camera.xyz2cam == pytest.approx(cold, abs=1e-4)
