@@ -57,6 +57,9 @@ REFUSED = [
     (["-m", "camera=nope"], r"camera=nope: no such option"),
     (["hydra.run.dir=there"], r"hydra.run.dir=there: Hydra's own settings are fixed"),
     (["--cfg"], r"generate: -c/--cfg: expected one argument; see gen-dataset generate --help"),
+    (["--cfg", "x"], r"generate: --cfg x: expected job or hydra or all"),
+    (["again", "ds", "out=x", "output.frames=no"], r"again: output.frames=no: expected true"),
+    (["-m", "hydra.sweeper.params.seed=1,2"], r"hydra.sweeper.params.seed=1,2: Hydra's own settings are fixed"),
     (["again", "/no/such", "out=x"], r"again: /no/such: no such folder; expected the folder of a dataset"),
 ]  # fmt: skip
 

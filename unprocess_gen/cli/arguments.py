@@ -36,7 +36,6 @@ class Argument:
     read: Callable[[str], Any] = str
     expected: str = "text"
     required: bool = False
-    choices: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -58,9 +57,15 @@ STANDARD = (Argument(("-q", "--quiet"), "show only warnings and errors on stderr
 """Flags of every verb."""
 
 
-def choice(names: tuple[str, ...], text: str, *choices: str, required: bool = False) -> Argument:
+def choice(names: tuple[str, ...], text: str, *choices: str) -> Argument:
     """Return an argument whose value is one of some words."""
-    return Argument(names, text, f"{{{','.join(choices)}}}", required=required, choices=choices)
+
+    def read(written: str) -> str:
+        if written not in choices:
+            raise ValueError
+        return written
+
+    return Argument(names, text, f"{{{','.join(choices)}}}", read, " or ".join(choices))
 
 
 HYDRA_FLAGS = (
@@ -145,8 +150,7 @@ def flag_parser(verb: Verb) -> argparse.ArgumentParser:
     parser = _Parser(prog=f"gen-dataset {verb.name}", add_help=False, allow_abbrev=False)
     for argument in verb.accepted:
         if argument.is_flag and argument.metavar:
-            choices = argument.choices or None
-            parser.add_argument(*argument.names, dest=argument.key, metavar=argument.metavar, choices=choices)
+            parser.add_argument(*argument.names, dest=argument.key, metavar=argument.metavar)
         elif argument.is_flag:
             parser.add_argument(*argument.names, dest=argument.key, action="store_true", default=None)
     return parser

@@ -29,9 +29,6 @@ Returns exit code, result and the texts to print. The result of a task that gene
 caller prints, because a stdout that cannot be written is no failure of the job.
 """
 
-HYDRA_SETTINGS = ("hydra.mode", "hydra.sweeper.params")
-"""Settings of Hydra that an override may set."""
-
 
 def compose(
     call: Call, task: Task, sweep_csv: bool = False, totals: Callable[[Sequence[Any]], str] | None = None
@@ -67,10 +64,8 @@ def check_overrides(overrides: Sequence[str]) -> None:
     for override in overrides:
         check_override(override)
         key = override.lstrip("+").partition("=")[0]
-        if key.startswith("hydra") and not key.startswith(HYDRA_SETTINGS):
-            raise ConfigError(
-                f"{override}: Hydra's own settings are fixed; expected one of {', '.join(HYDRA_SETTINGS)}"
-            )
+        if key.startswith("hydra") and key != "hydra.mode":
+            raise ConfigError(f"{override}: Hydra's own settings are fixed; expected only hydra.mode")
 
 
 def option_folders(hydra: Mapping[str, Any]) -> OptionFolders:

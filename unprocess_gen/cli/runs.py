@@ -53,7 +53,7 @@ def again(call: Call) -> int:
     folder = dataset_folder(call)
     changes = {"out": call.values["out"], "executor": _executor(call)}
     changes |= {"n_jobs": call.values["n_jobs"]} if "n_jobs" in call.values else {}
-    changes |= {"output.frames": call.values["output.frames"] == "true"} if "output.frames" in call.values else {}
+    changes |= {"output.frames": True} if "output.frames" in call.values else {}
     changes |= {"source.max_failed": call.values["source.max_failed"]} if "source.max_failed" in call.values else {}
     changes |= {"noise.dark_frames": dark_frames_of(folder / "manifest.csv", call)}
     config = recorded_config(folder, given_root(call), changes)

@@ -168,12 +168,7 @@ _VERBS = (
             OUT,
             _integer("n_jobs", "number of worker processes; -1: all cores"),
             Argument(("executor",), "what runs the workers: local or dask", "NAME"),
-            choice(
-                ("output.frames",),
-                "false: only the manifest; true: also the frames of a manifest without frames",
-                "true",
-                "false",
-            ),
+            choice(("output.frames",), "make the frames of a manifest without frames", "true"),
             Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
             _integer("source.max_failed", "largest number of failed sources with exit code 0"),
         ),

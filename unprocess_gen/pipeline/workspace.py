@@ -74,8 +74,8 @@ class Workspace:
         Raises LockedError if another run holds it, ConfigError if it cannot be written, contains other files or is
         inside a dataset.
         """
-        check_format(self.storage.path)
         self.storage.open()
+        check_format(self.storage.path)
         self._refuse_foreign_files()
         try:
             self.storage.hold()
