@@ -76,6 +76,8 @@ OPTIONS_BY_GROUP = [
 def test_fixture_settings_builds_what_hydra_composes(number: int, settings: Settings) -> None:
     """Every option occurs; one composition takes an option of each group."""
     files = [options[number % len(options)] for options in OPTIONS_BY_GROUP]
+    if Path("sensor/source.yaml") in files:  # a raw source takes no colours of a photograph
+        files = [file for file in files if str(file.parent) not in ("camera", "gains", "isp")]
     overrides = [f"{file.parent}={file.stem}" for file in files]
     overrides += [override for file in files for override in NEEDS.get(str(file), [])]
     composed = compose_node(overrides)

@@ -123,23 +123,26 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     folders = folders or OptionFolders()
     if folders.own is not None and not folders.own.is_dir():
         raise ConfigError(f"--config-dir {folders.own}: no such folder; expected a folder of option files")
+    name, main, second = folders.name or "config", folders.main or conf_dir(), folders.own
+    if folders.name is not None and second is not None and (second / f"{name}.yaml").is_file():
+        main, second = second, main  # Hydra looks for the primary config in the first folder only
     given = [*map(hydra_override, overrides)]
-    if folders.own is not None:
-        given.append(quoted("hydra.searchpath", f"file://{folders.own.absolute()}", "[{}]"))
+    if second is not None:
+        given.append(quoted("hydra.searchpath", f"file://{second.absolute()}", "[{}]"))
     _check_own_options(overrides, folders)
     try:
-        node = _compose(folders, given)
+        node = _compose(main, name, given)
         added = source_overrides(node, overrides)
-        return _compose(folders, [*given, *added]) if added else node
+        return _compose(main, name, [*given, *added]) if added else node
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(explain(error, overrides)) from error
 
 
-def _compose(folders: OptionFolders, overrides: list[str]) -> DictConfig:
+def _compose(main: Path, name: str, overrides: list[str]) -> DictConfig:
     """Compose overrides that Hydra can parse; HydraException for whatever Hydra raises about them."""
-    with _hydra_in((folders.main or conf_dir()).absolute()):
+    with _hydra_in(main.absolute()):
         try:
-            return hydra.compose(folders.name or "config", overrides, return_hydra_config=True)
+            return hydra.compose(name, overrides, return_hydra_config=True)
         except PLAIN_ERRORS as error:
             raise HydraException(str(error)) from error
 
