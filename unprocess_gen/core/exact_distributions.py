@@ -31,8 +31,7 @@ def normal_quantile(p: Decimal) -> Decimal:
     Decimal
         Φ⁻¹(p) with at least 23 correct digits: Newton's method on `normal_cdf`.
     """
-    with localcontext() as context:
-        context.prec = DIGITS
+    with localcontext(prec=DIGITS):
         z = Decimal(NormalDist().inv_cdf(float(p)))
         for _ in range(2):
             z -= (normal_cdf(z) - p) / normal_density(z)

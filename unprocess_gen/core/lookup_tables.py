@@ -108,8 +108,7 @@ def tukey_table(shape: float) -> Float:
     if not -0.5 < shape < 10:
         raise ValueError(f"shape={shape}: Tukey's lambda distribution is not usable; expected a number in (-0.5, 10)")
     rows = []
-    with localcontext() as context:
-        context.prec = DIGITS
+    with localcontext(prec=DIGITS):
         std = tukey_std(shape)
         for octave in range(OCTAVES):
             for segment in range(SEGMENTS):
@@ -142,8 +141,7 @@ def unit_tukey_table(shape: float) -> Float:
         If ``shape`` is outside its range.
     """
     table = tukey_table(shape)
-    with localcontext() as context:
-        context.prec = DIGITS
+    with localcontext(prec=DIGITS):
         std = draw_variance(table).sqrt()
         return freeze(np.array([[float(Decimal(number) / std) for number in row] for row in table.tolist()]))
 
@@ -207,8 +205,7 @@ def exponential_levels() -> Float:
     ndarray of float64, [1024]
         Ascending quantiles at the centres of 1024 equal probabilities, divided by their mean; read-only.
     """
-    with localcontext() as context:
-        context.prec = DIGITS
+    with localcontext(prec=DIGITS):
         levels = [-((1023 - step + Decimal("0.5")) / 1024).ln() for step in range(1024)]
         mean = sum(levels, Decimal(0)) / 1024
         return freeze(np.array([float(level / mean) for level in levels]))

@@ -104,8 +104,7 @@ EXACT_INVERSE_TONES: dict[str, Callable[[Decimal], Decimal]] = {"smoothstep": sm
 
 def exact_curve(tone: str, gamma: str, code: int, codes: int) -> Decimal:
     """Return the linear light of one code to `DIGITS` digits; ``gamma`` is spelled as by `types.gamma_text`."""
-    with localcontext() as context:
-        context.prec = DIGITS
+    with localcontext(prec=DIGITS):
         v = EXACT_INVERSE_TONES[tone](Decimal(code) / (codes - 1))
         if gamma == "srgb":
             return srgb_expand(v)

@@ -55,8 +55,8 @@ class Sample(_Frames):
     ----------
     clean, noisy : ndarray
         Frames in the ``dtype`` and ``layout`` of the row: uint16 in DN, or float32 with 0 at black and 1 at white. The
-        clean frame has the dtype ``clean_dtype`` unless that is empty. Mosaics [H, W], or packed planes
-        [4, H / 2, W / 2] in the order of `cfa.PLANES`.
+        clean frame has the dtype ``clean_dtype`` unless that is empty. Mosaics [H, W], or planes
+        [4, H / 2, W / 2]: R, G of the red rows, G of the blue rows, B.
     row : dict
         Manifest row: value by column.
     dataset : str

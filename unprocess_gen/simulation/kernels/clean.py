@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Plan
-from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels import simd, strips
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
@@ -301,11 +301,11 @@ def fill_clean(scene: Any, codes: Pointer, strip: Strip, buffers: Buffers, count
         _fill_signal(codes, strip, scene, signal)
     has_negative, has_bright = _fill_linear(scene, strip, buffers)
     if has_bright:
-        counts[6] += _recompute_bright(scene, strip, buffers)
-        counts[1] += count_outside(strip, buffers.bright_light, 0.0, scene.clipped)[1]
+        counts[strips.LIGHT_HIGH] += _recompute_bright(scene, strip, buffers)
+        counts[strips.CLEAN_HIGH] += count_outside(strip, buffers.bright_light, 0.0, scene.clipped)[1]
     if has_negative:
         light = buffers.bright_light if scene.response.steps[1] else buffers.signal
-        counts[0] += count_outside(strip, light, 0.0, np.inf)[0]
+        counts[strips.CLEAN_LOW] += count_outside(strip, light, 0.0, np.inf)[0]
     return bool(has_bright)
 
 

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.types import PACKED, Float, Plan
-from unprocess_gen.simulation.kernels import electrons, gaussian, simd
+from unprocess_gen.simulation.kernels import electrons, gaussian, simd, strips
 from unprocess_gen.simulation.kernels.clean import FLOAT32_MARGIN
 from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32
@@ -85,13 +85,8 @@ class Output(NamedTuple):
     """Locate what a strip of a frame fills."""
 
     sites: Pointer  # the strip in the frame
-    counts: Pointer  # of the frame, see `CLEAN_LOW`
+    counts: Pointer  # of the frame, see `strips.CLEAN_LOW`
     may_saturate: bool  # whether any site of the clean frame can be saturated
-
-
-CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE, LIGHT_HIGH = range(7)
-"""Places of the members of `Counts` in the counts of a frame."""
-COUNT_FIELDS = 7
 
 
 def readout_of(
@@ -205,8 +200,8 @@ def _read_integers(readout: Any, noise: Any, n: int, output: Output, strip: Stri
 @inner
 def _count_clipped(output: Output, strip: Strip, values_dn: Pointer, low: Any, high: Any) -> None:
     below, above = count_outside(strip, values_dn, low, high)
-    output.counts[NOISY_LOW] += below
-    output.counts[NOISY_HIGH] += above
+    output.counts[strips.NOISY_LOW] += below
+    output.counts[strips.NOISY_HIGH] += above
 
 
 @inner
@@ -251,7 +246,7 @@ def _write_integers(readout: Rounded, output: Output, strip: Strip, buffers: Buf
             dn = (buffers.unrounded_dn[x] + ROUND) - ROUND
             clean[x] = np.uint16(np.int32(simd.minimum(simd.maximum(dn, limits.low), limits.high)))
     if output.may_saturate:
-        output.counts[SATURATED] += _count_equal(strip, clean, np.uint16(readout.white))
+        output.counts[strips.SATURATED] += _count_equal(strip, clean, np.uint16(readout.white))
     _write(readout, strip, clean, output.sites)
 
 
@@ -299,7 +294,7 @@ def _write_normalised(readout: Any, output: Output, strip: Strip, buffers: Buffe
         low, high = limits.low, limits.high
     _normalise(readout, buffers.unrounded_dn, low, high, strip, buffers.normalised)
     if output.may_saturate:
-        output.counts[SATURATED] += _count_equal(strip, buffers.normalised, np.float32(readout.white))
+        output.counts[strips.SATURATED] += _count_equal(strip, buffers.normalised, np.float32(readout.white))
     _write(readout, strip, buffers.normalised, output.sites)
 
 
@@ -328,7 +323,7 @@ def count_zero_variance(readout: Any, n: int, output: Output, strip: Strip, buff
         count = 0
         for x in range(strip.first, strip.after):
             count += a * (buffers.unrounded_dn[x] - readout.black_dn) + b <= 0.0
-        output.counts[ZERO_VARIANCE] += count
+        output.counts[strips.ZERO_VARIANCE] += count
 
 
 read_noisy = by_class({Rounded: _read_integers, Unrounded: _read_normalised, FloatClean: _read_integers})

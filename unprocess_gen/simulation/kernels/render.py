@@ -33,7 +33,6 @@ from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
-    COUNT_FIELDS,
     Output,
     ReadOut,
     average_patterns,
@@ -44,7 +43,7 @@ from unprocess_gen.simulation.kernels.readout import (
     write_clean,
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
-from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, buffers_in, locate, scratch_of_thread
+from unprocess_gen.simulation.kernels.strips import COUNT_FIELDS, STRIP, Scratch, buffers_in, locate, scratch_of_thread
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.slots import Slots
 

@@ -214,6 +214,11 @@ def list_lanes(lanes: Vector, x: np.uint64, count: int, buffers: Buffers) -> int
     return length
 
 
+CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE, LIGHT_HIGH = range(7)
+"""Places of the members of `Counts` in the counts of a frame."""
+COUNT_FIELDS = 7
+
+
 @inner
 def count_outside(strip: Strip, values: Pointer, low: float, high: float) -> tuple[int, int]:
     """Return the numbers of values of a strip below and above the limits."""

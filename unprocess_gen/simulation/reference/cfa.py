@@ -104,10 +104,6 @@ def mosaic(camera_rgb: Float | Srgb, pattern: str, origin: tuple[int, int] = (0,
     return raw
 
 
-PLANES = ("R", "G of the red rows", "G of the blue rows", "B")
-"""Packed planes in their order, as in Brooks et al. 2019 (unprocess.py, mosaic())."""
-
-
 def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], ...]:
     """Return the position in the 2x2 tile of the site of each packed plane.
 
@@ -121,7 +117,8 @@ def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[i
     Returns
     -------
     tuple of four (int, int)
-        Row and column for each of `PLANES`; the four sites row by row if all have the same filter.
+        Row and column of R, G of the red rows, G of the blue rows and B, as in Brooks et al. 2019 (unprocess.py,
+        mosaic()); the four sites row by row if all have the same filter.
 
     Examples
     --------
@@ -151,7 +148,7 @@ def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame
     Returns
     -------
     ndarray, [4, H / 2, W / 2]
-        Planes in the order of `PLANES`; a copy of the same dtype.
+        Planes in the order of `plane_sites`; a copy of the same dtype.
 
     Raises
     ------
@@ -173,7 +170,7 @@ def unpack(planes: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Fra
     Parameters
     ----------
     planes : ndarray, [4, H / 2, W / 2]
-        Planes in the order of `PLANES`.
+        Planes in the order of `plane_sites`.
     pattern : str
         One of `PATTERNS`.
     origin : (int, int)

@@ -144,8 +144,7 @@ def digest(tables: Tables) -> str:
 def _tails() -> Float:
     """Return `Tables.tails`, correctly rounded; the derivatives are Hermite polynomials times the density."""
     rows = []
-    with localcontext() as context:
-        context.prec = DIGITS
+    with localcontext(prec=DIGITS):
         for cell in range(LAST_TAIL_CELL + 1):
             z = (Decimal(cell) + Decimal("0.5")) / TAIL_CELLS
             term, before = -normal_density(z), Decimal(0)  # -φ·He_n / (n + 1)! for n = 0, up to the sign
@@ -162,8 +161,7 @@ def _cdf_polynomials(middle: Float) -> Float:
 
     The derivative of P(K <= k) is -P(K = k); the derivative of P(K = k) is P(K = k - 1) - P(K = k).
     """
-    with localcontext() as context:
-        context.prec = DIGITS
+    with localcontext(prec=DIGITS):
         none = np.array([float((-Decimal(float(rate))).exp()) for rate in middle])
     share = np.zeros((CELLS, MOST))
     share[:, 0] = none
