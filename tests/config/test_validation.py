@@ -328,11 +328,13 @@ SPELLINGS = [
     ("noise.b=30", "noise.b=3e1"),
     ("isp.gamma=2", "isp.gamma=2.0"),
     ("gains.threshold=0", "gains.threshold=0.0"),
+    ("source.dequantize=off", "source.dequantize=false"),
+    ("effects.heteroscedastic=on", "effects.heteroscedastic=true"),
 ]
 
 
 @pytest.mark.parametrize(("one", "other"), SPELLINGS)
-def test_equal_numbers_have_one_spelling(one: str, other: str, settings: Settings) -> None:
+def test_equal_values_have_one_spelling(one: str, other: str, settings: Settings) -> None:
     assert dataset_yaml(settings(one)) == dataset_yaml(settings(other))
 
 

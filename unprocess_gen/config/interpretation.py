@@ -185,12 +185,7 @@ def saturated_as(config: Config) -> str:
 
 def effect_switch(effects: EffectsConfig, effect: str) -> str:
     """Return the switch of an effect."""
-    return str(limits.SWITCH.word(getattr(effects, effect) or effects.all))
-
-
-def dequantize_method(source: SourceConfig) -> str:
-    """Return the method that dequantizes 8-bit codes."""
-    return str(limits.DEQUANTIZE.word(source.dequantize))
+    return str(getattr(effects, effect) or effects.all)
 
 
 def has_float_clean(config: Config) -> bool:

@@ -39,15 +39,7 @@ class Choice(Limit):
 
     def __init__(self, *words: str) -> None:
         self.words = words
-        super().__init__(
-            f"one of {', '.join(words)}",
-            lambda value: self.word(value) in words,
-            lambda value: value_text(self.word(value)),
-        )
-
-    def word(self, value: Any) -> Any:
-        """Return the value as one of the words is spelled."""
-        return value
+        super().__init__(f"one of {', '.join(words)}", lambda value: value in words)
 
 
 YAML_SWITCHES = {"True": "on", "False": "off"}
@@ -55,11 +47,7 @@ YAML_SWITCHES = {"True": "on", "False": "off"}
 
 
 class Switch(Choice):
-    """One of a few words, of which YAML may have read on or off as a boolean."""
-
-    def word(self, value: Any) -> Any:
-        """Return the word that the user wrote."""
-        return YAML_SWITCHES.get(value, value)
+    """One of a few words, of which YAML may have read on or off as a boolean; `schema.Group` restores them."""
 
 
 class Integers(Limit):

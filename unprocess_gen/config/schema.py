@@ -40,13 +40,15 @@ def frozen(value: Any) -> Any:
 
 
 class Group:
-    """Base of the dataclasses of a config, whose lists become tuples."""
+    """Base of the dataclasses of a config, whose lists become tuples, and whose switches have one spelling."""
 
     def __post_init__(self) -> None:
         """Freeze the values of the fields."""
         for name, value in vars(self).items():
             if isinstance(value, list | tuple | dict):
                 object.__setattr__(self, name, frozen(value))
+            elif value in ("True", "False") and isinstance(settings_of(self)[name].limit, limits.Switch):
+                object.__setattr__(self, name, limits.YAML_SWITCHES[value])
 
 
 PATTERN = Choice("RGGB", "BGGR", "GRBG", "GBRG")
@@ -156,7 +158,7 @@ class SourceConfig(Group):
 
     @property
     def place(self) -> str | None:
-        """Folder, or folders, that names of sources are relative to; None for the built-in scenes."""
+        """Folder that names of sources are relative to; None for the built-in scenes."""
         if self.root is not None or self.list is None:
             return self.root
         return str(Path(self.list).parent)

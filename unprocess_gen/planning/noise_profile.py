@@ -16,7 +16,7 @@ from typing import Any
 
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.interpretation import branch_of
-from unprocess_gen.config.limits import EXPOSURE_S, ISO, SCATTER, TEMPERATURE_C
+from unprocess_gen.config.limits import EXPOSURE_S, ISO, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile
@@ -41,7 +41,6 @@ class PhysicalNoise:
         self.iso = parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, ISO)
         self.exposure_s = parse_drawn("exposure_s", scene.exposure_s, EXPOSURE_S)
         self.temperature_c = parse_drawn("temperature_c", scene.temperature_c, TEMPERATURE_C)
-        self.scatter = SCATTER.word(noise.scatter)
         self.scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
 
     def draw(self, uniforms: Sequence[float], stream_key: int, seed: int) -> Physics:
@@ -96,7 +95,7 @@ class PhysicalNoise:
 
     def _scatter(self, body: int) -> Callable[[Number], float]:
         """Return the uniform at which each number of a body is drawn."""
-        if self.scatter == "off":
+        if self.noise.scatter == "off":
             return lambda declared: MIDDLE
         scatter = _scatter_of_body(body)
         return lambda declared: MIDDLE if declared.counter < 0 else scatter[declared.counter]

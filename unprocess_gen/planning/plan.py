@@ -165,7 +165,7 @@ class Planner:
         self._levels = [kind(level, number) for number, level in enumerate(levels)]
         self._accuracy = config.accuracy
         self._scene_name, self._highlight = config.scene.name, (config.gains.highlight, config.gains.threshold)
-        self._source = types.SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
+        self._source = types.SourcePlan(config.source.downscale, config.source.dequantize)
         self._isp = types.IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
         self._splits: dict[str, float] = config.split or {}
         sensor = config.sensor

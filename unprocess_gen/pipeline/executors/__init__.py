@@ -1,1 +1,1 @@
-"""Run the shard tasks of a dataset: with joblib on one machine (`local`)."""
+"""Run the shard tasks of a dataset: with joblib on one machine (`local`), or with Dask (`dask`)."""
