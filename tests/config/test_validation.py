@@ -53,7 +53,7 @@ NEEDS = {
     "camera/custom.yaml": [f"camera.xyz2cam={MATRIX}"],
     "noise/heteroscedastic.yaml": ["noise.a=3.5", "noise.b=12"],
     "body/imx385.yaml": ["noise.iso=3200"],
-    "sensor/source.yaml": ["source.kind=raw", f"source.root={conf_dir()}"],
+    "sensor/source.yaml": ["source.kind=raw", f"source.root={conf_dir()}", "source.include=[x.dng]"],
     "noise/imx385.yaml": ["noise.iso=3200"],  # the ISO of scene=daylight is not calibrated
 }
 SHA256 = "0" * 64
