@@ -146,7 +146,7 @@ def contact_sheet(folder: AnyPath, keys: str = "", source: AnyPath | None = None
     strips = []
     for pair in with_bar(selected_pairs(folder, keys, source), "pair drawn"):
         drawn = _pair_panels(pair, panels.detail_window(pair.clean.shape), panels.STRIP_PX)
-        overviews = [panel._replace(detail=None) for panel in drawn]
+        overviews = [panel._replace(detail=None, note=panel.note.partition(", detail")[0]) for panel in drawn]
         strips.append(panels.lay_out([f"{pair.row['key']}   {pair.row['source']}"], overviews, 6, panels.STRIP_PX))
     return np.vstack(strips)
 
