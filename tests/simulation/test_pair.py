@@ -85,6 +85,13 @@ def test_kernels_equal_the_reference_on_16_bit_sources(plan: Plan, figure: Figur
     figure("kernels", f"{len(SENSORS)} sensors: 0 of {codes[..., 0].size} sites differ on 16-bit codes")
 
 
+@pytest.mark.parametrize("well_dn", [0.25, 50.8])
+def test_sites_that_round_to_the_full_well_are_saturated(plan: Plan, well_dn: float) -> None:
+    codes = np.tile(np.arange(0, 40000, 2, np.uint16)[:, None, None], (1, 8, 3))
+    physics = replace(GOLDEN_PHYSICS, full_well_e=well_dn / GOLDEN_PHYSICS.dn_per_e)
+    assert_same(codes, plan.replace(physics=physics, effects=("shot", "full_well"), saturated="white"))
+
+
 def test_single_pixels_equal_those_of_the_frame(plan: Plan, scene: np.ndarray, full: Pair) -> None:
     for y, x in [(0, 0), (0, 15), (0, 16), (7, 63), (8, 64), (210, 296)]:
         pixel = make_pair(scene[y : y + 1, x : x + 1], plan, origin=(y, x))

@@ -190,6 +190,8 @@ def _headroom(plan: Plan) -> list[float]:
 def _linear_limit(plan: Plan) -> float:
     """Return a signal up to which no site is a highlight, clipped or saturated, with a margin for rounding errors."""
     light = min(plan.brightest * 0.999, plan.brightest - 1 / plan.sensor.span_dn)
+    if light < 0:  # black rounds to the DN of the full well, so all sites count as saturated
+        return -np.inf
     unclipped = min(1.0, light / plan.scene.exposure) / max(_site_gains(plan)) * 0.999
     return min(unclipped, plan.camera.highlight_threshold) if any(_headroom(plan)) else unclipped
 
