@@ -10,7 +10,7 @@ from unprocess_gen.core.errors import MachineError
 if sys.platform != "win32":
     import resource
 
-LEAST_ADDRESS_SPACE = 3 * 2**28
+LEAST_ADDRESS_SPACE = 2**30
 """Bytes of ``ulimit -v`` below which libraries crash instead of raising MemoryError.
 
 Without the check, numpy's OpenBLAS and LLVM end the process with a segmentation fault or a page of tracebacks."""
