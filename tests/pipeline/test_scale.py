@@ -36,7 +36,7 @@ import unprocess_gen as ug
 from unprocess_gen.pipeline.parts import prepare
 root, out, parts, *overrides = sys.argv[1:]
 config = ug.load_config([f"source.root={root}", f"out={out}", "n_jobs=1", "check_disk=false", *overrides])
-assert prepare(config, int(parts)).sources >= 1000
+assert len(prepare(config, int(parts)).sources) >= 1000
 """
 
 PART = """
