@@ -247,7 +247,7 @@ def test_unreadable_sweep_csv_ends_in_one_line(
 
 
 def test_names_omit_keys_that_do_not_decide_data() -> None:
-    overrides = ["seed=1", "executor=dask", "executor.address=x", "append=true", "+experiment=e", "output.dtype=uint16"]
+    overrides = ["seed=1", "executor=dask", "executor.address=x", "+experiment=e", "output.dtype=uint16"]
     overrides += ["n_jobs=1", "out=sweep", "source.root=p", "check_disk=false", "self_test=go_on"]
     assert named_overrides(overrides) == ["+experiment=e", "output.dtype=uint16", "seed=1"]
 
