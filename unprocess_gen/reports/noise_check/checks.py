@@ -56,6 +56,7 @@ CHECKS = {
     "neighbours": Check("correlation of neighbours of a plane", "%", _SHARP, _SMOOTH),
     "repetition": Check("correlation with the pair before", "%", *2 * ("noise of another pair is repeated",)),
     "odd codes": Check("surplus of odd codes", "%", *2 * ("codes are missing",)),
+    "hot pixels": Check("share of the body's hot pixels", "%", "missing hot pixels", "unknown defects"),
     "outliers": Check("share of outliers", "per million", "missing defects or weaker tails", "unknown defects"),
 }
 """Checks by name; failed ones are listed in this order."""

@@ -16,6 +16,7 @@ from unprocess_gen.core.types import DarkPixels, Float, Frame, Patch, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.simulation.effects import order
+from unprocess_gen.simulation.effects.hot_pixels import HotPixels
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 from unprocess_gen.statistics.mosaics import TILE
 
@@ -46,6 +47,8 @@ class Noise(NamedTuple):
         Noise over std, without the median of each plane, limited to ±`LARGEST_Z`.
     is_far : ndarray of bool, [2, H, W]
         Sites beyond `FAR_Z`.
+    is_hot : ndarray of bool, [H, W]
+        Hot pixels of the camera body whose mean is far beyond that.
     """
 
     plan: Plan
@@ -54,6 +57,7 @@ class Noise(NamedTuple):
     weight: Single
     z: Single
     is_far: NDArray[np.bool_]
+    is_hot: NDArray[np.bool_]
 
     @property
     def rounding_dn2(self) -> float:
@@ -75,7 +79,16 @@ def measure_noise(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels 
         noise_dn[:, y::2, x::2] -= np.median(of_repetition) if of_repetition.size else 0.0
     z = (noise_dn * weight).astype(np.float32)
     limited = np.clip(z, -LARGEST_Z, LARGEST_Z)
-    return Noise(plan, clean_dn, noisy_dn, weight.astype(np.float32), limited, np.abs(z) > FAR_Z)
+    is_hot = _hot_sites(plan, patch, weight)
+    return Noise(plan, clean_dn, noisy_dn, weight.astype(np.float32), limited, np.abs(z) > FAR_Z, is_hot)
+
+
+def _hot_sites(plan: Plan, patch: Patch, weight: Float) -> NDArray[np.bool_]:
+    """Sites whose mean excess is three times as far as outliers, so that each frame shows it."""
+    if "hot_pixels" not in plan.noise.effects:
+        return np.zeros(weight.shape, np.bool_)
+    mean_e = HotPixels().mean_electrons(order.crop_of(plan, weight.shape, patch.origin))
+    return np.asarray(mean_e * plan.physics.dn_per_e * weight > 3 * FAR_Z)
 
 
 def _usable_std(clean_dn: Float, plan: Plan) -> Float:

@@ -21,6 +21,9 @@ SHARED_ROUNDING = 0.15
 LARGEST_DETAIL = 8.0
 """Bound of the detail of the clean frame, in standard deviations of the noise."""
 
+MISSED_BY_CHANCE = 1e-4
+"""Largest probability that the noise hides a hot pixel of `Noise.is_hot`."""
+
 Scores = dict[tuple[str, str], Score]
 """Scores by the names of check and plane; the plane is empty if all planes are summed."""
 
@@ -51,6 +54,9 @@ def scores_of(noise: Noise, before: Residual | None = None) -> tuple[Scores, Res
     bound = noise.rounding_dn2 * float((noise.weight**2).sum(dtype=np.float64))
     scores["order of sites", ""] = _score(_by_row(here.z * detail), float((detail**2).sum()), bound)
     scores["outliers", ""] = _score(_by_row(noise.is_far & used), sites * 1e-6)
+    seen = noise.is_far & (noise.is_hot & noise.is_far[1])  # dead and clipped pixels are not in the repetition
+    if hot := int(seen[1].sum()):
+        scores["hot pixels", ""] = Score(float(seen[0].sum()) - hot, hot, hot * MISSED_BY_CHANCE, step=1.0)
     if not noise.plan.output.normalised:
         signs = (2 * (noise.noisy_dn.astype(np.int64) & 1) - 1) * used
         scores["odd codes", ""] = _score(_by_row(signs), sites)
