@@ -1,4 +1,4 @@
-"""Two small datasets have the bytes that format 1 began with."""
+"""Small datasets have the bytes that format 1 began with."""
 
 from __future__ import annotations
 
@@ -15,14 +15,24 @@ RECORDED = Path(__file__).parent / "format_1.json"
 """SHA-256 of the files of each dataset, by `digests`. A change of bytes records them again, and gives the reason."""
 
 SETTINGS = {
-    "two_numbers": ["source.limit=2", "output.pairs_per_shard=1", "source.patch=[random,64,2]", "noise.draws=2"],
-    "physical": ["source.limit=2", "source.patch=[random,64,1]", "body=sony_a7s2", "scene=night", "sensor.units=2"],
+    "two_numbers": ["output.pairs_per_shard=1", "source.patch=[random,64,2]", "noise.draws=2"],
+    "physical": ["source.patch=[random,64,1]", "body=sony_a7s2", "scene=night", "sensor.units=2"],
+    "levels": ["noise=brooks2019", "noise.levels=3", "camera=choice", "split={train: 0.5, val: 0.5}"],
+    "float": ["output.clean_dtype=float32", "output.targets=[linear_rgb]", "isp=srgb", "gains=by_light"],
+    "all_on": ["body=nikon_d850", "effects.all=on", "clean.includes_fixed_pattern=true"],
+    "planned": [
+        "output.frames=false",
+        "body=canon_70d",
+        "noise.iso=[log_uniform,800,3200]",
+        "source.patch=[grid,64,64]",
+    ],
+    "mono": ["sensor=generic_16bit", "sensor.pattern=MONO", "noise=imx385_iso3200_rvdd"],
 }
 
 
 def digests(name: str, folder: Path) -> dict[str, str]:
     """Make a dataset, and return the SHA-256 of each file except ``dataset.json``."""
-    ug.generate(ug.load_config([*SETTINGS[name], "seed=7", f"out={folder}", "n_jobs=1"]))
+    ug.generate(ug.load_config([*SETTINGS[name], "source.limit=2", "seed=7", f"out={folder}", "n_jobs=1"]))
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "dataset.json")
     return {path.relative_to(folder).as_posix(): file_sha256(path) for path in files}
 
