@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.exact_distributions import tukey_quantile
-from unprocess_gen.core.lookup_tables import normal_table, tukey_table
-from unprocess_gen.core.tone_curves import linear_table
+from unprocess_gen.simulation.lookup_tables import normal_table, tukey_table
 from unprocess_gen.simulation.reference import colour, isp
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.unprocess import apply_ccm, inverse_smoothstep, invert_gains_per_channel
+from unprocess_gen.simulation.tone_curves import linear_table
 from unprocess_gen.sources.dark_frames import trimmed_moments
 from unprocess_gen.sources.loader import downscaled
 

@@ -38,10 +38,10 @@ from unprocess_gen.config.serialization import (
 )
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import parse_yaml_mapping
-from unprocess_gen.core import tone_curves
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import FLOAT32, MOSAIC, PACKED, UINT16, Facts
 from unprocess_gen.planning.plan import plan_image, plan_pairs
+from unprocess_gen.simulation import tone_curves
 from unprocess_gen.simulation.reference import cfa, unprocess
 from unprocess_gen.sources.image.decode import ICC_CHOICES
 

@@ -22,10 +22,10 @@ from helpers.photographs import fill
 from helpers.processes import ONE
 
 from unprocess_gen.cli.messages import logging_to_stderr
+from unprocess_gen.cli.process_limits import LEAST_ADDRESS_SPACE
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import machine_error
-from unprocess_gen.core.limits import LEAST_ADDRESS_SPACE
 from unprocess_gen.core.paths import LocalPath
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import progress as progress_module

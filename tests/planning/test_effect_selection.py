@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, Plan, Srgb
 from unprocess_gen.planning.effect_selection import Prediction, Selection, effect_rules, facts_of, omit_weakest
 from unprocess_gen.planning.frame_model import FrameModel, SignalRange, signal_range
@@ -36,6 +35,7 @@ from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.sensor import to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
+from unprocess_gen.simulation.tone_curves import linear_table
 from unprocess_gen.sources.scenes import synthetic
 
 RARE = {

@@ -22,7 +22,7 @@ UNORDERED_SUMS = {
 ALLOWED_IN_OPENCV = {"imdecode", "error", "getNumThreads", "setNumThreads", "utils"}
 
 OUTSIDE_OUTPUT = {
-    *("core/exact_distributions.py", "core/lookup_tables.py", "core/tone_curves.py"),
+    *("core/exact_distributions.py", "simulation/lookup_tables.py", "simulation/tone_curves.py"),
     *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
     "config/noise_validation.py",  # a logarithm decides only whether a config is refused
     *("dataset/dng.py", "reports", "calibration", "statistics", "torch.py", "camera_noise.py"),

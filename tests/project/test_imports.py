@@ -26,7 +26,7 @@ ONLY_IN = {
     },
     "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},
-    "numba": {"core.jit", "simulation.kernels.simd"},
+    "numba": {"simulation.kernels.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
         *("reports.encoding", "reports.explorer.views", "reports.sheets.panels", "camera_noise"),

@@ -13,7 +13,7 @@ import pytest
 from helpers.commands import run_process
 
 ROOT = Path(__file__).parents[2]
-CURVES = "unprocess_gen/core/data/curves_16bit.npz"
+CURVES = "unprocess_gen/simulation/data/curves_16bit.npz"
 PROJECT_FILES = (
     *("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "uv.lock", ".pre-commit-config.yaml"),
     *(".github/workflows/tests.yml", ".readme/denoiser.jpg", "docs/conf.py"),

@@ -27,9 +27,9 @@ from helpers.flats import (
 )
 from helpers.moments import REACH, bernstein
 
-from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.simulation.effects import EFFECTS, order
 from unprocess_gen.simulation.effects.effect import Effect
+from unprocess_gen.simulation.lookup_tables import exponential_levels
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.slots import Patterns, Slots
 

@@ -12,9 +12,9 @@ from helpers.configs import composed
 from helpers.photographs import pixels
 
 import unprocess_gen as ug
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.unprocess import camera_light
+from unprocess_gen.simulation.tone_curves import linear_table
 
 SRGB = pixels(3, 33, 70)
 NOISES = (("noise=imx385_iso3200",), ("noise=sony_a7s2", "scene=night"), ("noise=canon_70d", "effects.all=on"))

@@ -17,7 +17,9 @@ from helpers.published import CRVD
 from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.core.lookup_tables import (
+from unprocess_gen.planning.effect_selection import facts_of
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.lookup_tables import (
     OCTAVES,
     SEGMENTS,
     draw_variance,
@@ -25,8 +27,6 @@ from unprocess_gen.core.lookup_tables import (
     tukey_table,
     unit_tukey_table,
 )
-from unprocess_gen.planning.effect_selection import facts_of
-from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.reference import noise as effects
 
 SHAPES = (0.0, 1e-13, 0.015, 0.1571, 1.0, -0.1, -0.2429)

@@ -17,10 +17,10 @@ from helpers.promise_report import Figure
 
 from unprocess_gen.config.schema import NoiseConfig
 from unprocess_gen.config.settings import settings_of
-from unprocess_gen.core import lookup_tables, tone_curves
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.simulation import lookup_tables, tone_curves
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.effects import NUMBERS
 from unprocess_gen.simulation.kernels import clean, gaussian, normal, philox, readout, render, strips

@@ -16,13 +16,13 @@ from PIL import Image
 
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference.unprocess import dequantise
+from unprocess_gen.simulation.tone_curves import linear_table
 from unprocess_gen.sources.loader import downscaled, list_photographs, load_source
 
 

@@ -20,11 +20,11 @@ from unprocess_gen.cli.arguments import Verb, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
 from unprocess_gen.cli.help import global_help, group_help, key_help, verb_help
 from unprocess_gen.cli.messages import checked_streams, logging_to_stderr, report, report_error
+from unprocess_gen.cli.process_limits import prepare_libraries
 from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.core.errors import RESUME, ConfigError, UnprocessGenError
-from unprocess_gen.core.limits import prepare_libraries
 from unprocess_gen.core.suggestions import did_you_mean
 
 OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from operator import add, mul
 from typing import NamedTuple
 
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, SourcePlan
 from unprocess_gen.simulation.effects import BY_NAME, EFFECTS, Physics
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, PerStatistic
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
+from unprocess_gen.simulation.tone_curves import linear_table
 
 MASKING = tuple(effect for effect in EFFECTS if effect.masks)
 """Random effects of single pixels, which mask others."""

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.simulation.reference.cfa import filters
 from unprocess_gen.simulation.reference.unprocess import camera_light
+from unprocess_gen.simulation.tone_curves import linear_table
 
 TILE_SIDE = 32
 """Side of a tile, pixels; its green plane has half of it."""

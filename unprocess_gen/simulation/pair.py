@@ -16,7 +16,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import (
     EXACT,
     FLOAT32,
@@ -38,6 +37,7 @@ from unprocess_gen.simulation.kernels.render import CODES, CropRenderer, pass_ke
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
 from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
+from unprocess_gen.simulation.tone_curves import linear_table
 
 
 def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None) -> Pair:

@@ -23,14 +23,14 @@ import numpy as np
 from unprocess_gen.core import types
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.jit import has_run, kernel, note_run
-from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import philox4x32
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS, Physics
+from unprocess_gen.simulation.kernels.jit import has_run, kernel, note_run
 from unprocess_gen.simulation.kernels.render import uses_scene32
+from unprocess_gen.simulation.lookup_tables import normal_table
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.tone_curves import linear_table
 
 KNOWN_ANSWERS = (
     # Random123's kat_vectors, philox4x32-10: counter, key, output.

@@ -13,8 +13,8 @@ import pytest
 from helpers.kernels import coarse_normals, exact_values, exact_values_by_vectors, values_by_lines
 from helpers.promise_report import Figure
 
-from unprocess_gen.core.lookup_tables import LINES_PER_OCTAVE, normal_table, tukey_table
 from unprocess_gen.simulation.kernels.normal import COARSE_ERROR, build_quantiles, normal_quantiles
+from unprocess_gen.simulation.lookup_tables import LINES_PER_OCTAVE, normal_table, tukey_table
 from unprocess_gen.simulation.reference import noise as effects
 
 SIGN = 2**31

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from unprocess_gen.core.jit import inner, kernel
 from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels.jit import inner, kernel
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, load_columns, pointer_to, pointers_of, store
 
 SINGLES = np.array([-np.inf, -1.5, -0.0, 0.0, 1e-40, 2.5, 7.25, np.inf], dtype=np.float32)

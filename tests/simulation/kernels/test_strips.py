@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.random_streams import BLOCK
+from unprocess_gen.simulation.kernels.jit import kernel
 from unprocess_gen.simulation.kernels.strips import (
     CACHE_LINE,
     SIZE,

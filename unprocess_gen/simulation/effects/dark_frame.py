@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
+from unprocess_gen.simulation.lookup_tables import quantile_table
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 

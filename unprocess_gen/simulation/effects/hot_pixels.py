@@ -8,11 +8,11 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
-from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.numbers import EffectNumbers, number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
+from unprocess_gen.simulation.lookup_tables import exponential_levels
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import BrightPixels

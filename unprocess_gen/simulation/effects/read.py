@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.numbers import SHAPE, EffectNumbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import FrameFacts
+from unprocess_gen.simulation.lookup_tables import quantile_table
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 

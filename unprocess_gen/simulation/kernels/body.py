@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import kernel
-from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.random_streams import BLOCK, purpose
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.effects.lens_shading import illumination
 from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels.jit import kernel
 from unprocess_gen.simulation.kernels.normal import exact_values, fill_rows, normal_quantiles
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, philox_key
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH
@@ -29,6 +28,7 @@ from unprocess_gen.simulation.kernels.strips import (
     padded_width,
     scratch_of_thread,
 )
+from unprocess_gen.simulation.lookup_tables import exponential_levels
 from unprocess_gen.simulation.slots import BrightPixels, DeadSlot, NormalPattern, Patterns, RadialFactor
 
 SMALL_SITES, SMALL_PATTERNS, LARGE_PATTERNS, LIVE_PATTERNS = 2**16, 384, 5, 8

@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import by_class, inner
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.kernels import simd, strips
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE
+from unprocess_gen.simulation.kernels.jit import by_class, inner
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 from unprocess_gen.simulation.kernels.strips import Buffers, SiteMap, Strip, count_outside, strip_values
 from unprocess_gen.simulation.reference.cfa import tile
+from unprocess_gen.simulation.tone_curves import linear_table
 
 _0, _8 = np.uint64(0), np.uint64(8)
 _ROW_SITES = VECTOR_WIDTH + 2

@@ -37,10 +37,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.body import Body
+from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, first_word
 from unprocess_gen.simulation.kernels.poisson import (
     FLOAT32_RATE,

@@ -25,11 +25,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner
-from unprocess_gen.core.lookup_tables import FIRST_LINE, LINE_SHIFT, SEGMENTS, normal_table, quantile_lines
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
+from unprocess_gen.simulation.lookup_tables import FIRST_LINE, LINE_SHIFT, SEGMENTS, normal_table, quantile_lines
 
 # --------------------------------------------------------------------------------------------------------------- tables
 

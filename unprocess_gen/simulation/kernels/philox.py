@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner
 from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, LOW, MULTIPLIERS, ROUNDS
 from unprocess_gen.core.types import Plan
+from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.simd import Pointer
 from unprocess_gen.simulation.kernels.strips import Strip
 

@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels import normal, simd
+from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.rounding import ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 from unprocess_gen.simulation.kernels.strips import Buffers

@@ -32,12 +32,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.types import PACKED, Float, Plan
 from unprocess_gen.simulation.kernels import electrons, gaussian, simd, strips
 from unprocess_gen.simulation.kernels.clean import FLOAT32_MARGIN
 from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32
+from unprocess_gen.simulation.kernels.jit import by_class, inner
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer_to
 from unprocess_gen.simulation.kernels.strips import Buffers, Strip, count_outside, list_lanes

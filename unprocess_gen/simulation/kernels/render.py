@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.core.types import FAST, PACKED, Counts, DarkFramePlan, DarkPixels, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE, body_of, light_factor
@@ -31,6 +30,7 @@ from unprocess_gen.simulation.kernels.clean import (
 from unprocess_gen.simulation.kernels.electron_records import electron_noise
 from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
+from unprocess_gen.simulation.kernels.jit import kernel
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
     Output,

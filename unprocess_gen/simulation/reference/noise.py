@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from unprocess_gen.core.lookup_tables import SEGMENTS, normal_table
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
+from unprocess_gen.simulation.lookup_tables import SEGMENTS, normal_table
 
 
 def by_inverse_cdf(uniforms: Words, table: Float) -> Float:

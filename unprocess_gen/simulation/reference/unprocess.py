@@ -4,7 +4,7 @@ This is the reference (NumPy, float64, one function per step, in the article's o
 kernels compute the same DN, much faster (``docs/performance.md``).
 
 The formulas of the tone curves use libm, whose last bit differs between machines. Datasets never depend on it: kernels,
-and ``accuracy=reference``, read exact tables (`core.tone_curves`). With 8-bit sources and all five sensors, table
+and ``accuracy=reference``, read exact tables (`simulation.tone_curves`). With 8-bit sources and all five sensors, table
 values are at least 6.7e-4 DN from a rounding boundary.
 """
 

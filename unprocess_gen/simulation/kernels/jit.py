@@ -143,7 +143,7 @@ def kernel_cache_folder() -> Path | None:
     The folder is in ``NUMBA_CACHE_DIR`` if this variable is set, else in the package's ``__pycache__``, else in
     ``$XDG_CACHE_HOME/unprocess_gen`` (``~/.cache/unprocess_gen`` by default).
     """
-    package = Path(__file__).parents[1]
+    package = Path(__file__).parents[2]
     try:
         name = PREFIX + source_digest(package)
     except OSError:  # the sources are not readable, for example in a frozen application

@@ -17,9 +17,10 @@ import pytest
 import yaml
 from helpers.promise_report import Figure
 
-from unprocess_gen.core import exact_distributions, lookup_tables, tone_curves, types
+from unprocess_gen.core import exact_distributions, types
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.tone_curves import PUBLISHED_SHA256
+from unprocess_gen.simulation import lookup_tables, tone_curves
+from unprocess_gen.simulation.tone_curves import PUBLISHED_SHA256
 
 ROOT = Path(__file__).parents[2]
 

@@ -5,7 +5,7 @@ between machines. Each entry is correctly rounded. A curve of 256 codes takes 30
 or more, so the curves of the options in ``conf/isp`` are package data. For another ``isp.gamma``, each process that
 decodes 16-bit sources computes the curve once. The SHA-256 of the package data and of the default curves is checked.
 
-``python -m unprocess_gen.core.tone_curves`` regenerates the package data (30 s).
+``python -m unprocess_gen.simulation.tone_curves`` regenerates the package data (30 s).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.exact_distributions import DIGITS
-from unprocess_gen.core.lookup_tables import freeze
 from unprocess_gen.core.types import Float, gamma_text
+from unprocess_gen.simulation.lookup_tables import freeze
 
 PUBLISHED_SHA256 = {
     ("smoothstep", "2.2", 256): "d358dd03d38f763306ef83a982403114f2ff8e5397025f2c68dbe50e85503bfa",

@@ -15,22 +15,22 @@ from typing import Any, NamedTuple, cast
 import numba
 import pytest
 
-from unprocess_gen.core import jit
-from unprocess_gen.core.jit import KERNEL_PACKAGES, by_class, has_run, inner, kernel, note_run
+from unprocess_gen.simulation.kernels import jit
+from unprocess_gen.simulation.kernels.jit import KERNEL_PACKAGES, by_class, has_run, inner, kernel, note_run
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "unprocess_gen"
 
 
 LIBRARY = """
-from unprocess_gen.core.jit import inner
+from unprocess_gen.simulation.kernels.jit import inner
 
 @inner
 def half(x):
     return x / 2
 """
 CALLER = """
-from unprocess_gen.core.jit import kernel
+from unprocess_gen.simulation.kernels.jit import kernel
 from unprocess_gen.simulation.library import half
 
 @kernel
@@ -39,7 +39,7 @@ def quarter(x):
 """
 CALL = """
 import sys
-from unprocess_gen.core.jit import has_run, note_run
+from unprocess_gen.simulation.kernels.jit import has_run, note_run
 from unprocess_gen.simulation.caller import quarter
 print(has_run("quarter"), quarter(8.0), len(quarter.stats.cache_hits))
 note_run("quarter")
@@ -74,8 +74,9 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Copy:
     """Return a package whose kernels were compiled by another process."""
     made = Copy(tmp_path_factory.mktemp("compiled"))
     shutil.copytree(PACKAGE / "core", made.package / "core", ignore=shutil.ignore_patterns("__pycache__"))
-    made.write("__init__.py", "")
-    made.write("simulation/__init__.py", "")
+    for name in ("__init__.py", "simulation/__init__.py", "simulation/kernels/__init__.py"):
+        made.write(name, "")
+    made.write("simulation/kernels/jit.py", (PACKAGE / "simulation/kernels/jit.py").read_text())
     made.write("simulation/library.py", LIBRARY)
     made.write("simulation/caller.py", CALLER)
     made.write("cli/main.py", "x = 1")
@@ -110,7 +111,7 @@ def test_editing_a_called_kernel_recompiles_its_callers(copy: Copy) -> None:
 
 def test_changing_any_kernel_package_changes_the_folder(copy: Copy) -> None:
     folders = [jit.source_digest(copy.package)]
-    for name in ("core/random_streams.py", "core/jit.py", "simulation/new.py"):
+    for name in ("core/random_streams.py", "simulation/kernels/jit.py", "simulation/new.py"):
         path = copy.package / name
         copy.write(name, (path.read_text() if path.exists() else "") + "\n# changed\n")
         folders.append(jit.source_digest(copy.package))
@@ -120,7 +121,7 @@ def test_changing_any_kernel_package_changes_the_folder(copy: Copy) -> None:
 
 
 def test_a_read_only_package_caches_below_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jit, "__file__", str(tmp_path / "package" / "core" / "jit.py"))
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "package" / "simulation" / "kernels" / "jit.py"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     for name in KERNEL_PACKAGES:
