@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from unprocess_gen import RawPairs
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 SCENE = "highlights-0"
 CROP = (slice(260, 308), slice(130, 202))  # rows and columns; even starts keep the CFA pattern
@@ -52,7 +52,7 @@ def main() -> None:
         subprocess.run(["gen-dataset", f"out={folder}/ds", "noise=imx385_iso12800", "camera=sony_a7r"], check=True)
         sample = next(sample for sample in RawPairs(f"{folder}/ds") if sample.row["source"] == SCENE)
         frames = [np.array(frame) for frame in (sample.clean, sample.noisy)]
-    source = synthetic.scene(SCENE) / 255
+    source = synthetic.picture(SCENE) / 255
     top = [source, *(developed(frame, sample.row) for frame in frames)]
     bottom = [source[CROP], *(sites(frame, sample.row)[CROP] for frame in frames)]
     picture = np.vstack(

@@ -18,7 +18,7 @@ import unprocess_gen as ug
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Float
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.sources.scenes.synthetic import scene
+from unprocess_gen.sources import synthetic
 
 FOLDER = Path(__file__).parent / "reference" / "effects"
 SIDE, GAP, JPEG_QUALITY = 128, 8, 75
@@ -37,7 +37,7 @@ def config_of(picture: Picture, switches: dict[str, str | None], *overrides: str
 
 def frames_dn(config: Config) -> tuple[Float, Float]:
     """Return the clean and the noisy frame of a part of a built-in scene."""
-    pair = ug.make_pair(np.ascontiguousarray(scene("dead_leaves-0")[:SIDE, :SIDE]), config)
+    pair = ug.make_pair(np.ascontiguousarray(synthetic.picture("dead_leaves-0")[:SIDE, :SIDE]), config)
     clean, noisy = (mosaic_dn(frame, pair.row).astype(np.float64) for frame in (pair.clean, pair.noisy))
     return clean, noisy
 

@@ -40,7 +40,7 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.pipeline import generate as runner
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 _BUCKETS = itertools.count()
 
@@ -87,14 +87,14 @@ def _no_sync() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _scenes_drawn_once() -> Iterator[None]:
-    """Draw each built-in scene once in this process: a scene takes up to 0.5 s, and half of the datasets use one.
+def _pictures_drawn_once() -> Iterator[None]:
+    """Draw each synthetic picture once in this process: it takes up to 0.5 s, and half of the datasets use one.
 
-    Tests of the scenes import the function itself, before this fixture replaces it.
+    Tests of the pictures import the function itself, before this fixture replaces it.
     """
-    drawn = functools.cache(synthetic.scene)
+    drawn = functools.cache(synthetic.picture)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "scene", lambda name: drawn(name).copy())
+        patch.setattr(synthetic, "picture", lambda name: drawn(name).copy())
         yield
 
 

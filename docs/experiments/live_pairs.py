@@ -26,7 +26,7 @@ from live_pairs_numpy import NumpyPairs, brooks_colours
 import unprocess_gen as ug
 from unprocess_gen.reports.timing import measure_in_turns
 from unprocess_gen.simulation.reference.colour import CAMERAS, RGB2XYZ
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 SIDE, PATCHES, BATCH, REPEATS = 128, 16, 16, 6
 TWO, FAST = ("noise=imx385_iso3200",), ("noise=imx385_iso3200", "accuracy=fast")
@@ -50,8 +50,8 @@ def median_ratio(times: Sequence[float], reference: Sequence[float]) -> float:
 def write_scenes(folder: Path, count: int = 16) -> None:
     """Write JPEG files of 2048 x 2304 pixels, each of twelve built-in scenes."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = [name for name in synthetic.SCENES if name not in synthetic.SCENE_SIZES][:count]
-    scenes = [synthetic.scene(name) for name in names]
+    names = [name for name in synthetic.NAMES if name not in synthetic.SIZES][:count]
+    scenes = [synthetic.picture(name) for name in names]
     for number in range(count):
         parts = [scenes[(number + n) % len(scenes)] for n in range(12)]
         picture = np.vstack([np.hstack(parts[n : n + 3]) for n in range(0, 12, 3)])

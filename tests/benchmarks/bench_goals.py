@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_goals.py [PHOTO_OR_FOLDER ...] [--rounds 5]
 
-Without photographs, the image is a frame of 2.4 megapixels made of synthetic scenes. In each round the benchmark
+Without photographs, the image is a frame of 2.4 megapixels made of synthetic pictures. In each round the benchmark
 measures both sides of a ratio directly after each other: the shortest processor time of several calls. The Markdown
 table shows the median ratio over rounds and images, the lowest and the highest one, and nanoseconds per site of both
 sides. Planning is compared with a pair of 128 x 128 pixels. The yardstick is Algorithm 1 in float64 NumPy
@@ -36,8 +36,8 @@ from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.pair import make_pair, make_pairs
+from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.decode import decode
-from unprocess_gen.sources.scenes import synthetic
 
 TWO_NUMBERS = "noise=imx385_iso3200"
 PROFILES = ("sony_a7s2", "nikon_d850")
@@ -206,14 +206,14 @@ def table(images: Sequence[Bench], rounds: int, least_ns: int = LEAST_NS) -> str
 
 
 def synthetic_frame() -> Srgb:
-    """A frame of 1024 x 2304 pixels: six synthetic scenes of all kinds."""
-    names = [name for name in synthetic.SCENES if name not in synthetic.SCENE_SIZES][:6]
-    scenes = [synthetic.scene(name) for name in names]
+    """A frame of 1024 x 2304 pixels: six synthetic pictures of all kinds."""
+    names = [name for name in synthetic.NAMES if name not in synthetic.SIZES][:6]
+    scenes = [synthetic.picture(name) for name in names]
     return np.concatenate([np.concatenate(scenes[first : first + 3], axis=1) for first in (0, 3)])
 
 
 def main() -> None:
-    """Measure synthetic scenes, or every photograph given on the command line."""
+    """Measure synthetic pictures, or every photograph given on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", nargs="*", type=Path)
     parser.add_argument("--rounds", type=int, default=5)

@@ -14,7 +14,7 @@ import unprocess_gen as ug
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "experiments"))
 from live_pairs_numpy import NumpyPairs
 
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 SIDE, EPOCHS = 96, 60
 SETTINGS = {
@@ -30,7 +30,7 @@ def test_moments_are_those_of_live_pairs(name: str, make: Make, tmp_path: Path) 
     make(None, tmp_path / "ds", *SETTINGS[name], "source.limit=1")
     live = ug.LivePairs(tmp_path / "ds", patch=SIDE)
     row = ug.RawPairs(tmp_path / "ds")[0].row
-    srgb = synthetic.scene(str(row["source"]))
+    srgb = synthetic.picture(str(row["source"]))
     plain = NumpyPairs([row], lambda _: srgb, SIDE)
     camera, sums = plain.images[0], np.zeros((2, 5))
     for epoch in range(EPOCHS):

@@ -19,8 +19,8 @@ from unprocess_gen import RawPairs
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.types import Srgb
+from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.loader import downscaled
-from unprocess_gen.sources.scenes import synthetic
 
 RECIPE = "experiment"
 RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml") if not path.stem.startswith("raw_"))
@@ -120,7 +120,7 @@ def brooks(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_clean_planes_match_the_formulas_of_brooks(brooks: Path, figure: Figure) -> None:
     """Within float32 rounding: half a unit in the last place of 1, ten times that for the constants of the script."""
-    scenes = {row["source"]: downscaled(synthetic.scene(row["source"]), 2) for *_, row in RawPairs(brooks)}
+    scenes = {row["source"]: downscaled(synthetic.picture(row["source"]), 2) for *_, row in RawPairs(brooks)}
     errors = []
     for clean, _, row in RawPairs(brooks):
         y, x = row["patch_y"], row["patch_x"]

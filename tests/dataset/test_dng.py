@@ -31,7 +31,7 @@ from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.simulation.reference.colour import CAMERAS
 from unprocess_gen.simulation.reference.isp import apply_gains
 from unprocess_gen.simulation.reference.unprocess import camera_light, linear_light
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 Tags = dict[str, Any]
 D65_XY = (0.3127, 0.3290)
@@ -225,7 +225,7 @@ SENSORS = ("imx385_12bit", "generic_14bit", "generic_16bit")
 @pytest.fixture(scope="module")
 def scenes() -> list[np.ndarray]:
     """Return two built-in scenes at a third of their sides."""
-    return [synthetic.scene(name)[::3, ::3] for name in ("colour_chart-0", "dead_leaves-0")]
+    return [synthetic.picture(name)[::3, ::3] for name in ("colour_chart-0", "dead_leaves-0")]
 
 
 @pytest.mark.parametrize("sensor", SENSORS[:1])

@@ -28,7 +28,7 @@ from unprocess_gen.simulation.effects.hot_pixels import HotPixels
 from unprocess_gen.simulation.effects.prnu import Prnu
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.colour import IDENTITY
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 SHA256 = "7" * 64
 
@@ -48,7 +48,7 @@ FORCED = (
 @functools.lru_cache(maxsize=1)
 def picture() -> Srgb:
     """Return a crop of odd size with clipped highlights, deep shadows and saturated colours."""
-    return np.ascontiguousarray(synthetic.scene("highlights-0")[150:183, 300:361])
+    return np.ascontiguousarray(synthetic.picture("highlights-0")[150:183, 300:361])
 
 
 def planned(settings: Settings, srgb: Srgb, *overrides: str, forced: bool = False) -> Plan:

@@ -19,7 +19,7 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.random_streams import CLIP_FRAMES, EPOCHS, frame_word
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.self_test import _PHYSICAL, GOLDEN_PLAN
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 LEVELS = (
     "noise=sony_a7s2",
@@ -145,7 +145,7 @@ def test_light_and_targets(night: Path) -> None:
     np.testing.assert_allclose(stored.targets["variance"], law, rtol=1e-6)
     np.testing.assert_allclose(sample.targets["variance"], law / span**2, rtol=1e-5)
     y, x = row["patch_y"], row["patch_x"]
-    photograph = synthetic.scene(str(row["source"]))[y : y + 64, x : x + 64]
+    photograph = synthetic.picture(str(row["source"]))[y : y + 64, x : x + 64]
     np.testing.assert_array_equal(sample.targets["srgb"], photograph)
     arrays = ug.LivePairs(night, targets=names, arrays_only=True)[1, 2]
     assert [array.shape for array in arrays] == [(64, 64)] * 4 + [(64, 64, 3)]

@@ -36,7 +36,7 @@ from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.sensor import to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
 from unprocess_gen.simulation.tone_curves import linear_table
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 RARE = {
     "lens_shading": "lens_shading", "gain_by_colour": "gain_by_colour", "column_temporal": "column_temporal_std_dn",
@@ -69,7 +69,7 @@ def independent(statistic: str, count: int, srgb: Srgb) -> int:
 
 @functools.cache
 def cut(name: str, height: int, width: int) -> Srgb:
-    return np.ascontiguousarray(synthetic.scene(name)[100 : 100 + height, 200 : 200 + width])
+    return np.ascontiguousarray(synthetic.picture(name)[100 : 100 + height, 200 : 200 + width])
 
 
 def flat(*colour: int, height: int = 40, width: int = 56) -> Srgb:

@@ -37,7 +37,7 @@ from unprocess_gen.reports.noise_check.checks import (
     failed_checks,
 )
 from unprocess_gen.reports.noise_check.scores import Scores, scores_of
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 from unprocess_gen.statistics.scores import FALSE_ALARM, Score, alarm_limit
 
 NIGHT_A7S2 = ("noise=sony_a7s2", "scene=night", "effects.row=on")
@@ -105,7 +105,7 @@ def checked(
 ) -> list[Checked]:
     """Plan and scores of a pair for each fault; ``numbers``: physical numbers of the row."""
     draws = np.random.default_rng(number)
-    picture = synthetic.scene(synthetic.SCENES[number % len(synthetic.SCENES)])
+    picture = synthetic.picture(synthetic.NAMES[number % len(synthetic.NAMES)])
     height, width = (min(side, length) // 2 * 2 for length in picture.shape[:2])
     y, x = (int(draws.integers(0, n - m + 1)) // 2 * 2 for n, m in zip(picture.shape, (height, width), strict=False))
     srgb = KINDS[kind](np.ascontiguousarray(picture[y : y + height, x : x + width]))
@@ -331,7 +331,7 @@ def repetitions(pairs: Iterable[Any], **numbers: int) -> list[Alarm]:
 
 def test_repeated_draws_and_noise_are_found(settings: Settings) -> None:
     """Draws of a scene are equal byte by byte; frames of different scenes have the same deviates."""
-    scenes = [np.ascontiguousarray(synthetic.scene(name)[:64, :64]) for name in synthetic.SCENES[:3]]
+    scenes = [np.ascontiguousarray(synthetic.picture(name)[:64, :64]) for name in synthetic.NAMES[:3]]
     pairs = [make_pair(srgb, settings()) for srgb in scenes]
     assert repetitions([(pairs[0].clean, pairs[0].noisy, pairs[0].row)] * 2) == []  # patches of a frame at one place
     assert repetitions([(pair.clean, pair.noisy, pair.row) for pair in pairs]) == []

@@ -14,7 +14,7 @@ from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs, make_pair
 from unprocess_gen.reports.photon_transfer import fit_pair
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_95_percent_intervals_contain_90_to_99_percent(name: str, settings: Sett
     for overrides in INTERVALS[name]:
         config = settings(*overrides)
         for seed in range(240 // len(INTERVALS[name])):
-            picture = synthetic.scene(synthetic.SCENES[seed % len(synthetic.SCENES)])
+            picture = synthetic.picture(synthetic.NAMES[seed % len(synthetic.NAMES)])
             y, x = np.random.default_rng(seed).integers(0, 64, 2) * 2
             pair = make_pair(np.ascontiguousarray(picture[y : y + 256, x : x + 256]), replace(config, seed=seed))
             fit = fit_pair(pair.clean, pair.noisy, pair.row)

@@ -24,7 +24,7 @@ from unprocess_gen.config.schema import (
 )
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.pipeline.generate import generate
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 NOISE = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
 BROOKS = (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["truncated_normal", 0.8, 0.1, 0.5, 1.1])
@@ -52,7 +52,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scenes as JPEG and PNG, every corner of the cube, all gray codes, and a 16-bit PNG."""
     folder = tmp_path_factory.mktemp("photographs")
     for name in ("dead_leaves-1", "highlights-0", "colour_chart-0"):
-        cv2.imwrite(str(folder / f"{name}.jpg"), synthetic.scene(name)[..., ::-1])
+        cv2.imwrite(str(folder / f"{name}.jpg"), synthetic.picture(name)[..., ::-1])
     corners = np.array(np.meshgrid([0, 128, 254, 255], [0, 128, 254, 255], [0, 128, 254, 255])).T.reshape(1, -1, 3)
     grays = np.repeat(np.arange(256)[None, :, None], 3, axis=2)
     cv2.imwrite(str(folder / "corners.png"), np.repeat(corners, 2, axis=0).astype(np.uint8))

@@ -21,7 +21,7 @@ from unprocess_gen.simulation.kernels.render import pass_key
 from unprocess_gen.simulation.pair import FRAMES_PER_PASS, make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.self_test import GOLDEN_PHYSICS
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 SENSORS = {8: (0, 255), 10: (64, 1023), 12: (240, 4095), 14: (1024, 16383), 16: (4096, 65535)}
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
@@ -37,7 +37,7 @@ def plan() -> Plan:
 @pytest.fixture(scope="module")
 def scene() -> np.ndarray:
     """Return a crop of odd size with clipped highlights, deep shadows and saturated colours."""
-    return np.ascontiguousarray(synthetic.scene("highlights-0")[150:361, 300:597])
+    return np.ascontiguousarray(synthetic.picture("highlights-0")[150:361, 300:597])
 
 
 STEPS = [pytest.param(9, id="every 9th row"), pytest.param(1, id="every row", marks=pytest.mark.slow)]

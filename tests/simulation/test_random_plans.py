@@ -41,7 +41,7 @@ from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN
-from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources import synthetic
 
 SPECIAL = ("lens_shading", "gain_by_colour", "column_temporal", "dsnu")
 """Effects whose numbers few profiles have."""
@@ -277,7 +277,7 @@ def drawn_image(dice: Dice, even: bool) -> Srgb:
 
 @functools.lru_cache(maxsize=1)
 def scene() -> Srgb:
-    return synthetic.scene("highlights-0")
+    return synthetic.picture("highlights-0")
 
 
 def simulate(one: Case) -> Pair:

@@ -144,5 +144,5 @@ def test_clip_of_different_photographs_gives_warnings(run_main: RunMain, tmp_pat
 
 
 def test_row_of_a_scene_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(SourceError, match=r"^unreadable: synthetic scene 'p0.png'"):
+    with pytest.raises(SourceError, match=r"^unreadable: synthetic picture 'p0.png'"):
         load_source(SourceConfig(root=None), Source(0, "p0.png", "p0.png", 0))

@@ -131,7 +131,7 @@ class SourceConfig(Group):
     """
 
     root: Optional[str] = key(
-        None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
+        None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic pictures", decides_data=False
     )
     kind: str = key("srgb", Choice("srgb", "raw"))
     list: Optional[str] = key(

@@ -40,7 +40,7 @@ class Source:
         Path below ``source.root`` as in the manifest: joined by ``/``, percent-encoded if necessary.
     path : str
         Path below ``source.root`` as the operating system spells it (undecodable bytes as surrogate escapes), or the
-        name of a synthetic scene.
+        name of a synthetic picture.
     size_bytes : int or None
         Size of the file; 0 for a scene, None if there is no readable file.
     reason : str or None

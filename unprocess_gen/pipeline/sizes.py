@@ -15,11 +15,11 @@ from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Source
+from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import list_patches
 from unprocess_gen.sources.reading import read_bytes
-from unprocess_gen.sources.scenes import synthetic
 
 HEADERS_READ = 8
 """Sources whose sizes are read before a run; the others are taken to be as large as their mean."""

@@ -11,13 +11,12 @@ from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import FilteredError, MachineError, SourceError
 from unprocess_gen.core.types import MOSAIC, PACKED, Photograph, Source, Srgb
-from unprocess_gen.sources import reading
+from unprocess_gen.sources import reading, synthetic
 from unprocess_gen.sources.clips import clip_warnings, number_clips
 from unprocess_gen.sources.image import decode
 from unprocess_gen.sources.listing import Listing, list_file, list_folder
 from unprocess_gen.sources.raw.frames import read_raw_source
 from unprocess_gen.sources.read_ahead import ReadFile
-from unprocess_gen.sources.scenes import synthetic
 from unprocess_gen.sources.twins import number_twins
 
 
@@ -33,9 +32,9 @@ def list_photographs(config: SourceConfig) -> Listing:
     """
     place = config.place
     if place is None:
-        names = (synthetic.clip_listing if config.clips else synthetic.listing)(config.limit)
-        scenes = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
-        return Listing(number_clips(None, scenes) if config.clips else scenes)
+        names = synthetic.list_names(config.limit, config.clips)
+        pictures = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
+        return Listing(number_clips(None, pictures) if config.clips else pictures)
     if config.list is None:
         listed = list_folder(place, config.include or (), config.recursive, config.limit)
     else:
@@ -102,7 +101,7 @@ def _decoded(config: SourceConfig, source: Source, read: ReadFile) -> tuple[str,
     place = config.place
     if place is None:
         try:
-            pixels = synthetic.scene(source.path)
+            pixels = synthetic.picture(source.path)
         except ValueError as error:  # only the row of an edited manifest can name a scene that does not exist
             raise SourceError("unreadable", str(error)) from error
         return hashlib.sha256(pixels.data).hexdigest(), Photograph(pixels, orientation=1)

@@ -1,16 +1,13 @@
-"""Generate the built-in scenes, which are the source if ``source.root`` is null.
+"""Draw the built-in synthetic pictures, which are the source if ``source.root`` is null.
 
-A scene has a name, ``<kind>-<number>``, and depends on it only: blake2b of the name keys a Philox stream, and a painter
-turns the stream into linear light. No picture files are shipped.
+A picture has a name, ``<kind>-<number>``, and depends on it only: blake2b of the name keys a Philox stream, and a
+painter turns the stream into linear light, ``[3, H, W]`` float64, 0 at black and 1 at display white. It takes about
+100 ms and 30 MB on one core.
 
-A name gives the same bytes on every machine, so that datasets of scenes can be pinned by their hashes. Therefore only
-exact operations are used: integers, comparisons, look-ups, and ``+ - * / sqrt floor`` on float64, each as one
-elementwise ufunc, which IEEE 754 rounds in one way. Sines, powers, sums, matrix products and image libraries are not:
-their last bit depends on CPU, build and version. Angles are therefore rational points of the unit circle, falloffs are
-rational functions, and the transfer curve is a square root.
-
-A painter returns ``[3, H, W]`` float64, where 0 is black and 1 is display white; brighter values clip. A scene takes
-about 100 ms and 30 MB on one core.
+A name gives the same bytes on every machine. Therefore only exact operations are used: integers, comparisons, look-ups,
+and ``+ - * / sqrt floor`` on float64, each as one elementwise ufunc, which IEEE 754 rounds in one way. Sines, powers,
+sums, matrix products and image libraries are not: their last bit depends on CPU, build and version. Angles are
+therefore rational points of the unit circle, falloffs are rational functions, and the transfer curve is a square root.
 """
 
 from __future__ import annotations
@@ -25,49 +22,48 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-SYNTHETIC_KINDS = ("dead_leaves", "colour_chart", "highlights")
+KINDS = ("dead_leaves", "colour_chart", "highlights")
 
 DEFAULT_COUNT = 10
 
-
-def listing(limit: int | None) -> tuple[str, ...]:
-    """Return the names of the first ``limit`` scenes (None: ten); kinds alternate."""
-    count = DEFAULT_COUNT if limit is None else limit
-    return tuple(f"{SYNTHETIC_KINDS[i % len(SYNTHETIC_KINDS)]}-{i // len(SYNTHETIC_KINDS)}" for i in range(count))
-
-
 FRAMES_PER_CLIP = 8
-"""Frames of a scene that is a clip."""
+"""Frames of a picture that is a clip."""
 
 PAN = (2, 4)
 """Rows and columns by which the camera moves on from frame to frame."""
 
-
-def clip_listing(limit: int | None) -> tuple[str, ...]:
-    """Return the names of the first ``limit`` frames (None: all of ten clips), ``<kind>-<number>/<frame>``."""
-    clips = listing(None if limit is None else -(-limit // FRAMES_PER_CLIP))
-    return tuple(f"{clip}/{frame:04}" for clip in clips for frame in range(FRAMES_PER_CLIP))[:limit]
-
-
-SCENES = listing(None)
-
 DEFAULT_SIZE = (512, 768)
 
-SCENE_SIZES = {"dead_leaves-1": (481, 641)}
+SIZES = {"dead_leaves-1": (481, 641)}
 """Height and width that differ from the default, with odd sides."""
 
 
-def scene(name: str) -> NDArray[np.uint8]:
-    """Draw scene ``name`` (``<kind>-<number>``): uint8 ``[H, W, 3]``, display-referred R, G, B, C-contiguous.
+def list_names(limit: int | None, clips: bool = False) -> tuple[str, ...]:
+    """Names of the first ``limit`` pictures, kinds alternating; None: ten.
 
-    A frame of a clip (``<kind>-<number>/<frame>``) is a window of the scene, which moves by `PAN`.
+    With ``clips``, names ``<kind>-<number>/<frame>`` of the first ``limit`` frames; None: all of ten clips.
+    """
+    if clips:
+        names = list_names(None if limit is None else -(-limit // FRAMES_PER_CLIP))
+        return tuple(f"{clip}/{frame:04}" for clip in names for frame in range(FRAMES_PER_CLIP))[:limit]
+    count = DEFAULT_COUNT if limit is None else limit
+    return tuple(f"{KINDS[i % len(KINDS)]}-{i // len(KINDS)}" for i in range(count))
+
+
+NAMES = list_names(None)
+
+
+def picture(name: str) -> NDArray[np.uint8]:
+    """Draw a picture: uint8 ``[H, W, 3]``, display-referred R, G, B, C-contiguous.
+
+    A frame of a clip (``<kind>-<number>/<frame>``) is a window of the picture, which moves by `PAN`.
     """
     clip, slash, frame = name.partition("/")
     pixels = _drawn(clip)
     if not slash:
         return pixels.copy()
     if frame not in map("{:04}".format, range(FRAMES_PER_CLIP)):
-        raise ValueError(f"frame {frame!r} of a synthetic scene: expected 0000 to {FRAMES_PER_CLIP - 1:04}")
+        raise ValueError(f"frame {frame!r} of a synthetic picture: expected 0000 to {FRAMES_PER_CLIP - 1:04}")
     (top, left), last = (int(frame) * step for step in PAN), FRAMES_PER_CLIP - 1
     height, width = (side - last * step for side, step in zip(pixels.shape, PAN, strict=False))
     return pixels[top : top + height, left : left + width].copy()
@@ -75,36 +71,36 @@ def scene(name: str) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _drawn(name: str) -> NDArray[np.uint8]:
-    """Draw a scene, once for all frames of its clip; a number has one spelling only, so that a scene has one name."""
+    """Draw a picture, once for all frames of its clip; a number has one spelling, so that a picture has one name."""
     match = re.fullmatch(r"(.*)-(?:0|[1-9][0-9]*)", name)
-    if match is None or match[1] not in SYNTHETIC_KINDS:
+    if match is None or match[1] not in KINDS:
         raise ValueError(
-            f"synthetic scene {name!r}: expected <kind>-<number>, the kind one of {', '.join(SYNTHETIC_KINDS)} "
+            f"synthetic picture {name!r}: expected <kind>-<number>, the kind one of {', '.join(KINDS)} "
             "and the number 0 or more without leading zeros"
         )
-    draws, (height, width) = _Draws(name), SCENE_SIZES.get(name, DEFAULT_SIZE)
+    draws, (height, width) = _Draws(name), SIZES.get(name, DEFAULT_SIZE)
     return _encode(PAINTERS[match[1]](draws, height, width), draws)
 
 
 class _Draws:
-    """Hold the random stream of one scene; it uses raw Philox words, since NumPy may change its distributions."""
+    """Random stream of one picture: raw Philox words, since NumPy may change its distributions."""
 
     def __init__(self, name: str) -> None:
         digest = hashlib.blake2b(name.encode("utf-8"), digest_size=16).digest()
         self._philox = np.random.Philox(key=int.from_bytes(digest, "little"))
 
     def below(self, bound: int, count: int) -> NDArray[np.int64]:
-        """Return ``count`` integers from 0 to ``bound`` - 1."""
+        """Draw ``count`` integers from 0 to ``bound`` - 1."""
         words = self._philox.random_raw(count) >> np.uint64(32)
         return ((words * np.uint64(bound)) >> np.uint64(32)).astype(np.int64)
 
     def between(self, low: float, high: float, *shape: int) -> Float:
-        """Return float64 in [``low``, ``high``)."""
+        """Draw float64 in [``low``, ``high``)."""
         words = self._philox.random_raw(int(np.prod(shape))) >> np.uint64(11)
         return low + (high - low) * (words.astype(np.float64) / float(1 << 53)).reshape(shape)
 
     def octets(self, shape: tuple[int, ...]) -> Float:
-        """Return float64 multiples of 1/256 in [0, 1); eight per random word, cheap enough for every pixel."""
+        """Draw float64 multiples of 1/256 in [0, 1), eight per random word: cheap enough for every pixel."""
         size = int(np.prod(shape))
         words = self._philox.random_raw(-(-size // 8)).astype("<u8")
         return words.view(np.uint8)[:size].reshape(shape) / 256.0
@@ -120,12 +116,12 @@ def _encode(light: Float, draws: _Draws) -> NDArray[np.uint8]:
 
 
 def _grid(height: int, width: int) -> tuple[Float, Float]:
-    """Return pixel coordinates ``[H, 1]`` and ``[1, W]``, which broadcast."""
+    """Pixel coordinates ``[H, 1]`` and ``[1, W]``, which broadcast."""
     return np.arange(height, dtype=np.float64)[:, None], np.arange(width, dtype=np.float64)[None, :]
 
 
 def _colour(*light: float) -> Float:
-    """Return linear R, G, B as ``[3, 1, 1]``."""
+    """Linear R, G, B as ``[3, 1, 1]``."""
     return np.array(light)[:, None, None]
 
 
@@ -134,7 +130,7 @@ def _unit(value: Float) -> Float:
 
 
 def _smooth(value: Float) -> Float:
-    """Return the cubic from 0 to 1 with zero slope at both ends."""
+    """Cubic from 0 to 1 with zero slope at both ends."""
     t = _unit(value)
     return t * t * (3.0 - 2.0 * t)
 
@@ -145,7 +141,7 @@ def _cover(canvas: Float, light: Float, alpha: Float) -> None:
 
 
 def _noise(draws: _Draws, height: int, width: int, cell: tuple[int, int]) -> Float:
-    """Return value noise ``[H, W]`` in [-1, 1] on a lattice of ``cell`` = (rows, columns) pixels."""
+    """Value noise ``[H, W]`` in [-1, 1] on a lattice of ``cell`` = (rows, columns) pixels."""
     lattice = draws.between(-1.0, 1.0, height // cell[0] + 2, width // cell[1] + 2)
     return _stretch(_stretch(lattice, height, cell[0]).T, width, cell[1]).T
 
@@ -165,7 +161,7 @@ LEAVES = np.array([0x804A26, 0xAB6C2F, 0xC49246, 0x6E3422, 0x943C28, 0x5C6030, 0
 
 
 class _Leaf(NamedTuple):
-    """Hold a leaf's centre, half length, width over length, direction ``(ux, uy)`` and contrast of texture."""
+    """Leaf: centre, half length, width over length, direction ``(ux, uy)`` and contrast of texture."""
 
     y: float
     x: float
@@ -308,4 +304,4 @@ def _ball(canvas: Float, y: Float, x: Float, colour: tuple[float, ...]) -> None:
     _cover(canvas, shown, _unit((1.0 - square) * 30.0 + 0.5))
 
 
-PAINTERS = dict(zip(SYNTHETIC_KINDS, (_dead_leaves, _colour_chart, _highlights), strict=True))
+PAINTERS = dict(zip(KINDS, (_dead_leaves, _colour_chart, _highlights), strict=True))

@@ -1,1 +1,0 @@
-"""Generate the built-in synthetic scenes."""
