@@ -33,7 +33,8 @@ from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import isp, unprocess
 from unprocess_gen.simulation.reference.cfa import CHANNELS, mosaic, tile
-from unprocess_gen.sources.loader import list_photographs, load_source
+from unprocess_gen.sources.listing import list_photographs
+from unprocess_gen.sources.loader import load_source
 
 READINGS = {"divided by g_rgb": ("paper_min", "paper_max"), "multiplied by g_rgb": ("fig6_top", "fig6_bottom")}
 """Readings of Figure 6, with the options of ``conf/gains`` of its top and bottom row."""

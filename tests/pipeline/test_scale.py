@@ -24,7 +24,7 @@ assert verify(Path(sys.argv[1])) == []
 LIST = """
 import sys
 import unprocess_gen as ug
-from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.sources.listing import list_photographs
 sources = list_photographs(ug.load_config([f"source.root={sys.argv[1]}"]).source).sources
 assert len(sources) == 1_000_000
 assert sum(source.occurrence for source in sources) == 99_999

@@ -26,7 +26,7 @@ from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Input
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.pair import make_pair, reference_pair
-from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.sources.listing import list_photographs
 
 
 @pytest.fixture(autouse=True)

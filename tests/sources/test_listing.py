@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import Source
-from unprocess_gen.sources.listing import Listing, list_folder, unmatched_sentence
+from unprocess_gen.sources.listing import TAIL_BYTES, Listing, list_folder, number_twins, unmatched_sentence
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import read_bytes
-from unprocess_gen.sources.twins import TAIL_BYTES, number_twins
 
 
 def listed(root: Path, *include: str, recursive: bool = True, limit: int | None = None) -> Listing:

@@ -12,7 +12,7 @@ from helpers.photographs import fill
 
 import unprocess_gen as ug
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.sources.listing import list_photographs
 
 MAKE = ("n_jobs=1", "output.pairs_per_shard=2")
 

@@ -23,7 +23,8 @@ from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference.unprocess import dequantise
 from unprocess_gen.simulation.tone_curves import linear_table
-from unprocess_gen.sources.loader import downscaled, list_photographs, load_source
+from unprocess_gen.sources.listing import list_photographs
+from unprocess_gen.sources.loader import downscaled, load_source
 
 
 @given(side=st.integers(1, 9), seed=st.integers(0, 99), deep=st.booleans())

@@ -29,7 +29,8 @@ from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.reports.estimate import estimate_run
 from unprocess_gen.reports.plan_text import format_estimate
-from unprocess_gen.sources import loader as photographs
+from unprocess_gen.sources.listing import list_photographs
+from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import list_patches
 
 GRID, STRIDE, RANDOM = "source.patch=32", "source.patch=[grid,32,18]", "source.patch=[random,30,5]"
@@ -250,10 +251,10 @@ def test_image_smaller_than_a_patch_is_too_small(make: Make, tmp_path: Path) -> 
 
 def test_failure_of_a_small_image_is_explained(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "source.patch=14")
-    (source,) = photographs.list_photographs(config.source).sources
+    (source,) = list_photographs(config.source).sources
     why = r"too_small: 16 x 12 pixels contain no patch of 14 x 14 \(source.patch\)$"
     with pytest.raises(SourceError, match=f"^{why}"):
-        photographs.load_source(config.source, source)
+        load_source(config.source, source)
     assert "fails     000.png: too_small\n          16 x 12 pixels contain no patch" in format_estimate(
         estimate_run(config, 1, True)
     )

@@ -18,11 +18,9 @@ from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.generate import generate
-from unprocess_gen.sources import listing, read_ahead, reading
-from unprocess_gen.sources.listing import list_folder
-from unprocess_gen.sources.loader import list_photographs
-from unprocess_gen.sources.reading import read_bytes
-from unprocess_gen.sources.twins import number_twins
+from unprocess_gen.sources import reading
+from unprocess_gen.sources.listing import Listing, list_folder, list_photographs, number_twins
+from unprocess_gen.sources.reading import read_bytes, reading_ahead
 
 
 @pytest.fixture
@@ -32,14 +30,14 @@ def remote(photos: Path, bucket: ObjectPath) -> ObjectPath:
     return bucket / "photos"
 
 
-def listed(root: object, **options: object) -> listing.Listing:
+def listed(root: object, **options: object) -> Listing:
     """List photographs as a run does."""
     config = composed(*(f"source.{key}={value}" for key, value in options.items()))
     config = replaced(config, {"source.root": str(root)})
     return list_photographs(config.source)
 
 
-def without_etag(found: listing.Listing) -> listing.Listing:
+def without_etag(found: Listing) -> Listing:
     return replace(found, sources=tuple(replace(source, etag=None) for source in found.sources))
 
 
@@ -157,14 +155,14 @@ def test_reads_run_ahead_in_order(s3: str, bucket: ObjectPath, monkeypatch: pyte
     with servers.proxy(s3) as proxy:
         servers.use(monkeypatch, proxy.endpoint)
         proxy.delay_s = 0.02
-        with read_ahead.reading_ahead(str(bucket), read_bytes, sources) as read:
+        with reading_ahead(str(bucket), read_bytes, sources) as read:
             assert [read(str(bucket), source) for source in sources] == [source.path.encode() for source in sources]
-        assert 2 < proxy.most_at_once <= read_ahead.AHEAD
+        assert 2 < proxy.most_at_once <= reading.AHEAD
         assert len(proxy.requests) == len(sources)
 
 
 def test_reading_ahead_is_bounded_in_bytes(bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(read_ahead, "AHEAD_BYTES", 25)
+    monkeypatch.setattr(reading, "AHEAD_BYTES", 25)
     sources = [Source(index, str(index), str(index), 10) for index in range(9)]
     started: list[int] = []
 
@@ -172,7 +170,7 @@ def test_reading_ahead_is_bounded_in_bytes(bucket: ObjectPath, monkeypatch: pyte
         started.append(source.index)
         return bytes(10)
 
-    with read_ahead.reading_ahead(str(bucket), read, sources) as ahead:
+    with reading_ahead(str(bucket), read, sources) as ahead:
         ahead(str(bucket), sources[0])
         assert max(started) <= 2
         assert ahead(str(bucket), sources[0]) == bytes(10)  # a second time
@@ -185,7 +183,7 @@ def test_reading_ahead_is_bounded_in_bytes(bucket: ObjectPath, monkeypatch: pyte
 def test_failed_read_is_raised_for_its_source(remote: ObjectPath) -> None:
     sources = listed(remote).sources
     (remote / sources[1].path).delete()
-    with read_ahead.reading_ahead(str(remote), read_bytes, sources) as read:
+    with reading_ahead(str(remote), read_bytes, sources) as read:
         read(str(remote), sources[0])
         with pytest.raises(SourceError):
             read(str(remote), sources[1])
@@ -193,7 +191,7 @@ def test_failed_read_is_raised_for_its_source(remote: ObjectPath) -> None:
 
 
 def test_local_files_are_not_read_ahead(photos: Path) -> None:
-    with read_ahead.reading_ahead(str(photos), read_bytes, ()) as read:
+    with reading_ahead(str(photos), read_bytes, ()) as read:
         assert read is read_bytes
 
 

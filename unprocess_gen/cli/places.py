@@ -36,11 +36,11 @@ def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> 
 
 def given_root(call: Call) -> str | None:
     """Return the root that the user gives; ConfigError if it is no folder or photograph, None if none is given."""
-    from unprocess_gen.sources.listing import check_root
+    from unprocess_gen.sources.listing import single_file
 
     root: str | None = call.values.get("source.root")
     if root is not None:
-        check_root(root)
+        single_file(root)
     return root
 
 

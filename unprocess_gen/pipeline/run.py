@@ -15,8 +15,7 @@ from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.sensor_levels import sensor_warning
-from unprocess_gen.sources.listing import Listing
-from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.sources.listing import Listing, list_photographs
 
 
 @dataclass(frozen=True, slots=True)

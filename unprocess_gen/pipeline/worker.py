@@ -35,8 +35,7 @@ from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, Shar
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
 from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.read_ahead import ReadFile, reading_ahead
-from unprocess_gen.sources.reading import read_bytes, source_file
+from unprocess_gen.sources.reading import ReadFile, read_bytes, reading_ahead, source_file
 
 PARENT_POLL_S = 0.5
 WATCHDOG = "unprocess_gen watchdog"

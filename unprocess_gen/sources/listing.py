@@ -1,38 +1,41 @@
-"""List the source images of a folder or bucket.
+"""List the sources of a run: photographs of a folder or bucket, those that a list names, or synthetic pictures.
 
-Listing opens no file, so a pipe, a device or a terabyte file costs one ``stat``. A folder that cannot be read stops the
-run, because photographs that go missing silently change a dataset; ``os.walk`` ignores such folders.
+Listing opens no file, except those that share a size. A folder that cannot be read stops the run, because photographs
+that go missing silently change a dataset. Only cyclic links are skipped: a photograph reached through two links is two
+sources. Folders that link to each other are walked along every path without a repetition, which grows quickly with
+their number: link to files, not between folders.
 
-Only cyclic links are skipped. A photograph reached through two links is two sources; `twins` numbers them. Folders that
-link to each other are walked along every path without a repetition, which grows quickly with their number: link to
-files, not between folders.
-
-``source.root`` may be the URL of an object store. Its objects have the names and the order that files of a folder with
-these paths have, so that the same photographs give the same dataset.
+Objects of a store have the names and the order that files of a folder with these paths have, so that the same
+photographs give the same dataset.
 """
 
 from __future__ import annotations
 
 import csv
 import fnmatch
+import hashlib
 import itertools
 import os
 import posixpath
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import PurePosixPath
 
+from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.entries import Entry, EntryKind
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import absolute_text, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.types import Source
+from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.names import encode_name
+from unprocess_gen.sources.reading import opened, read_bytes
 
 NAMED_SUFFIXES = 5
 """Suffixes of unmatched files that `unmatched_sentence` names; the others are summed."""
@@ -43,25 +46,20 @@ READABLE_SUFFIXES = frozenset((".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff",
 CONVERTIBLE_SUFFIXES = frozenset((".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"))
 """Suffixes of pictures that photographs are not read from; `unmatched_sentence` advises to convert them."""
 
-
 MAX_LISTED = 4096
 """Characters of the longest path in a list."""
+
+TAIL_BYTES = 4096
+"""Bytes at the end of a file that `number_twins` reads first. The ends of photographs of one size nearly always differ;
+their beginnings, which hold the metadata of a camera, often do not."""
 
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Hold the result of listing a source.
+    """Sources in order, with indices 0 to n-1, and what a user should read about them.
 
-    Attributes
-    ----------
-    sources : tuple of Source
-        In order, with indices 0 to n-1.
-    skipped_links : int
-        Directory links that lead back to a folder that contains them.
-    unmatched : dict of str to int
-        Number of regular files that no glob matches, by suffix in lower case (``""`` for none), most frequent first.
-    warnings : tuple of str
-        Sentences about the listing that a user should read.
+    ``skipped_links`` counts links to a folder that contains them, ``unmatched`` the regular files that no glob matches,
+    by suffix in lower case (``""`` for none), most frequent first.
     """
 
     sources: tuple[Source, ...]
@@ -75,31 +73,39 @@ class Listing:
         return sum(self.unmatched.values())
 
 
+def list_photographs(config: SourceConfig) -> Listing:
+    """List every source of a run in order, with identical files and frames of clips numbered; decode no pixel.
+
+    Raises ConfigError for a folder or a list that cannot be used, MachineError if a file changes while it is hashed.
+    """
+    place = config.place
+    if place is None:
+        names = synthetic.list_names(config.limit, config.clips)
+        pictures = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
+        return Listing(number_clips(None, pictures) if config.clips else pictures)
+    if config.list is None:
+        listed = list_folder(place, config.include or (), config.recursive, config.limit)
+    else:
+        listed = list_file(place, config.list, config.limit)
+    listed = replace(listed, sources=number_twins(place, listed.sources))
+    if not config.clips:
+        return listed
+    numbered = number_clips(place, listed.sources)
+    warning = (
+        f"source.clips=true: all {len(numbered)} photographs are in one folder and become frames of one clip; "
+        "expected one folder for each clip; set source.clips=false if they are different photographs"
+    )
+    is_suspicious = len(numbered) > 1 and len({source.clip for source in numbered}) == 1
+    return replace(listed, sources=numbered, warnings=(warning,) if is_suspicious else ())
+
+
 def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int | None) -> Listing:
     """List the files below ``root`` that the globs match, ordered by the bytes of their relative paths.
 
-    Parameters
-    ----------
-    root : str
-        A folder, or a single file, which is listed whatever the globs are; or the URL of a prefix or of an object.
-    include : sequence of str
-        Globs, case-insensitive. A glob with ``/`` is matched against the relative path, others against the file name.
-    recursive : bool
-        Whether to list sub-folders too, also through links.
-    limit : int or None
-        Keep the first ``limit`` files; None keeps all.
-
-    Returns
-    -------
-    Listing
-        Sources without twins and clips numbered, and counts of what was left out.
-
-    Raises
-    ------
-    ConfigError
-        If the root does not exist, a sub-folder cannot be read, or no file matches.
+    A single file is listed whatever the globs are. ConfigError if the root does not exist, a sub-folder cannot be read,
+    or no file matches.
     """
-    single = _single_file(root)
+    single = single_file(root)
     if single is not None:
         return Listing((_source(0, single),))
     matches = matcher(include)
@@ -172,7 +178,7 @@ def _listed_paths(file: str) -> Iterator[tuple[int, str]]:
 
 
 def _path_below(root: str, text: str) -> str:
-    """Return the path of a listed file below the root, with ``/`` between its segments; others stay as they are."""
+    """Path of a listed file below the root, with ``/`` between its segments; others stay as they are."""
     start = f"{absolute_text(root)}".rstrip("/") + "/"
     if text.startswith(start):
         return posixpath.normpath(text.removeprefix(start))
@@ -188,13 +194,8 @@ def _listed_entry(root: str, path: str) -> Entry:
         return Entry(path, None, EntryKind.BROKEN_LINK)
 
 
-def check_root(root: str) -> None:
-    """Raise ConfigError unless a source root is a folder, a regular file, or the URL of a prefix or object."""
-    _single_file(root)
-
-
 def unmatched_sentence(unmatched: dict[str, int]) -> str:
-    """Return a sentence on the files that no glob matches, with advice; empty without such files."""
+    """Sentence on the files that no glob matches, with advice; empty without such files."""
     total = sum(unmatched.values())
     if not total:
         return ""
@@ -215,7 +216,7 @@ def unmatched_sentence(unmatched: dict[str, int]) -> str:
 
 
 def matcher(include: Iterable[str]) -> Callable[[str], bool]:
-    """Compile the globs of `list_folder` to a function that says whether a relative path matches one of them."""
+    """Compile globs, case-insensitive: those with ``/`` match the relative path, others the name of the file."""
     patterns: dict[bool, list[str]] = {True: [], False: []}
     for glob in include:
         patterns["/" in glob].append(fnmatch.translate(glob))
@@ -234,8 +235,8 @@ def _unreadable_folder(root: str, folder: str, reason: str) -> ConfigError:
     )
 
 
-def _single_file(root: str) -> Entry | None:
-    """Return the file or object that a root is, or None if it is a folder or prefix."""
+def single_file(root: str) -> Entry | None:
+    """Describe the file or object that a root is, None for a folder or prefix; ConfigError for anything else."""
     try:
         entry = any_path(root).entry()
     except StoreAccessError as error:
@@ -257,3 +258,66 @@ _REASONS = {EntryKind.BROKEN_LINK: "unreadable", EntryKind.UNREADABLE: "unreadab
 def _source(index: int, entry: Entry) -> Source:
     reason = _REASONS.get(entry.kind, "not_a_file")
     return Source(index, encode_name(entry.path), entry.path, entry.size, reason, etag=entry.etag)
+
+
+# ------------------------------------------------------------------------------------------- identical files and clips
+
+
+def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
+    """Number files of equal content 0, 1, … in listing order (``occurrence``), so that they get different noise.
+
+    Only files that share their size and their last `TAIL_BYTES` are read completely; their ``sha256`` is kept. A file
+    that cannot be read keeps number 0. Raises MachineError if a file has another size than when it was listed.
+    """
+    sizes = Counter(source.size_bytes for source in sources)
+    suspects = [source for source in sources if source.size_bytes is not None and sizes[source.size_bytes] > 1]
+    place = any_path(root)
+    tails = place.map(partial(_digest, root, tail=TAIL_BYTES), suspects)
+    groups: dict[tuple[int | None, bytes], list[Source]] = {}
+    for source, end in zip(suspects, tails, strict=True):
+        if end is not None:
+            groups.setdefault((source.size_bytes, end), []).append(source)
+    alike = [source for group in groups.values() if len(group) > 1 for source in group]
+    numbered, seen = list(sources), Counter[bytes]()
+    for source, digest in zip(alike, place.map(partial(_digest, root), alike), strict=True):
+        if digest is not None:
+            numbered[source.index] = replace(source, occurrence=seen[digest], sha256=digest.hex())
+            seen[digest] += 1
+    return tuple(numbered)
+
+
+def _digest(root: str, source: Source, tail: int | None = None) -> bytes | None:
+    """SHA-256 of a file, or of its last ``tail`` bytes; None if it cannot be read."""
+    start = 0 if tail is None else max(0, (source.size_bytes or 0) - tail)
+    with suppress(SourceError), opened(root, source, start) as file:
+        return hashlib.file_digest(file, "sha256").digest()  # type: ignore[arg-type]
+    return None
+
+
+def number_clips(root: str | None, sources: Sequence[Source]) -> tuple[Source, ...]:
+    """Make each folder a clip whose files are frames 0, 1, … in listing order.
+
+    The digest of a clip's first file identifies the clip, so that adding or removing other clips changes nothing. If
+    that file cannot be read, or is a synthetic picture (no ``root``), the digest of its name is used.
+    """
+    clips: dict[str, list[Source]] = {}
+    for source in sources:
+        clips.setdefault(source.name.rpartition("/")[0] or ".", []).append(source)
+    numbered, seen = list(sources), Counter[str]()
+    for clip, frames in clips.items():
+        digest = _clip_sha256(root, frames[0])
+        for frame, source in enumerate(frames):
+            numbered[source.index] = replace(
+                source, clip=clip, frame=frame, clip_sha256=digest, clip_occurrence=seen[digest], frames=len(frames)
+            )
+        seen[digest] += 1
+    return tuple(numbered)
+
+
+def _clip_sha256(root: str | None, first: Source) -> str:
+    if root is not None:
+        if first.sha256 is not None:
+            return first.sha256
+        with suppress(SourceError):
+            return hashlib.sha256(read_bytes(root, first)).hexdigest()
+    return hashlib.sha256(first.name.encode()).hexdigest()

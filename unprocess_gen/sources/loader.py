@@ -1,4 +1,4 @@
-"""List and load the source images of a run: photographs of a folder, or built-in scenes."""
+"""Load a source: read, decode and downscale a photograph or a raw frame, or draw a synthetic picture."""
 
 from __future__ import annotations
 
@@ -11,82 +11,67 @@ from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import FilteredError, MachineError, SourceError
 from unprocess_gen.core.types import MOSAIC, PACKED, Photograph, Source, Srgb
-from unprocess_gen.sources import reading, synthetic
-from unprocess_gen.sources.clips import clip_warnings, number_clips
-from unprocess_gen.sources.image import decode
-from unprocess_gen.sources.listing import Listing, list_file, list_folder
+from unprocess_gen.sources import synthetic
+from unprocess_gen.sources.image.decode import decode
 from unprocess_gen.sources.raw.frames import read_raw_source
-from unprocess_gen.sources.read_ahead import ReadFile
-from unprocess_gen.sources.twins import number_twins
-
-
-def list_photographs(config: SourceConfig) -> Listing:
-    """List every source of the run in order, with identical files and frames of clips numbered; decode no pixel.
-
-    Raises
-    ------
-    ConfigError
-        If the folder does not exist, cannot be read or contains no matching file.
-    MachineError
-        If a file changes while it is hashed.
-    """
-    place = config.place
-    if place is None:
-        names = synthetic.list_names(config.limit, config.clips)
-        pictures = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
-        return Listing(number_clips(None, pictures) if config.clips else pictures)
-    if config.list is None:
-        listed = list_folder(place, config.include or (), config.recursive, config.limit)
-    else:
-        listed = list_file(place, config.list, config.limit)
-    numbered = number_twins(place, listed.sources)
-    if not config.clips:
-        return replace(listed, sources=numbered)
-    numbered = number_clips(place, numbered)
-    return replace(listed, sources=numbered, warnings=clip_warnings(numbered))
+from unprocess_gen.sources.reading import ReadFile, read_bytes
 
 
 def load_source(
-    config: SourceConfig, source: Source, layout: str = MOSAIC, read: ReadFile = reading.read_bytes
+    config: SourceConfig, source: Source, layout: str = MOSAIC, read: ReadFile = read_bytes
 ) -> tuple[str, Photograph]:
-    """Read, decode and downscale one source; return the SHA-256 of its file, or of a scene's pixels, and the pixels.
+    """Read, decode and downscale one source: the SHA-256 of its file, or of a synthetic picture, and its pixels.
 
-    ``read`` reads a photograph; `read_ahead.reading_ahead` provides a function that has read ahead.
-
-    Raises
-    ------
-    SourceError
-        If the source cannot be used or is left out, or no patch or tile fits into it; ``sha256`` is set if the bytes
-        could be read.
-    MachineError
-        If the file is not the one that was listed.
+    Raises SourceError if the source cannot be used or is left out, or no patch or tile fits into it, with ``sha256`` if
+    the bytes could be read; MachineError if the file is not the one that was listed.
     """
-    digest, photograph = _decoded(config, source, read)
-    height, width = (side // config.downscale for side in photograph.srgb.shape[:2])
-    if config.min_side is not None and min(height, width) < config.min_side:
-        text = f"{width} x {height} pixels have a side shorter than source.min_side={config.min_side}"
-        raise FilteredError("too_small", text, digest)
+    if config.place is None:
+        try:
+            photograph = Photograph(synthetic.picture(source.path), orientation=1)
+        except ValueError as error:  # only the row of an edited manifest can name a picture that does not exist
+            raise SourceError("unreadable", str(error)) from error
+        digest = hashlib.sha256(photograph.srgb.data).hexdigest()
+    else:
+        content = read(config.place, source)
+        digest = hashlib.sha256(content).hexdigest()
+        if source.sha256 not in (None, digest):
+            raise MachineError(
+                f"source {source.name} has other bytes than when it was listed; expected unchanged sources; "
+                "restore it, or choose another out"
+            )
+        try:
+            if config.kind == "raw":
+                photograph = read_raw_source(config, content, source.name)
+            else:
+                photograph = decode(content, max_pixels=config.max_pixels, icc=config.icc, name=source.name)
+        except SourceError as error:
+            raise SourceError(error.reason, error.text, digest) from error
+    _check_size(config, photograph.srgb, layout, digest)
     if config.downscale > 1:
-        square = f"are less than one square of source.downscale={config.downscale}"
-        _check_side(photograph.srgb, config.downscale, square, digest)
         photograph = replace(photograph, srgb=downscaled(photograph.srgb, config.downscale))
-    rule = patch_rule(config)
-    if rule is not None:
-        patch = f"contain no patch of {rule.side} x {rule.side} (source.patch)"
-        _check_side(photograph.srgb, rule.side, patch, digest)
-    if layout == PACKED:
-        _check_side(photograph.srgb, 2, "contain no 2 x 2 tile (output.layout=packed)", digest)
     return digest, photograph
 
 
-def _check_side(srgb: Srgb, least: int, problem: str, digest: str) -> None:
-    height, width = srgb.shape[:2]
-    if min(height, width) < least:
-        raise SourceError("too_small", f"{width} x {height} pixels {problem}", digest)
+def _check_size(config: SourceConfig, srgb: Srgb, layout: str, digest: str) -> None:
+    """Raise FilteredError below ``source.min_side``, SourceError if no square, patch or tile fits."""
+    decoded = height, width = srgb.shape[:2]
+    prepared = height, width = height // config.downscale, width // config.downscale
+    if config.min_side is not None and min(prepared) < config.min_side:
+        text = f"{width} x {height} pixels have a side shorter than source.min_side={config.min_side}"
+        raise FilteredError("too_small", text, digest)
+    rule = patch_rule(config)
+    side = 1 if rule is None else rule.side
+    for (height, width), least, problem in (
+        (decoded, config.downscale, f"are less than one square of source.downscale={config.downscale}"),
+        (prepared, side, f"contain no patch of {side} x {side} (source.patch)"),
+        (prepared, 2 if layout == PACKED else 1, "contain no 2 x 2 tile (output.layout=packed)"),
+    ):
+        if min(height, width) < least:
+            raise SourceError("too_small", f"{width} x {height} pixels {problem}", digest)
 
 
 def downscaled(srgb: Srgb, side: int) -> Srgb:
-    """Average squares of pixels in integer arithmetic; return uint16, the code nearest to each mean.
+    """Average squares of pixels in integer arithmetic: uint16, the code nearest to each mean.
 
     8-bit code k counts as 257 k. Rows and columns that fill no square are omitted.
     """
@@ -95,26 +80,3 @@ def downscaled(srgb: Srgb, side: int) -> Srgb:
     sums = squares.sum(axis=(1, 3), dtype=np.uint64) * np.uint64(2 * 65535 // int(np.iinfo(srgb.dtype).max))
     count = np.uint64(side * side)
     return np.asarray((sums + count) // (np.uint64(2) * count), dtype=np.uint16)
-
-
-def _decoded(config: SourceConfig, source: Source, read: ReadFile) -> tuple[str, Photograph]:
-    place = config.place
-    if place is None:
-        try:
-            pixels = synthetic.picture(source.path)
-        except ValueError as error:  # only the row of an edited manifest can name a scene that does not exist
-            raise SourceError("unreadable", str(error)) from error
-        return hashlib.sha256(pixels.data).hexdigest(), Photograph(pixels, orientation=1)
-    content = read(place, source)
-    digest = hashlib.sha256(content).hexdigest()
-    if source.sha256 not in (None, digest):
-        raise MachineError(
-            f"source {source.name} has other bytes than when it was listed; expected unchanged sources; "
-            "restore it, or choose another out"
-        )
-    try:
-        if config.kind == "raw":
-            return digest, read_raw_source(config, content, source.name)
-        return digest, decode.decode(content, max_pixels=config.max_pixels, icc=config.icc, name=source.name)
-    except SourceError as error:
-        raise SourceError(error.reason, error.text, digest) from error

@@ -44,7 +44,8 @@ from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.kernels.render import render_clean
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference.sensor import in_dn
-from unprocess_gen.sources.loader import list_photographs, load_source
+from unprocess_gen.sources.listing import list_photographs
+from unprocess_gen.sources.loader import load_source
 
 LOGGER = logging.getLogger("unprocess_gen")
 

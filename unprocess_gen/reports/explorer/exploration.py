@@ -26,7 +26,8 @@ from unprocess_gen.reports.sheets.panels import MosaicArray
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.simulation.reference.cfa import unpack
-from unprocess_gen.sources.loader import list_photographs, load_source
+from unprocess_gen.sources.listing import list_photographs
+from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
 
 PAIR_FOLDER = "pair"
