@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.sources.raw.metadata import read_metadata
+from unprocess_gen.sources.raw.decode import read_metadata
 
 CENTRE = 256
 PICTURES = (".jpg", ".jpeg", ".png")

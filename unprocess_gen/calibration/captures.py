@@ -25,7 +25,7 @@ from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES
 from unprocess_gen.core.records import check_record
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
-from unprocess_gen.sources.raw.metadata import read_metadata
+from unprocess_gen.sources.raw.decode import read_metadata
 from unprocess_gen.sources.raw.mosaics import even_sides, read_mosaic
 
 TABLE, EMVA = "captures.csv", "EMVA1288_Data.txt"

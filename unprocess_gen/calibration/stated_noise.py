@@ -22,7 +22,7 @@ from unprocess_gen.calibration.profile import MARK, NamedNumber, estimates_json,
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.sources.raw.metadata import RawMetadata, read_metadata
+from unprocess_gen.sources.raw.decode import RawMetadata, read_metadata
 
 FORM = "calibrate --from noise_profile"
 DIGITS = 12

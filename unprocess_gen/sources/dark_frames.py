@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,10 @@ from numpy.typing import NDArray
 from unprocess_gen.config.interpretation import uses_dark_frames
 from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
+from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import SUFFIXES
 from unprocess_gen.core.types import DarkFrame, DarkFrames, Raw
-from unprocess_gen.sources.raw.mosaics import Mosaic, check_sha256, even_sides, map_mosaic, mosaic_sha256, read_mosaic
+from unprocess_gen.sources.raw.mosaics import Mosaic, checked_mosaic, even_sides, read_mosaic
 
 KEY = "noise.dark_frames"
 
@@ -54,11 +56,11 @@ class DarkFolder:
 
     @property
     def sha256(self) -> str:
-        """Return the digest that identifies the set of frames; it does not depend on names."""
+        """Digest that identifies the set of frames; it does not depend on names."""
         return hashlib.sha256("\n".join(["dark frames 1", *sorted(self.files)]).encode()).hexdigest()
 
     def frame(self, sha256: str) -> Raw:
-        """Return the mosaic of a frame, uint16 [H, W] with even sides; read-only if the file is mapped."""
+        """Mosaic of a frame, uint16 [H, W] with even sides; read-only if the file is mapped."""
         name = self.files.get(sha256)
         if name is None:
             raise SourceChangedError(
@@ -70,13 +72,10 @@ class DarkFolder:
 
 
 def dark_folder(folder: str) -> DarkFolder:
-    """Return access to the dark frames of a folder.
-
-    Raises ConfigError or MachineError.
-    """
+    """Hash the dark frames of a folder; raise ConfigError or MachineError."""
     try:
         names = sorted(path.name for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES)
-        files = {mosaic_sha256(Path(folder) / name): name for name in names}
+        files = {_frame_sha256(Path(folder) / name): name for name in names}
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(f"{KEY}={folder}: no such folder; expected a folder of dark frames") from None
     except OSError as error:
@@ -89,10 +88,9 @@ def dark_folder(folder: str) -> DarkFolder:
 
 
 def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFolder | None]:
-    """Read and check the dark frames of a run; return its config, what plans need, and access to the pixels.
+    """Check the dark frames of a run: its config with the digest of the set, what plans need, access to the pixels.
 
-    The config contains the digest of the set, which ``config.yaml`` records. Without dark frames, the others are None.
-    Raises ConfigError, SourceChangedError or MachineError.
+    Without dark frames, the last two are None. Raises ConfigError, SourceChangedError or MachineError.
     """
     if not uses_dark_frames(config.noise):
         return config, None, None
@@ -140,7 +138,7 @@ def _described(folder: DarkFolder, noise: NoiseConfig, sensor: SensorConfig) -> 
 
 
 def trimmed_moments(counts: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the mean and the variance of counted integers, without the `FARTHEST` at both ends; exact."""
+    """Mean and variance of counted integers, without the `FARTHEST` at both ends; exact."""
     cut = int(int(counts.sum()) * FARTHEST)
     ascending = np.cumsum(counts)
     kept = np.diff(np.clip(ascending, cut, int(ascending[-1]) - cut), prepend=cut)
@@ -165,15 +163,41 @@ def _check(start: str, mosaic: Mosaic, bits: int, pattern: str) -> None:
         )
 
 
+def _frame_sha256(path: Path) -> str:
+    """SHA-256 of a file; a program that makes many pairs hashes each file once. Raises OSError."""
+    status = path.stat()
+    return _sha256_of(path, status.st_size, status.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4096)
+def _sha256_of(path: Path, size: int, modified_ns: int) -> str:
+    return file_sha256(path)
+
+
+def _check_sha256(path: Path, sha256: str) -> None:
+    """Raise SourceChangedError unless a file has the SHA-256 of a dark frame."""
+    try:
+        digest = _frame_sha256(path)
+    except OSError as error:
+        raise SourceChangedError(f"dark frame {path}: cannot be read ({error.strerror}); restore it") from error
+    if digest != sha256:
+        raise SourceChangedError(f"dark frame {path}: has the SHA-256 {digest}; expected {sha256}; restore it")
+
+
 @functools.lru_cache(maxsize=MAPPED)
 def _mapped(path: Path, sha256: str) -> Raw:
-    """Return the array of an NPY file, mapped into memory."""
-    check_sha256(path, "dark frame", sha256)
-    return map_mosaic(path, KEY)
+    """Map the array of an NPY file into memory."""
+    _check_sha256(path, sha256)
+    try:
+        with machine_errors(path):
+            pixels: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:  # an edited row can name any file of the folder
+        raise ConfigError(f"{KEY}: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
+    return checked_mosaic(pixels, path, KEY)
 
 
 @functools.lru_cache(maxsize=DECODED)
 def _decoded(path: Path, sha256: str) -> Raw:
-    """Return the pixels of another file."""
-    check_sha256(path, "dark frame", sha256)
+    """Decode another file."""
+    _check_sha256(path, sha256)
     return read_mosaic(path, KEY).pixels

@@ -20,8 +20,7 @@ from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.types import CameraPlan, IspPlan, Levels, Photograph, RawParts, SensorPlan, SourcePlan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites
-from unprocess_gen.sources.raw.decode import RawFrame, decode_raw
-from unprocess_gen.sources.raw.metadata import LOSSY_JPEG, RawMetadata
+from unprocess_gen.sources.raw.decode import LOSSY_JPEG, RawFrame, RawMetadata, decode_raw
 from unprocess_gen.sources.raw.mosaics import mosaic_pixels
 
 LONGEST_CAMERA_NAME = 64

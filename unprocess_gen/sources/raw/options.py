@@ -12,9 +12,8 @@ from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.sources.raw.colour import temperature
-from unprocess_gen.sources.raw.decode import decode_raw
+from unprocess_gen.sources.raw.decode import RawMetadata, decode_raw, tags_of
 from unprocess_gen.sources.raw.frames import camera_colours, file_levels, file_pattern, file_sensor
-from unprocess_gen.sources.raw.metadata import RawMetadata, tags_of
 
 MARK = "Written by gen-dataset camera"
 """Text in the first line of each file, by which an earlier one is known."""
