@@ -38,6 +38,7 @@ from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, replaced
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core import object_store
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.sources import synthetic
@@ -181,10 +182,10 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def s3_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Return the endpoint of an S3 server that runs in a process of its own."""
+def s3_server() -> Iterator[str]:
+    """Return the endpoint of an S3 server."""
     pytest.importorskip("obstore")
-    with servers.moto_server(tmp_path_factory.mktemp("moto") / "log") as endpoint:
+    with servers.serving(servers.s3_application()) as endpoint:
         yield endpoint
 
 
@@ -193,6 +194,16 @@ def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
     """Let this process, and those that it starts, use the S3 server; return its endpoint."""
     servers.use(monkeypatch, s3_server)
     return s3_server
+
+
+@pytest.fixture
+def proxy(s3: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[servers.Proxy]:
+    """Return a proxy in front of the S3 server, which this process and those that it starts use."""
+    proxy = servers.Proxy(servers.s3_application(), s3)
+    with servers.serving(proxy) as proxy.endpoint:
+        servers.use(monkeypatch, proxy.endpoint)
+        yield proxy
+    object_store._store.cache_clear()
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 from helpers import object_store as servers
 from helpers.configs import composed
 from helpers.datasets import Make, TreeHash
+from helpers.object_store import Proxy
 
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
@@ -81,17 +82,14 @@ def test_twins_are_numbered_like_files(tmp_path: Path, bucket: ObjectPath, monke
     assert without_etag(listed(bucket)) == listed(tmp_path)
 
 
-def test_only_candidates_are_read_completely(
-    s3: str, tmp_path: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_candidates_are_read_completely(tmp_path: Path, bucket: ObjectPath, proxy: Proxy) -> None:
     for number in range(20):
         (tmp_path / f"{number:02d}.png").write_bytes(bytes(9000) + bytes([number % 19]) * 4096)
     servers.upload(tmp_path, bucket)
     found = list_folder(str(bucket), ["*"], True, None).sources
-    with servers.proxy(s3) as proxy:
-        servers.use(monkeypatch, proxy.endpoint)
-        numbered = number_twins(str(bucket), found)
-        assert proxy.count("GET") == 20 + 2
+    proxy.requests.clear()
+    numbered = number_twins(str(bucket), found)
+    assert proxy.count("GET") == 20 + 2
     assert [source.occurrence for source in numbered] == [0] * 19 + [1]
 
 
@@ -148,17 +146,16 @@ def test_no_match_names_the_globs(remote: ObjectPath) -> None:
         listed(remote, include="[*.none]")
 
 
-def test_reads_run_ahead_in_order(s3: str, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reads_run_ahead_in_order(bucket: ObjectPath, proxy: Proxy) -> None:
     sources = [Source(index, f"{index:02d}", f"{index:02d}", 2) for index in range(24)]
     for source in sources:
         (bucket / source.path).write_bytes(source.path.encode())
-    with servers.proxy(s3) as proxy:
-        servers.use(monkeypatch, proxy.endpoint)
-        proxy.delay_s = 0.02
-        with reading_ahead(str(bucket), read_bytes, sources) as read:
-            assert [read(str(bucket), source) for source in sources] == [source.path.encode() for source in sources]
-        assert 2 < proxy.most_at_once <= reading.AHEAD
-        assert len(proxy.requests) == len(sources)
+    proxy.requests.clear()
+    proxy.delay_s = 0.02
+    with reading_ahead(str(bucket), read_bytes, sources) as read:
+        assert [read(str(bucket), source) for source in sources] == [source.path.encode() for source in sources]
+    assert 2 < proxy.most_at_once <= reading.AHEAD
+    assert len(proxy.requests) == len(sources)
 
 
 def test_reading_ahead_is_bounded_in_bytes(bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
