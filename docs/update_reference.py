@@ -110,7 +110,7 @@ def purpose(package: str) -> str:
 
 GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
     "packages": ("docs/design/architecture.md", package_table),
-    "lights": ("docs/guides/physical_scenes.md", light_tables),
+    "lights": ("docs/guides/own_camera.md", light_tables),
 }
 """Generated parts: name of the markers, page, function that returns the text."""
 
