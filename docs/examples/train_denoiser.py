@@ -1,6 +1,6 @@
 """Train a small raw denoiser on pairs of unprocess_gen, and compare it with filters: the example of docs/tutorial.md.
 
-``python train_denoiser.py`` uses the built-in scenes; ``--photos FOLDER`` uses the photographs of a folder. It needs
+``python train_denoiser.py`` uses the synthetic pictures; ``--photos FOLDER`` uses the photographs of a folder. It needs
 PyTorch, and writes a dataset (``denoiser_scenes`` or ``denoiser_photos``) and the picture ``denoiser.jpg`` below
 ``--out``. A fifth of the photographs is not trained on; all figures come from it.
 """
@@ -172,8 +172,8 @@ def draw(path: Path, denoised: Filter, pairs: ug.RawPairs) -> None:
 def main() -> None:
     """Generate the dataset, train, measure and draw."""
     parser = argparse.ArgumentParser(description="Train a small raw denoiser.")
-    parser.add_argument("--photos", help="folder of photographs; by default 50 built-in scenes")
-    parser.add_argument("--scenes", type=int, default=50, help="number of built-in scenes")
+    parser.add_argument("--photos", help="folder of photographs; by default 50 synthetic pictures")
+    parser.add_argument("--scenes", type=int, default=50, help="number of synthetic pictures")
     parser.add_argument("--steps", type=int, default=2000, help="training steps")
     parser.add_argument("--workers", type=int, default=0, help="processes that load crops")
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")

@@ -3,7 +3,7 @@
     python docs/experiments/live_pairs.py --out FOLDER [--photos FOLDER] [--rounds 9] [--only goals]
 
 Processor time of one thread, all sides in turns. Results go to live_pairs.json in ``--out``, and as Markdown tables to
-standard output. Without photographs, the sources are JPEG files of built-in scenes.
+standard output. Without photographs, the sources are JPEG files of synthetic pictures.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def median_ratio(times: Sequence[float], reference: Sequence[float]) -> float:
 
 
 def write_scenes(folder: Path, count: int = 16) -> None:
-    """Write JPEG files of 2048 x 2304 pixels, each of twelve built-in scenes."""
+    """Write JPEG files of 2048 x 2304 pixels, each of twelve synthetic pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [name for name in synthetic.NAMES if name not in synthetic.SIZES][:count]
     scenes = [synthetic.picture(name) for name in names]
