@@ -67,15 +67,21 @@ class DarkFolder:
                 f"{KEY}={self.folder}: no file has the SHA-256 {sha256}; expected the dark frames of the dataset; "
                 "restore the file, or give their folder"
             )
-        read = _mapped if name.lower().endswith(".npy") else _decoded
-        return even_sides(read(Path(self.folder) / name, sha256))
+        path = Path(self.folder) / name
+        try:
+            digest = _file_sha256(path)
+        except OSError as error:
+            raise SourceChangedError(f"dark frame {path}: cannot be read ({error.strerror}); restore it") from error
+        if digest != sha256:
+            raise SourceChangedError(f"dark frame {path}: has the SHA-256 {digest}; expected {sha256}; restore it")
+        return even_sides((_mapped if name.lower().endswith(".npy") else _decoded)(path, sha256))
 
 
 def dark_folder(folder: str) -> DarkFolder:
     """Hash the dark frames of a folder; raise ConfigError or MachineError."""
     try:
         names = sorted(path.name for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES)
-        files = {_frame_sha256(Path(folder) / name): name for name in names}
+        files = {_file_sha256(Path(folder) / name): name for name in names}
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(f"{KEY}={folder}: no such folder; expected a folder of dark frames") from None
     except OSError as error:
@@ -163,7 +169,7 @@ def _check(start: str, mosaic: Mosaic, bits: int, pattern: str) -> None:
         )
 
 
-def _frame_sha256(path: Path) -> str:
+def _file_sha256(path: Path) -> str:
     """SHA-256 of a file; a program that makes many pairs hashes each file once. Raises OSError."""
     status = path.stat()
     return _sha256_of(path, status.st_size, status.st_mtime_ns)
@@ -174,20 +180,9 @@ def _sha256_of(path: Path, size: int, modified_ns: int) -> str:
     return file_sha256(path)
 
 
-def _check_sha256(path: Path, sha256: str) -> None:
-    """Raise SourceChangedError unless a file has the SHA-256 of a dark frame."""
-    try:
-        digest = _frame_sha256(path)
-    except OSError as error:
-        raise SourceChangedError(f"dark frame {path}: cannot be read ({error.strerror}); restore it") from error
-    if digest != sha256:
-        raise SourceChangedError(f"dark frame {path}: has the SHA-256 {digest}; expected {sha256}; restore it")
-
-
 @functools.lru_cache(maxsize=MAPPED)
 def _mapped(path: Path, sha256: str) -> Raw:
-    """Map the array of an NPY file into memory."""
-    _check_sha256(path, sha256)
+    """Map the array of an NPY file into memory; the digest makes a replaced file another one."""
     try:
         with machine_errors(path):
             pixels: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -198,6 +193,5 @@ def _mapped(path: Path, sha256: str) -> Raw:
 
 @functools.lru_cache(maxsize=DECODED)
 def _decoded(path: Path, sha256: str) -> Raw:
-    """Decode another file."""
-    _check_sha256(path, sha256)
+    """Decode another file; the digest as in `_mapped`."""
     return read_mosaic(path, KEY).pixels

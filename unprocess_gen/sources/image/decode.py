@@ -69,7 +69,6 @@ _DAMAGE = re.compile(
 _LOG_PREFIX = re.compile(r"\[ *[A-Z]+:\d+@[\d.]+\] global \S+ \S+ ")
 """Severity, seconds since the start, file and function of an OpenCV message; they would make manifests differ."""
 
-_UNCHANGED = cv2.IMREAD_UNCHANGED
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _COLOUR_16 = _COLOUR | cv2.IMREAD_ANYDEPTH
 
@@ -87,30 +86,12 @@ _TURNS = {
 
 
 def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Photograph:
-    """Decode one photograph to uint8 or uint16 ``[H, W, 3]`` in R, G, B order, upright and contiguous.
+    """Decode the bytes of one photograph to uint8 or uint16 ``[H, W, 3]``, R, G, B, upright and contiguous.
 
-    Parameters
-    ----------
-    data : bytes
-        The complete file.
-    max_pixels : int
-        Largest number of pixels, judged by the header.
-    icc : {"ignore", "refuse"}
-        Whether to refuse photographs whose colour profile is not sRGB.
-    name : str
-        Name of the file in log messages.
-
-    Returns
-    -------
-    Photograph
-        Pixels and the EXIF orientation that was applied.
-
-    Raises
-    ------
-    SourceError
-        With the first reason found of: ``empty``, ``unsupported``, ``truncated``, ``too_large``, ``animated``,
-        ``cmyk``, ``icc``, ``corrupt``, ``alpha``. Headers that are refused while they are read (a gray TIFF with
-        alpha, an impossible header) give ``alpha`` or ``corrupt`` before the others are checked.
+    ``max_pixels`` limits what the header declares, ``name`` begins log messages. Raises SourceError with the first
+    reason found of: ``empty``, ``unsupported``, ``truncated``, ``too_large``, ``animated``, ``cmyk``, ``icc``,
+    ``corrupt``, ``alpha``. Headers that are refused while they are read (a gray TIFF with alpha, an impossible header)
+    give ``alpha`` or ``corrupt`` before the others are checked.
     """
     header = probe(data)
     _refuse(header, max_pixels, icc)
@@ -155,7 +136,7 @@ def _refuse_cicp(cicp: bytes, icc: str) -> None:
 
 @lru_cache(maxsize=32)
 def _profile_objection(icc: bytes) -> str:
-    """Reason why an embedded profile is not sRGB, or an empty text; judged by its effect, since names prove little."""
+    """Reason why an embedded profile is not sRGB, or an empty text: judged by its effect, since names prove little."""
     from PIL import ImageCms
 
     try:
@@ -166,7 +147,7 @@ def _profile_objection(icc: bytes) -> str:
 
 
 def _codes_moved(icc: bytes) -> int:
-    """Return the largest difference from sRGB, in 8-bit codes, over a grid of colours or over all grays."""
+    """Largest difference from sRGB, in 8-bit codes, over a grid of colours or over all grays."""
     from PIL import Image, ImageCms
 
     profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
@@ -183,11 +164,17 @@ def _codes_moved(icc: bytes) -> int:
 
 
 def _pixels(data: bytes, header: Header, name: str) -> Srgb:
-    """Return the pixels as stored, ``[height, width, 3]``, R, G, B."""
-    flags = _flags(header)
-    decoded, messages = _imdecode(tiff_without_orientation(data) if header.format == "tiff" else data, flags)
+    """Decode the pixels as stored, ``[height, width, 3]``, R, G, B."""
+    flags = _COLOUR_16 if header.bits == 16 else _COLOUR
+    if header.has_alpha or (header.format == "tiff" and header.bits == 16):
+        flags = cv2.IMREAD_UNCHANGED
+    content = np.frombuffer(tiff_without_orientation(data) if header.format == "tiff" else data, np.uint8)
+    decoded: Srgb | None = None
+    with captured() as written, suppress(cv2.error):
+        decoded = cast("Srgb | None", cv2.imdecode(content, flags))
     if decoded is None:  # codecs report a lack of memory in many ways, or not at all: MemoryError if there is one
         np.empty((header.height, header.width, DECODE_PEAK), f"uint{header.bits}")
+    messages = bytes(written)
     text = " ".join(_LOG_PREFIX.sub("", messages.decode(errors="replace")).split())
     damage = _DAMAGE.search(messages)
     if decoded is None or damage:
@@ -197,50 +184,31 @@ def _pixels(data: bytes, header: Header, name: str) -> Srgb:
         raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {words}")
     if text:
         _LOGGER.warning("%s: %s", name, text)
-    _check_array(decoded, header)
-    if header.has_alpha:
-        _check_opaque(decoded, header)
+    _check(decoded, header)
     if header.mode == "white_is_zero" and header.bits == 16:
         np.subtract(65535, decoded, out=decoded)
-    return _as_rgb(decoded) if flags == _UNCHANGED else decoded
+    if decoded.ndim == 2:
+        return cast(Srgb, np.repeat(decoded[..., None], 3, axis=2))
+    return cast(Srgb, np.ascontiguousarray(decoded[..., 2::-1])) if flags == cv2.IMREAD_UNCHANGED else decoded
 
 
-def _flags(header: Header) -> int:
-    if header.has_alpha or (header.format == "tiff" and header.bits == 16):
-        return _UNCHANGED
-    return _COLOUR_16 if header.bits == 16 else _COLOUR
+def _check(decoded: Srgb, header: Header) -> None:
+    """Raise SourceError for another array than the header declares, and for pixels that are or may be transparent.
 
-
-def _imdecode(data: bytes | bytearray, flags: int) -> tuple[Srgb | None, bytes]:
-    """Return the decoded array, None if the codec fails, and what the codec wrote to standard error."""
-    decoded: Srgb | None = None
-    with captured() as messages, suppress(cv2.error):
-        decoded = cast("Srgb | None", cv2.imdecode(np.frombuffer(data, np.uint8), flags))
-    return decoded, bytes(messages)
-
-
-def _check_array(decoded: Srgb, header: Header) -> None:
+    OpenCV drops the transparent value of gray.
+    """
     expected = (header.height, header.width, f"uint{header.bits}")
     actual = (*decoded.shape[:2], decoded.dtype.name)
     if actual != expected:
         raise SourceError("corrupt", f"the header declares {expected} (rows, columns, type), the data have {actual}")
-
-
-def _check_opaque(decoded: Srgb, header: Header) -> None:
-    """Raise SourceError if pixels are transparent, or gray with a transparent value, which OpenCV drops."""
-    if decoded.ndim == 2 or (decoded.shape[2] == 4 and decoded[..., 3].min() < 2**header.bits - 1):
+    if header.has_alpha and (
+        decoded.ndim == 2 or (decoded.shape[2] == 4 and decoded[..., 3].min() < 2**header.bits - 1)
+    ):
         raise SourceError("alpha", "some pixels may be transparent; flatten the picture onto a background")
 
 
-def _as_rgb(stored: Srgb) -> Srgb:
-    """Convert gray, BGR or BGRA to RGB."""
-    if stored.ndim == 2:
-        return cast(Srgb, np.repeat(stored[..., None], 3, axis=2))
-    return cast(Srgb, np.ascontiguousarray(stored[..., 2::-1]))
-
-
 def upright(srgb: Srgb, orientation: int) -> Srgb:
-    """Return stored pixels rotated and mirrored by an EXIF orientation, 1 to 8 (EXIF tag 274)."""
+    """Rotate and mirror stored pixels by an EXIF orientation, 1 to 8 (tag 274)."""
     swap, row_step, column_step = _TURNS[orientation]
     turned = srgb.swapaxes(0, 1) if swap else srgb
     return cast(Srgb, np.ascontiguousarray(turned[::row_step, ::column_step]))

@@ -15,9 +15,10 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import TypeVar
 
 from unprocess_gen.core.errors import SourceError
 
@@ -25,35 +26,18 @@ _MOST_PIECES = 2**18
 """Largest number of segments or chunks: 2^26 pixels of 16-bit RGBA in pieces of 2 KiB. Walking them takes 0.5 s."""
 
 _MAX_PROFILE_BYTES = 2**22
+_Piece = TypeVar("_Piece")
 _EXIF_PREFIX, _TIFF_MAGIC = b"Exif\0\0", (b"II*\0", b"MM\0*")
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Hold what a file declares about itself.
+    """What a file declares: its size as stored, in pixels, before the EXIF ``orientation`` is applied, and its kind.
 
-    Attributes
-    ----------
-    format : str
-        ``jpeg``, ``png``, ``tiff``, ``webp`` or ``bmp``.
-    width, height : int
-        Size as stored, before the orientation is applied, in pixels.
-    bits : int
-        Bits of the decoded array, 8 or 16.
-    mode : str
-        ``cmyk``, ``white_is_zero``, or empty for other gray and RGB.
-    has_alpha : bool
-        Whether the file has an alpha channel or a transparent colour.
-    orientation : int
-        EXIF orientation, 1 to 8.
-    frames : int
-        Full pages of a TIFF; 2 for an animation.
-    icc : bytes
-        Embedded ICC profile; empty without one.
-    cicp : bytes or None
-        Primaries, transfer, matrix and full-range flag of a PNG (ITU-T H.273), a byte each; they override ``icc``.
-    missing : str
-        What the file lacks if it was cut; empty for a complete file.
+    ``bits`` are those of the decoded array, 8 or 16. ``mode`` is ``cmyk``, ``white_is_zero``, or empty. ``has_alpha``
+    is also true for a transparent colour. ``frames`` counts full pages of a TIFF, and is 2 for an animation. ``cicp``
+    (primaries, transfer, matrix and full-range flag of a PNG, ITU-T H.273) overrides the profile ``icc``. ``missing``
+    says what the file lacks if it was cut.
     """
 
     format: str
@@ -98,7 +82,7 @@ def _unsupported(what: str) -> SourceError:
     return SourceError("unsupported", f"{what}; expected {', '.join(_FORMATS)} of 8 bits, or PNG or TIFF of 16 bits")
 
 
-def _bounded(pieces: Iterable[Any]) -> Iterator[Any]:
+def _bounded(pieces: Iterable[_Piece]) -> Iterator[_Piece]:
     """Yield the pieces of a file; raise SourceError if there are so many that walking them takes long."""
     for count, piece in enumerate(pieces):
         if count == _MOST_PIECES:
@@ -157,8 +141,6 @@ def _jpeg(data: bytes) -> Header:
 
 # PNG ------------------------------------------------------------------------------------------------------------------
 
-_PNG_ALPHA = (4, 6)
-"""Colour types with an alpha channel."""
 _PNG_HEAD = 8
 
 
@@ -180,37 +162,30 @@ def _png(data: bytes) -> Header:
     cicp = chunks.get(b"cICP")
     if cicp is not None and len(cicp) != 4:
         raise _corrupt(f"the cICP chunk has {len(cicp)} bytes, expected 4")
+    icc = chunks.get(b"iCCP", b"")
+    with suppress(zlib.error):  # a broken one stays compressed, and never counts as sRGB
+        icc = zlib.decompressobj().decompress(icc.partition(b"\0")[2][1:], _MAX_PROFILE_BYTES)  # name, zero, method
     return Header(
         "png",
         width,
         height,
         16 if bits == 16 else 8,
-        has_alpha=colour in _PNG_ALPHA or b"tRNS" in chunks,
+        has_alpha=colour in (4, 6) or b"tRNS" in chunks,
         orientation=_orientation(chunks.get(b"eXIf", b"")),
         frames=2 if b"acTL" in chunks else 1,
-        icc=_png_profile(chunks.get(b"iCCP", b"")),
+        icc=icc,
         cicp=cicp,
         missing="" if b"IEND" in chunks else "its IEND chunk",
     )
-
-
-def _png_profile(chunk: bytes) -> bytes:
-    """Decompress iCCP (name, zero, method, deflated bytes); a broken one stays compressed, and never counts as sRGB."""
-    try:
-        return zlib.decompressobj().decompress(chunk.partition(b"\0")[2][1:], _MAX_PROFILE_BYTES)
-    except zlib.error:
-        return chunk
 
 
 # TIFF, and the EXIF block, which is one -------------------------------------------------------------------------------
 
 _TIFF_VALUES = {1: "B", 3: "H", 4: "I", 7: "B", 13: "I"}
 _SUBFILE, _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC = 254, 256, 257, 258, 259, 262
-_STRIP_OFFSETS, _ORIENTATION, _SAMPLES, _STRIP_ROWS, _STRIP_BYTES, _PLANES = 273, 274, 277, 278, 279, 284
+_STRIP_OFFSETS, _ORIENTATION, _SAMPLES, _STRIP_BYTES, _PLANES = 273, 274, 277, 279, 284
 _TILE_WIDTH, _TILE_HEIGHT, _TILE_OFFSETS, _TILE_BYTES, _SAMPLE_FORMAT, _PROFILE = 322, 323, 324, 325, 339, 34675
-_REDUCED_PAGE = 1
-_SEPARATE = 2
-_UNCOMPRESSED = 1
+_REDUCED_PAGE, _SEPARATE, _UNCOMPRESSED = 1, 2, 1
 _TIFF_COMPRESSIONS = (_UNCOMPRESSED, 5, 7, 8, 32773, 32946)
 """None, LZW, JPEG, deflate, PackBits, deflate."""
 _TIFF_WHITE_IS_ZERO, _TIFF_BLACK_IS_ZERO, _TIFF_CMYK, _TIFF_SUBSAMPLED = 0, 1, 5, 6
@@ -248,7 +223,7 @@ class _Directory:
             self.places.setdefault(tag, place)
 
     def values(self, tag: int, default: int) -> tuple[int, ...]:
-        """Return the values of a tag, at least one."""
+        """Values of a tag, at least one."""
         if tag not in self.places:
             return (default,)
         kind, count = struct.unpack_from(self.order + "HI", self.data, self.places[tag] + 2)
@@ -262,7 +237,7 @@ class _Directory:
         return struct.unpack_from(form, self.data, offset) or (default,)
 
     def value(self, tag: int, default: int) -> int:
-        """Return the first value of a tag."""
+        """First value of a tag."""
         return self.values(tag, default)[0]
 
     @property
@@ -350,7 +325,7 @@ def _tiff_missing(page: _Directory) -> str:
 
 
 def tiff_without_orientation(data: bytes) -> bytes | bytearray:
-    """Return the TIFF file with tag 274 set to 1, so that no decoder rotates it; the same bytes if it is 1 already."""
+    """Set tag 274 of a TIFF file to 1, so that no decoder rotates it, in a copy if it is not 1 already."""
     page = next(_directories(data))
     if page.values(_ORIENTATION, 1) == (1,):
         return data
@@ -360,7 +335,7 @@ def tiff_without_orientation(data: bytes) -> bytes | bytearray:
 
 
 def _orientation(block: bytes) -> int:
-    """Return the orientation in an EXIF block; 1 if it is missing or broken, since the pixels are still usable."""
+    """Orientation in an EXIF block; 1 if it is missing or broken, since the pixels are still usable."""
     tiff = block.removeprefix(_EXIF_PREFIX)
     if not tiff.startswith(_TIFF_MAGIC):
         return 1
@@ -397,16 +372,14 @@ def _webp(data: bytes) -> Header:
 
 # BMP ------------------------------------------------------------------------------------------------------------------
 
-_BMP_BITS = (1, 4, 8, 24, 32)
-_BMP_OLD_HEADER = 12
-
 
 def _bmp(data: bytes) -> Header:
     offset, size = struct.unpack_from("<II", data, 10)
-    old = size == _BMP_OLD_HEADER
-    width, height, _, bits = struct.unpack_from("<HHHH" if old else "<iiHH", data, 18)
-    (compression,) = (0,) if old else struct.unpack_from("<I", data, 30)
-    if bits not in _BMP_BITS or compression:
+    if size == 12:  # of OS/2
+        (width, height, _, bits), compression = struct.unpack_from("<HHHH", data, 18), 0
+    else:
+        width, height, _, bits, compression = struct.unpack_from("<iiHHI", data, 18)
+    if bits not in (1, 4, 8, 24, 32) or compression:
         raise _unsupported(f"a BMP of {bits} bits and compression {compression}")
     end = offset + (width * bits + 31) // 32 * 4 * abs(height)
     missing = f"{end - len(data)} bytes of its pixels" if end > len(data) else ""
