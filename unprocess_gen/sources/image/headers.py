@@ -32,7 +32,7 @@ _EXIF_PREFIX, _TIFF_MAGIC = b"Exif\0\0", (b"II*\0", b"MM\0*")
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a file declares: its size as stored, in pixels, before the EXIF ``orientation`` is applied, and its kind.
+    """Header of a picture: its size as stored, in pixels, before the EXIF ``orientation`` is applied, and its kind.
 
     ``bits`` are those of the decoded array, 8 or 16. ``mode`` is ``cmyk``, ``white_is_zero``, or empty. ``has_alpha``
     is also true for a transparent colour. ``frames`` counts full pages of a TIFF, and is 2 for an animation. ``cicp``
