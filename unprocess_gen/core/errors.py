@@ -71,21 +71,9 @@ class LockedError(UnprocessGenError):
 
 
 class SourceError(UnprocessGenError):
-    """Source that cannot be used.
+    """Source that cannot be used, for one of `REASONS`; ``sha256`` is that of its file, if it could be read.
 
-    Parameters
-    ----------
-    reason : str
-        One of `REASONS`.
-    text : str
-        Explanation for the user.
-    sha256 : str, optional
-        SHA-256 of the file, if it could be read.
-
-    Attributes
-    ----------
-    status : str
-        Value of the manifest column ``status``.
+    ``status`` is the value of the manifest column.
     """
 
     status = "failed"

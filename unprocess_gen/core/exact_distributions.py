@@ -19,17 +19,9 @@ LOGISTIC = 1e-12
 
 
 def normal_quantile(p: Decimal) -> Decimal:
-    """Return the quantile of the standard normal distribution.
+    """Quantile of the standard normal distribution with at least 23 correct digits: Newton's method on `normal_cdf`.
 
-    Parameters
-    ----------
-    p : Decimal
-        Probability in [2**-53, 1 - 2**-53].
-
-    Returns
-    -------
-    Decimal
-        Φ⁻¹(p) with at least 23 correct digits: Newton's method on `normal_cdf`.
+    ``p`` is a probability in [2**-53, 1 - 2**-53].
     """
     with localcontext(prec=DIGITS):
         z = Decimal(NormalDist().inv_cdf(float(p)))
@@ -39,34 +31,14 @@ def normal_quantile(p: Decimal) -> Decimal:
 
 
 def normal_density(z: Decimal) -> Decimal:
-    """Return the standard normal density.
-
-    Parameters
-    ----------
-    z : Decimal
-        Position.
-
-    Returns
-    -------
-    Decimal
-        φ(z), in the precision of the current decimal context.
-    """
+    """Standard normal density, in the precision of the current decimal context."""
     return (-z * z / 2).exp() / (2 * PI).sqrt()
 
 
 def normal_cdf(z: Decimal) -> Decimal:
-    """Return the distribution function of the standard normal distribution.
+    """Standard normal distribution function at |z| ≤ 8, in the precision of the current decimal context.
 
-    Parameters
-    ----------
-    z : Decimal
-        Position, at most 8 in magnitude.
-
-    Returns
-    -------
-    Decimal
-        Φ(z) = ½ + φ(z)·(z + z³/3 + z⁵/(3·5) + …) (Abramowitz and Stegun 26.2.11), in the precision of the current
-        decimal context.
+    Φ(z) = ½ + φ(z)·(z + z³/3 + z⁵/(3·5) + …) (Abramowitz and Stegun 26.2.11).
     """
     term = total = z
     k, least = 1, Decimal(10) ** -(DIGITS + 2)
@@ -78,7 +50,7 @@ def normal_cdf(z: Decimal) -> Decimal:
 
 
 def tukey_quantile(tail: Decimal, shape: float) -> Decimal:
-    """Return the quantile 1 - ``tail`` of Tukey's lambda distribution of scale 1, in the current decimal context.
+    """Quantile 1 - ``tail`` of Tukey's lambda distribution of scale 1, in the current decimal context.
 
     It is ((1 - tail)**shape - tail**shape) / shape, or ln((1 - tail) / tail) for shape 0, the logistic distribution.
     """
@@ -89,18 +61,9 @@ def tukey_quantile(tail: Decimal, shape: float) -> Decimal:
 
 
 def tukey_std(shape: float) -> Decimal:
-    """Return the standard deviation of Tukey's lambda distribution of scale 1.
+    """Standard deviation of Tukey's lambda distribution of scale 1 for λ > -½, in the current decimal context.
 
-    Parameters
-    ----------
-    shape : float
-        The distribution's λ, above -½.
-
-    Returns
-    -------
-    Decimal
-        √(2/λ² · (1/(1 + 2λ) - Γ(λ + 1)²/Γ(2λ + 2))), and π/√3 for λ = 0 (Joiner and Rosenblatt, JASA 1971), in the
-        precision of the current decimal context.
+    √(2/λ² · (1/(1 + 2λ) - Γ(λ + 1)²/Γ(2λ + 2))), and π/√3 for λ = 0 (Joiner and Rosenblatt, JASA 1971).
     """
     if abs(shape) < LOGISTIC:
         return PI / Decimal(3).sqrt()
@@ -114,7 +77,7 @@ _SHIFT = 60
 
 
 def _log_gamma(x: Decimal) -> Decimal:
-    """Return ln Γ(x) for x > 0 by Stirling's series at x + 60, whose ninth term is below 1e-30."""
+    """ln Γ(x) for x > 0 by Stirling's series at x + 60, whose ninth term is below 1e-30."""
     product = Decimal(1)
     for step in range(_SHIFT):
         product *= x + step

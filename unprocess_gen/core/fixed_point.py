@@ -1,13 +1,13 @@
 """Exponentials, logarithms and normal quantiles in integers: the quick way to correctly rounded draws.
 
-`exact_distributions` defines drawn parameters with 40 decimal digits, rounded once to float64. That takes up to half a
-millisecond. This module computes an interval that contains the exact value and the one in `decimal`. If all of the
-interval rounds to one float64, that is the drawn parameter. Otherwise, once in some 100,000 draws, the functions return
-None and the caller uses `decimal` (Ziv, ACM TOMS 17, 1991). So both ways give the same digits on every machine: integer
-arithmetic is exact, and Python rounds the quotient of two integers correctly.
+`exact_distributions` defines drawn parameters with 40 decimal digits, rounded once to float64, which takes up to half a
+millisecond. This module computes an interval that contains the exact value and the one in `decimal`. If all of it
+rounds to one float64, that is the drawn parameter. Otherwise, once in some 100,000 draws, functions return None and the
+caller uses `decimal` (Ziv, ACM TOMS 17, 1991). Both ways give the same digits on every machine: integer arithmetic is
+exact, and Python rounds the quotient of two integers correctly.
 
 A number x is the integer next to x · 2**128; one unit is 2**-128. An error is a number of units, at least the distance
-from the exact value. A product or quotient that is rounded down adds one unit. Each docstring derives its error.
+from the exact value. A product or quotient that is rounded down adds one unit. Docstrings derive the errors.
 
 Without this module, planning an image takes up to 0.8 ms longer. Design: ``docs/design/planning.md``.
 """
@@ -37,7 +37,7 @@ QUANTILE_ERROR = 1 << (BITS - 70)
 
 
 def fixed(value: Decimal) -> int:
-    """Return a decimal number as a fixed-point number, within half a unit."""
+    """Fixed-point form of a decimal number, within half a unit."""
     with localcontext(prec=3 * DIGITS):
         return int((value * ONE).to_integral_value())
 
@@ -49,19 +49,9 @@ def times(number: int, factor: float) -> int:
 
 
 def nearest(number: int, error: int) -> float | None:
-    """Return the float64 next to a fixed-point number.
+    """Float64 to which a number and all that are within its error round; None if they round to several.
 
-    Parameters
-    ----------
-    number : int
-        The number, fixed-point.
-    error : int
-        Its error, units. The distance to a result in `decimal` may be larger by 2**-100 of the number.
-
-    Returns
-    -------
-    float or None
-        The float64 to which all possible values round; None if they round to several.
+    The distance to a result in `decimal` may be larger than ``error`` by 2**-100 of the number.
     """
     error += abs(number) >> ROUNDED_BITS
     low, high = (number - error) / ONE, (number + error) / ONE
@@ -69,7 +59,7 @@ def nearest(number: int, error: int) -> float | None:
 
 
 def nearest_inverse(number: int, error: int) -> float | None:
-    """Return the float64 next to 1 divided by a fixed-point number; arguments and None as in `nearest`."""
+    """Float64 next to 1 divided by a fixed-point number, as by `nearest`."""
     error += abs(number) >> ROUNDED_BITS
     if abs(number) <= error:
         return None
@@ -95,35 +85,25 @@ MAX_EXPONENT, MAX_EXPONENT_ERROR = 700 * ONE, ONE >> 32
 
 @functools.cache
 def _exp_of_step(step: int) -> int:
-    """Return e**(step / 256) within one unit."""
+    """e**(step / 256) within one unit."""
     with localcontext(prec=DIGITS + 10):
         return fixed((Decimal(step) / (1 << STEP_BITS)).exp())
 
 
 @functools.cache
 def _ln_of_step(step: int) -> int:
-    """Return ln(step / 256) within one unit."""
+    """ln(step / 256) within one unit."""
     with localcontext(prec=DIGITS + 10):
         return fixed((Decimal(step) / (1 << STEP_BITS)).ln())
 
 
 def exponential(exponent: int, error: int) -> tuple[int, int, int]:
-    """Return an exponential as a mantissa, its error, and the power of two that multiplies both.
+    """Mantissa of e**exponent from 1 to 2.01, its error, and the power of two q that multiplies both.
 
-    e**exponent is 2**q · e**(step / 256) · e**x with 0 ≤ x < 2**-8. The series of e**x lacks less than 1.01 · x**12 /
-    12!, 10 units; its coefficients, rounded down, and its products add 2 units. The product with e**(step / 256) < 2 is
-    the mantissa, below 2.01 and within 28 units of that for the computed x. The error of x, with one unit of ln 2 for
-    each unit of q, moves it by less than 3 times as much.
-
-    Parameters
-    ----------
-    exponent, error : int
-        Exponent and its error, fixed-point; the error is at most `MAX_EXPONENT_ERROR`.
-
-    Returns
-    -------
-    (int, int, int)
-        Mantissa from 1 to 2.01 and its error, fixed-point; q.
+    The error of the exponent is at most `MAX_EXPONENT_ERROR`. e**exponent is 2**q · e**(step / 256) · e**x with 0 ≤ x <
+    2**-8. The series of e**x lacks less than 1.01 · x**12 / 12!, 10 units; its coefficients, rounded down, and its
+    products add 2 units. The product with e**(step / 256) < 2 is the mantissa, within 28 units of that for the computed
+    x. The error of x, with one unit of ln 2 for each unit of q, moves it by less than 3 times as much.
     """
     doublings, rest = divmod(exponent, LN2)
     step = rest >> (BITS - STEP_BITS)
@@ -135,17 +115,9 @@ def exponential(exponent: int, error: int) -> tuple[int, int, int]:
 
 
 def nearest_exp(exponent: int, error: int) -> float | None:
-    """Return the float64 next to an exponential.
+    """Float64 next to e**exponent; None if it is undecided, or the exponent or its error is too large.
 
-    Parameters
-    ----------
-    exponent, error : int
-        Exponent, fixed-point, and its error including `DECIMAL_ERROR`.
-
-    Returns
-    -------
-    float or None
-        None if the possible values round to several float64, or the exponent or its error is too large.
+    ``error`` includes `DECIMAL_ERROR`.
     """
     if abs(exponent) > MAX_EXPONENT or error > MAX_EXPONENT_ERROR:
         return None
@@ -158,13 +130,11 @@ def nearest_exp(exponent: int, error: int) -> float | None:
 
 @functools.lru_cache(maxsize=256)
 def logarithm(x: float) -> tuple[int, int]:
-    """Return the natural logarithm of a positive float and its error, fixed-point.
+    """Natural logarithm of a positive float, and its error.
 
     x is 2**q · m with ½ ≤ m < 1, and ln m is ln(step / 256) + 2·artanh(r) with r = (m - step / 256) / (m + step / 256),
     0 ≤ r < 2**-8. The series lacks less than r**17 / 8, one unit. The quotient, the series and the table add less than
-    7 units, and each unit of q one of ln 2.
-
-    Most draws take the logarithms of constants: limits of a distribution, or the gain at one ISO.
+    7 units, and each unit of q one of ln 2. Most draws take logarithms of constants, which are kept.
     """
     fraction, doublings = math.frexp(x)
     mantissa = int(fraction * 2.0**53)
@@ -196,16 +166,9 @@ _NORMAL = NormalDist()
 class _Node:
     """Taylor series of the upper normal quantile z(tail) at one quantile; see `normal_quantile`.
 
-    Attributes
-    ----------
-    quantile, tail, density : int
-        z, 1 - Φ(z) and φ(z), within one unit.
-    reach : int
-        Largest difference of tails for which the series is used.
-    coefficients : tuple of int
-        From the highest power down to the first.
-    error, error_of_unit : int
-        Error of the series, and error for each unit of error of the tail.
+    ``tail`` and ``density`` are 1 - Φ(z) and φ(z) within one unit, ``reach`` is the largest difference of tails for
+    which the series is used. ``coefficients`` begin with the highest power. ``error_of_unit`` is the error for each
+    unit of error of the tail.
     """
 
     quantile: int
@@ -219,7 +182,7 @@ class _Node:
 
 @functools.cache
 def _derivative(order: int) -> tuple[int, ...]:
-    """Return the polynomial P with d**order z / d(-tail)**order = P(z) / φ(z)**order: its coefficients, constant first.
+    """Coefficients, constant first, of the polynomial P with d**order z / d(-tail)**order = P(z) / φ(z)**order.
 
     P is 1 for the first order. As dz / d(-tail) = 1/φ and φ' = -z·φ, the next P is P' + order · z · P, so no
     coefficient is negative.
@@ -231,7 +194,7 @@ def _derivative(order: int) -> tuple[int, ...]:
 
 
 def _scaled_derivative(order: int, number: int) -> int:
-    """Return P(number / `NODES`) · `NODES`**(order - 1), an integer, where P is the polynomial of `_derivative`."""
+    """P(number / `NODES`) · `NODES`**(order - 1), an integer, where P is the polynomial of `_derivative`."""
     total, scale = 0, 1
     for coefficient in reversed(_derivative(order)):
         total, scale = total * number + coefficient * scale, scale * NODES
@@ -240,7 +203,7 @@ def _scaled_derivative(order: int, number: int) -> int:
 
 @functools.cache
 def _node(number: int) -> _Node:
-    """Return the series at the quantile ``number / 64``, with so many terms that they lack at most 2**-80.
+    """Series at the quantile ``number / 64``, with so many terms that they lack at most 2**-80.
 
     P increases, so its value at the next node, which is beyond `REACH`, limits the first term that is left out. The
     density at the distance `REACH` is φ(z) · e**-x with x = `REACH` · (z + `REACH` / 2); 1 - x is less than e**-x.
@@ -266,7 +229,7 @@ def _node(number: int) -> _Node:
 
 
 def normal_quantile(p: int, error: int) -> tuple[int, int] | None:
-    """Return the quantile of the standard normal distribution and its error, fixed-point.
+    """Quantile of the standard normal distribution and its error with `QUANTILE_ERROR`; None beyond `MAX_QUANTILE`.
 
     The quantile z of the tail min(p, 1 - p) is a Taylor series at the nearest of `NODES`, in powers of t = (tail of the
     node - tail) / φ(node). `statistics.NormalDist` chooses the node; its last bits differ between machines, but any
@@ -277,16 +240,6 @@ def normal_quantile(p: int, error: int) -> tuple[int, int] | None:
     first order left out and P the polynomial of `_derivative`. An error of the tail moves z by 1/φ(z) times as much,
     less than 1.2/φ(node), because `MAX_QUANTILE` · `REACH` is 0.105. Roundings of the node and of t count as less than
     3 units of the tail, roundings of the series as less than 8 units of z.
-
-    Parameters
-    ----------
-    p, error : int
-        Probability in (0, 1) and its error, fixed-point.
-
-    Returns
-    -------
-    (int, int) or None
-        Quantile, and its error including `QUANTILE_ERROR`; None beyond `MAX_QUANTILE`.
     """
     tail = min(p, ONE - p)
     probability = tail / ONE
@@ -309,22 +262,7 @@ def normal_quantile(p: int, error: int) -> tuple[int, int] | None:
 
 
 def nearest_log_linear(uniform: float, x: float, slope: float, intercept: float, std: float) -> float | None:
-    """Return the float64 next to e**(slope · ln x + intercept + std · n), where n is a normal quantile.
-
-    Parameters
-    ----------
-    uniform : float
-        Probability of n.
-    x : float
-        Positive number.
-    slope, intercept, std : float
-        Numbers of the line.
-
-    Returns
-    -------
-    float or None
-        None if the error leaves several float64.
-    """
+    """Float64 next to e**(slope · ln x + intercept + std · n), where n is the normal quantile of ``uniform``."""
     logarithm_x, error = logarithm(x)
     normal = normal_quantile(times(ONE, uniform), 0) if std else (0, 0)
     if normal is None:

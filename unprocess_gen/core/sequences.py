@@ -10,20 +10,7 @@ _Key = TypeVar("_Key")
 
 
 def evenly_spaced(items: Sequence[_Item], count: int) -> list[_Item]:
-    """Return at most ``count`` items at even distances, in order.
-
-    Parameters
-    ----------
-    items : sequence
-        Items to pick from, for example a `range` of numbers.
-    count : int
-        Number of items wanted, 0 or more.
-
-    Returns
-    -------
-    list
-        All items if there are no more than ``count``; otherwise items ``i * len(items) // count``, the first included.
-    """
+    """At most ``count`` items at even distances, in order: items ``i * len(items) // count``, the first included."""
     count = min(count, len(items))
     return [items[i * len(items) // count] for i in range(count)]
 

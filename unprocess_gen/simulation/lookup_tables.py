@@ -40,18 +40,7 @@ CHEBYSHEV_NODES = (0.5 - math.sqrt(3) / 4, 0.5, 0.5 + math.sqrt(3) / 4)
 
 
 def sha256(table: Float) -> str:
-    """Return the SHA-256 of a table.
-
-    Parameters
-    ----------
-    table : ndarray of float64
-        Any shape.
-
-    Returns
-    -------
-    str
-        64 hex digits: the digest of the little-endian values.
-    """
+    """SHA-256 of the little-endian values of a table, 64 hex digits."""
     return hashlib.sha256(table.astype("<f8").tobytes()).hexdigest()
 
 
@@ -67,19 +56,10 @@ def freeze(table: Float, expected_sha256: str | None = None) -> Float:
 
 @functools.lru_cache(maxsize=1)
 def normal_table() -> Float:
-    """Return the table of normal quantiles.
+    """Table of normal quantiles, float64 [1024, 3], read-only; MachineError if it is not the published one.
 
-    Returns
-    -------
-    ndarray of float64, [1024, 3]
-        Coefficients (c0, c1, c2), read-only. Row ``32 e + s`` serves the words j with
-        2**e (1 + s/32) ≤ j < 2**e (1 + (s + 1)/32), whose tail probability is p = j / 2**33. With
-        t = j / 2**e - 1 - s/32 the quantile -Φ⁻¹(p) is c0 + t (c1 + t c2).
-
-    Raises
-    ------
-    MachineError
-        If the table does not have the published SHA-256.
+    Row ``32 e + s`` has the coefficients (c0, c1, c2) for the words j with 2**e (1 + s/32) ≤ j < 2**e (1 + (s + 1)/32),
+    whose tail probability is p = j / 2**33. With t = j / 2**e - 1 - s/32 the quantile -Φ⁻¹(p) is c0 + t (c1 + t c2).
     """
     rows = [_normal_row(octave, segment) for octave in range(OCTAVES) for segment in range(SEGMENTS)]
     grid = np.array(COEFFICIENT_GRID)
@@ -88,22 +68,9 @@ def normal_table() -> Float:
 
 @functools.lru_cache(maxsize=64)
 def tukey_table(shape: float) -> Float:
-    """Return the table of quantiles of Tukey's lambda distribution with variance 1; takes 0.2 s.
+    """Table as `normal_table` of Tukey's lambda distribution with variance 1; takes 0.2 s.
 
-    Parameters
-    ----------
-    shape : float
-        The distribution's λ, in (-½, 10); the variance is infinite up to -½.
-
-    Returns
-    -------
-    ndarray of float64, [1024, 3]
-        Coefficients as in `normal_table`, read-only.
-
-    Raises
-    ------
-    ValueError
-        If ``shape`` is outside its range.
+    ValueError unless the shape λ is in (-½, 10); the variance is infinite up to -½.
     """
     if not -0.5 < shape < 10:
         raise ValueError(f"shape={shape}: Tukey's lambda distribution is not usable; expected a number in (-0.5, 10)")
@@ -120,25 +87,10 @@ def tukey_table(shape: float) -> Float:
 
 @functools.lru_cache(maxsize=64)
 def unit_tukey_table(shape: float) -> Float:
-    """Return `tukey_table` divided by the standard deviation of its draws.
+    """`tukey_table` divided by the standard deviation of its draws, so that it has variance 1 for all shapes.
 
     Random words have 32 bits, so no tail probability is below 2**-33. Quantiles beyond hold 0.02 % of the variance at
-    shape -0.3, 1.5 % at -0.4 and 12 % at -0.45. This table has variance 1 for all shapes.
-
-    Parameters
-    ----------
-    shape : float
-        The distribution's λ, in (-½, 10).
-
-    Returns
-    -------
-    ndarray of float64, [1024, 3]
-        Coefficients as in `normal_table`, read-only.
-
-    Raises
-    ------
-    ValueError
-        If ``shape`` is outside its range.
+    shape -0.3, 1.5 % at -0.4 and 12 % at -0.45.
     """
     table = tukey_table(shape)
     with localcontext(prec=DIGITS):
@@ -147,17 +99,9 @@ def unit_tukey_table(shape: float) -> Float:
 
 
 def draw_variance(table: Float) -> Decimal:
-    """Return the variance of the draws from all 2**32 random words, in the current decimal context.
+    """Mean square of the draws of a symmetric table from all 2**32 random words, in the current decimal context.
 
-    Parameters
-    ----------
-    table : ndarray of float64, [1024, 3]
-        Quadratics of a symmetric distribution, as `normal_table`.
-
-    Returns
-    -------
-    Decimal
-        Mean square of the deviates; rounding of the table's evaluation to float64 is left out.
+    Rounding of the table's evaluation to float64 is left out.
     """
     total = Decimal(0)
     for row, coefficients in enumerate(table.tolist()):
@@ -170,7 +114,7 @@ def draw_variance(table: Float) -> Decimal:
 
 
 def _sum_of_squares(count: int, start: Decimal, step: Decimal, c0: Decimal, c1: Decimal, c2: Decimal) -> Decimal:
-    """Return the sum of (c0 + t (c1 + t c2))² over ``count`` values of t, from ``start`` in steps."""
+    """Sum of (c0 + t (c1 + t c2))² over ``count`` values of t, from ``start`` in steps."""
     a, b, c = c0 + start * (c1 + start * c2), step * (c1 + 2 * start * c2), step * step * c2
     n = count
     first, second = n * (n - 1) // 2, n * (n - 1) * (2 * n - 1) // 6  # sums of the first four powers of 0 … n - 1
@@ -179,32 +123,13 @@ def _sum_of_squares(count: int, start: Decimal, step: Decimal, c0: Decimal, c1: 
 
 
 def quantile_table(law: str, shape: float) -> Float:
-    """Return the table of quantiles of a distribution of the read noise.
-
-    Parameters
-    ----------
-    law : str
-        ``gaussian`` or ``tukey_lambda``.
-    shape : float
-        Shape of Tukey's lambda distribution.
-
-    Returns
-    -------
-    ndarray of float64, [1024, 3]
-        Table for standard deviation 1, as `normal_table`; read-only.
-    """
+    """Table of a distribution of the read noise, ``gaussian`` or ``tukey_lambda``, for standard deviation 1."""
     return normal_table() if law == "gaussian" else unit_tukey_table(shape)
 
 
 @functools.lru_cache(maxsize=1)
 def exponential_levels() -> Float:
-    """Return 1024 equally likely values of the exponential distribution of mean 1.
-
-    Returns
-    -------
-    ndarray of float64, [1024]
-        Ascending quantiles at the centres of 1024 equal probabilities, divided by their mean; read-only.
-    """
+    """Quantiles of the exponential distribution at the centres of 1024 equal probabilities, divided by their mean."""
     with localcontext(prec=DIGITS):
         levels = [-((1023 - step + Decimal("0.5")) / 1024).ln() for step in range(1024)]
         mean = sum(levels, Decimal(0)) / 1024
@@ -212,14 +137,14 @@ def exponential_levels() -> Float:
 
 
 def _normal_row(octave: int, segment: int) -> tuple[float, float, float]:
-    """Return the unrounded coefficients of one row of the normal table."""
+    """Unrounded coefficients of one row of the normal table."""
     quantile = NormalDist().inv_cdf
     z = [-quantile(math.ldexp(1 + segment / SEGMENTS + node / SEGMENTS, octave - 33)) for node in CHEBYSHEV_NODES]
     return _interpolate(z)
 
 
 def _interpolate(z: Sequence[float]) -> tuple[float, float, float]:
-    """Return the quadratic in the position within a segment that has the values ``z`` at `CHEBYSHEV_NODES`."""
+    """Quadratic in the position within a segment that has the values ``z`` at `CHEBYSHEV_NODES`."""
     t = [node / SEGMENTS for node in CHEBYSHEV_NODES]
     slope01, slope12 = (z[1] - z[0]) / (t[1] - t[0]), (z[2] - z[1]) / (t[2] - t[1])
     c2 = (slope12 - slope01) / (t[2] - t[0])
@@ -236,7 +161,7 @@ FLOAT32_LINE_ERROR = 2.0**-21
 
 
 class QuantileLines(NamedTuple):
-    """Approximate a symmetric distribution in float32 by lines start + slope·f; the last one is the median."""
+    """Approximation of a symmetric distribution in float32 by lines start + slope·f; the last one is the median."""
 
     start: NDArray[np.float32]
     slope: NDArray[np.float32]
@@ -244,7 +169,7 @@ class QuantileLines(NamedTuple):
 
 
 def quantile_lines(table: Float) -> QuantileLines:
-    """Return lines for a table of quadratics ``[1024, 3]``: 128 for each octave, which halve the errors of chords."""
+    """Lines for a table of quadratics ``[1024, 3]``: 128 for each octave, which halve the errors of chords."""
     per_segment = LINES_PER_OCTAVE // SEGMENTS
     rows = np.repeat(table, per_segment, axis=0)
     t = np.arange(per_segment + 1) / LINES_PER_OCTAVE

@@ -44,28 +44,11 @@ DIFFERENCES = 4
 
 
 def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
-    """Return the curve from code to linear light.
+    """Curve from code to linear light: float64 [codes], from 0 to 1, correctly rounded, read-only.
 
-    Parameters
-    ----------
-    tone : str
-        Tone curve to invert: ``"smoothstep"`` (3x² - 2x³) or ``"none"``.
-    gamma : float or str
-        Exponent of the expansion, or ``"srgb"`` for the piecewise curve of IEC 61966-2-1.
-    codes : int
-        Number of codes: 256 or 65,536.
-
-    Returns
-    -------
-    ndarray of float64, [codes]
-        Entry k is the linear light of code k, correctly rounded; from 0 to 1, ascending, read-only.
-
-    Raises
-    ------
-    ValueError
-        If ``tone`` is unknown.
-    MachineError
-        If a published curve has another SHA-256 or the package data is missing.
+    ``tone`` is ``smoothstep`` (3x² - 2x³) or ``none``, ``gamma`` an exponent or ``srgb`` (IEC 61966-2-1), ``codes`` 256
+    or 65,536. Raises ValueError for an unknown tone, MachineError if a published curve differs or the package data is
+    missing.
     """
     if tone not in EXACT_INVERSE_TONES:
         raise ValueError(f"tone={tone}: unknown tone curve; expected one of {', '.join(EXACT_INVERSE_TONES)}")
@@ -81,7 +64,7 @@ def _linear_table(tone: str, gamma: str, codes: int) -> Float:
 
 
 def smoothstep_inverse(x: Decimal) -> Decimal:
-    """Return the y in [0, 1] with 3y² - 2y³ = x, for x in [0, 1], by Newton's method."""
+    """The y in [0, 1] with 3y² - 2y³ = x, for x in [0, 1], by Newton's method."""
     if x > Decimal("0.5"):
         return 1 - smoothstep_inverse(1 - x)
     if x == 0:
@@ -93,7 +76,7 @@ def smoothstep_inverse(x: Decimal) -> Decimal:
 
 
 def srgb_expand(v: Decimal) -> Decimal:
-    """Return the linear light of an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    """Linear light of an sRGB value in [0, 1] (IEC 61966-2-1)."""
     if v <= Decimal("0.04045"):
         return v / Decimal("12.92")
     return Decimal(((v + Decimal("0.055")) / Decimal("1.055")) ** Decimal("2.4"))
@@ -103,7 +86,7 @@ EXACT_INVERSE_TONES: dict[str, Callable[[Decimal], Decimal]] = {"smoothstep": sm
 
 
 def exact_curve(tone: str, gamma: str, code: int, codes: int) -> Decimal:
-    """Return the linear light of one code to `DIGITS` digits; ``gamma`` is spelled as by `types.gamma_text`."""
+    """Linear light of one code to `DIGITS` digits; ``gamma`` is spelled as by `gamma_text`."""
     with localcontext(prec=DIGITS):
         v = EXACT_INVERSE_TONES[tone](Decimal(code) / (codes - 1))
         if gamma == "srgb":

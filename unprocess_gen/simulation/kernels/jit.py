@@ -35,18 +35,7 @@ PREFIX = "unprocess_gen-"
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a kernel that Python calls, and cache its machine code.
-
-    Parameters
-    ----------
-    function : callable
-        Function in the subset of Python that Numba compiles.
-
-    Returns
-    -------
-    callable
-        Numba dispatcher. It compiles at the first call with new argument types.
-    """
+    """Compile a kernel that Python calls, at its first call with new argument types, and cache its machine code."""
     return _compile(function, no_cfunc_wrapper=True)
 
 
@@ -54,16 +43,6 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel that only other kernels call, without the entry point for Python.
 
     Omitting the entry point saves a third of the compilation time.
-
-    Parameters
-    ----------
-    function : callable
-        Function in the subset of Python that Numba compiles.
-
-    Returns
-    -------
-    callable
-        Numba dispatcher, for use in kernels only.
     """
     return _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -72,19 +51,10 @@ _INNER_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cpython_wrappe
 
 
 def by_class(implementations: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
-    """Return a function that calls one of several kernels, chosen by the class of its first argument.
+    """Make a function for kernels that calls one of several, chosen by the class of its first argument, a named tuple.
 
-    Compiled kernels contain only the chosen one, because Numba knows the class when it compiles them.
-
-    Parameters
-    ----------
-    implementations : mapping of class to callable
-        Return values of `inner`, or plain functions, by class of named tuple; all take the same number of arguments.
-
-    Returns
-    -------
-    callable
-        Function for use in kernels.
+    Compiled kernels contain only the chosen one, because Numba knows the class when it compiles them. All take the same
+    number of arguments.
     """
 
     def call(first: Any, *others: Any) -> Any:
@@ -105,31 +75,17 @@ def _implementation(implementations: Mapping[type, Any], kind: type) -> Any:
 
 
 def has_run(kernels: str) -> bool:
-    """Return whether `note_run` was called with this name since the sources changed, so that nothing is compiled.
+    """True if `note_run` was called for a set of kernels since the sources changed, so that nothing is compiled.
 
-    Parameters
-    ----------
-    kernels : str
-        Name of a set of kernels.
-
-    Returns
-    -------
-    bool
-        True also if nothing is compiled at all (``NUMBA_DISABLE_JIT=1``). Another processor or version of Numba may
-        compile again.
+    True also if nothing is compiled at all (``NUMBA_DISABLE_JIT=1``). Another processor or version of Numba may compile
+    again.
     """
     folder = kernel_cache_folder()
     return bool(numba_config.DISABLE_JIT) or (folder is not None and (folder / f"{kernels}.run").exists())
 
 
 def note_run(kernels: str) -> None:
-    """Record next to the machine code that a set of kernels has run.
-
-    Parameters
-    ----------
-    kernels : str
-        Name of a set of kernels.
-    """
+    """Record next to the machine code that a set of kernels has run."""
     folder = kernel_cache_folder()
     if folder is not None and not numba_config.DISABLE_JIT:
         with contextlib.suppress(OSError):  # only a message of progress depends on it
@@ -138,9 +94,9 @@ def note_run(kernels: str) -> None:
 
 @functools.cache
 def kernel_cache_folder() -> Path | None:
-    """Return the folder for machine code of the current sources, or None if there is no place to write it.
+    """Folder for machine code of the current sources; None if there is no place to write it.
 
-    The folder is in ``NUMBA_CACHE_DIR`` if this variable is set, else in the package's ``__pycache__``, else in
+    It is in ``NUMBA_CACHE_DIR`` if this variable is set, else in the package's ``__pycache__``, else in
     ``$XDG_CACHE_HOME/unprocess_gen`` (``~/.cache/unprocess_gen`` by default).
     """
     package = Path(__file__).parents[2]
@@ -166,7 +122,7 @@ def kernel_cache_folder() -> Path | None:
 
 
 def source_digest(package: Path) -> str:
-    """Return a digest of the names and contents of all files below `KERNEL_PACKAGES`, 16 hex digits."""
+    """Digest of the names and contents of all files below `KERNEL_PACKAGES`, 16 hex digits."""
     digest = hashlib.sha256()
     for name in KERNEL_PACKAGES:
         paths = sorted((package / name).rglob("*.py"))
@@ -186,7 +142,7 @@ def _remove_others(folder: Path) -> None:
 
 
 def _compile(function: Callable[..., Any], **options: bool) -> Callable[..., Any]:
-    """Return Numba's dispatcher, with a cache only if it is in `kernel_cache_folder`."""
+    """Dispatcher of Numba, with a cache only if it is in `kernel_cache_folder`."""
     compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", fastmath=False, **options)
     folder = kernel_cache_folder()
     if folder is None:
