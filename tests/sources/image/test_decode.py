@@ -97,43 +97,34 @@ def reason_of(data: bytes, *, max_pixels: int = 2**26, icc: str = "ignore") -> s
 
 # Pixels are exact -----------------------------------------------------------------------------------------------------
 
-LOSSLESS: dict[str, Callable[[np.ndarray], bytes]] = {
-    "png": lambda pixels: pillow(pixels, "PNG"),
-    "webp": lambda pixels: pillow(pixels, "WEBP", lossless=True),
-    "bmp": lambda pixels: pillow(pixels, "BMP"),
-    "tiff": lambda pixels: tiff(pixels),
-    "tiff, big-endian": lambda pixels: tiff(pixels, byteorder=">"),
-    "tiff, deflated": lambda pixels: tiff(pixels, compression="zlib", predictor=True),
-    "tiff, PackBits": lambda pixels: pillow(pixels, "TIFF", compression="packbits"),
-    "tiff, tiles": lambda pixels: tiff(pixels, tile=(32, 32)),
-    "tiff, strips": lambda pixels: tiff(pixels, rowsperstrip=2),
-    "tiff, planes": lambda pixels: tiff(np.moveaxis(pixels, -1, 0).copy(), planarconfig="separate"),
+Write = Callable[[np.ndarray], bytes]
+LOSSLESS: dict[str, tuple[Any, Write]] = {
+    "png": (np.uint8, lambda pixels: pillow(pixels, "PNG")),
+    "png, 16 bits": (np.uint16, lambda pixels: cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()),
+    "webp": (np.uint8, lambda pixels: pillow(pixels, "WEBP", lossless=True)),
+    "bmp": (np.uint8, lambda pixels: pillow(pixels, "BMP")),
+    "tiff": (np.uint8, tiff),
+    "tiff, big-endian": (np.uint8, lambda pixels: tiff(pixels, byteorder=">")),
+    "tiff, deflated": (np.uint8, lambda pixels: tiff(pixels, compression="zlib", predictor=True)),
+    "tiff, PackBits": (np.uint8, lambda pixels: pillow(pixels, "TIFF", compression="packbits")),
+    "tiff, tiles": (np.uint8, lambda pixels: tiff(pixels, tile=(32, 32))),
+    "tiff, strips": (np.uint8, lambda pixels: tiff(pixels, rowsperstrip=2)),
+    "tiff, planes": (np.uint8, lambda pixels: tiff(np.moveaxis(pixels, -1, 0).copy(), planarconfig="separate")),
+    "tiff, 16 bits": (np.uint16, tiff),
+    "tiff, 16 bits, big-endian": (np.uint16, lambda pixels: tiff(pixels, byteorder=">")),
+    "tiff, 16 bits, tiles": (np.uint16, lambda pixels: tiff(pixels, tile=(16, 16))),
 }
 
 
 @pytest.mark.parametrize("kind", LOSSLESS)
 def test_lossless_pixels_are_exact(kind: str) -> None:
+    dtype, write = LOSSLESS[kind]
     for size in SIZES:
-        stored = noise(*size)
-        np.testing.assert_array_equal(pixels_of(LOSSLESS[kind](stored)), stored, f"{size}", strict=True)
+        stored = noise(*size, dtype)
+        np.testing.assert_array_equal(pixels_of(write(stored)), stored, f"{size}", strict=True)
 
 
-DEEP: dict[str, Callable[[np.ndarray], bytes]] = {
-    "png": lambda pixels: cv2.imencode(".png", pixels[..., ::-1])[1].tobytes(),
-    "tiff": lambda pixels: tiff(pixels),
-    "tiff, big-endian": lambda pixels: tiff(pixels, byteorder=">"),
-    "tiff, tiles": lambda pixels: tiff(pixels, tile=(16, 16)),
-}
-
-
-@pytest.mark.parametrize("kind", DEEP)
-def test_16_bit_pixels_are_exact(kind: str) -> None:
-    for size in SIZES:
-        stored = noise(*size, np.uint16)
-        np.testing.assert_array_equal(pixels_of(DEEP[kind](stored)), stored, f"{size}", strict=True)
-
-
-GRAY: dict[str, Callable[[np.ndarray], bytes]] = {
+GRAY: dict[str, Write] = {
     "png": lambda gray: cv2.imencode(".png", gray)[1].tobytes(),
     "tiff": lambda gray: tiff(gray, "minisblack"),
     "tiff, white is zero": lambda gray: tiff(np.iinfo(gray.dtype).max - gray, "miniswhite"),
@@ -155,17 +146,10 @@ def test_few_bits_of_gray_are_spread_over_all_codes() -> None:
     np.testing.assert_array_equal(pixels_of(tiff(stored, "minisblack"))[..., 1], stored * np.uint8(255))
 
 
-PALETTES: dict[str, Callable[[Image.Image], bytes]] = {
-    "png": lambda image: pillow(image, "PNG"),
-    "bmp": lambda image: pillow(image, "BMP"),
-    "tiff": lambda image: pillow(image, "TIFF"),
-}
-
-
-@pytest.mark.parametrize("kind", PALETTES)
+@pytest.mark.parametrize("kind", ["PNG", "BMP", "TIFF"])
 def test_palettes_become_rgb(kind: str) -> None:
     image = Image.fromarray(smooth()).quantize(4)
-    np.testing.assert_array_equal(pixels_of(PALETTES[kind](image)), np.asarray(image.convert("RGB")), strict=True)
+    np.testing.assert_array_equal(pixels_of(pillow(image, kind)), np.asarray(image.convert("RGB")), strict=True)
 
 
 @pytest.mark.parametrize(("subsampling", "progressive"), [(0, True), (2, False)], ids=["444", "420"])
@@ -182,8 +166,9 @@ def test_lossy_pixels_are_read_in_rgb_order(kind: str, options: dict[str, str]) 
     assert np.abs(difference).mean() < 8
 
 
-def test_a_bmp_stored_top_down_is_upright() -> None:
+def test_a_bmp_may_be_stored_top_down_or_with_an_unused_byte() -> None:
     assert pixels_of(bmp(1, -2, 24, b"\3\2\1\0\6\5\4\0")).tolist() == [[[1, 2, 3]], [[4, 5, 6]]]
+    assert pixels_of(bmp(1, 1, 32, b"\3\2\1\0")).tolist() == [[[1, 2, 3]]]
 
 
 # Orientation ----------------------------------------------------------------------------------------------------------
@@ -228,10 +213,6 @@ def test_orientation_is_applied_once(kind: str) -> None:
         assert photograph.orientation == turn
 
 
-def test_orientation_of_an_exif_chunk_behind_the_pixels_counts() -> None:
-    assert probe(png(1, 8, 2, b"abc", after=chunk(b"eXIf", exif(5)[6:]))).orientation == 5
-
-
 @pytest.mark.parametrize("kind", ["jpeg", "tiff"])
 def test_an_orientation_that_does_not_exist_is_1(kind: str) -> None:
     dtype, write = ORIENTED[kind]
@@ -240,14 +221,19 @@ def test_an_orientation_that_does_not_exist_is_1(kind: str) -> None:
         assert (photograph.orientation, photograph.srgb.shape) == (1, (4, 6, 3)), value
 
 
-@pytest.mark.parametrize("block", [b"", b"Exif\0\0garbage", exif(6)[:20]])
-def test_a_broken_exif_block_is_no_reason_to_refuse_pixels(block: bytes) -> None:
-    assert decode(pillow(smooth(), "JPEG", exif=block or b"\0"), max_pixels=2**26, icc="ignore").orientation == 1
-
-
-def test_a_broken_thumbnail_directory_does_not_hide_the_orientation() -> None:
-    block = exif(6)[:-4] + struct.pack("<I", 2**31)
-    assert probe(pillow(smooth(), "JPEG", exif=block)).orientation == 6
+@pytest.mark.parametrize(
+    ("data", "orientation"),
+    [
+        (pillow(smooth(), "JPEG", exif=b"\0"), 1),
+        (pillow(smooth(), "JPEG", exif=b"Exif\0\0garbage"), 1),
+        (pillow(smooth(), "JPEG", exif=exif(6)[:20]), 1),
+        (pillow(smooth(), "JPEG", exif=exif(6)[:-4] + struct.pack("<I", 2**31)), 6),
+        (png(1, 8, 2, b"abc", after=chunk(b"eXIf", exif(5)[6:])), 5),
+    ],
+    ids=["no block", "no directory", "a cut directory", "a broken thumbnail", "behind the pixels"],
+)
+def test_a_broken_exif_block_is_no_reason_to_refuse_pixels(data: bytes, orientation: int) -> None:
+    assert decode(data, max_pixels=2**26, icc="ignore").orientation == orientation
 
 
 # Alpha ----------------------------------------------------------------------------------------------------------------
@@ -281,11 +267,6 @@ def test_alpha_is_dropped_if_all_pixels_are_opaque_and_refused_otherwise(kind: s
     assert reason_of(write(with_alpha(np.iinfo(dtype).max - 1, dtype))) == "alpha"
 
 
-def test_gray_png_with_alpha() -> None:
-    assert pixels_of(png(2, 8, 4, bytes([5, 255, 170, 255])))[0, :, 0].tolist() == [5, 170]
-    assert reason_of(png(2, 8, 4, bytes([5, 255, 170, 254]))) == "alpha"
-
-
 PALETTE = chunk(b"PLTE", bytes(range(12)))
 # colour type, bits, row, a tRNS that no pixel meets, one that a pixel meets
 TRANSPARENT_KEYS = {
@@ -304,25 +285,11 @@ def test_transparent_png_colour_is_refused_if_a_pixel_has_it_and_dropped_otherwi
     np.testing.assert_array_equal(dropped, pixels_of(png(4, bits, colour, row, before)))
 
 
-def test_gray_with_transparency_is_refused() -> None:
-    assert reason_of(png(4, 8, 0, b"\5\6\7\x08", chunk(b"tRNS", b"\0\4"))) == "alpha"
-    assert reason_of(tiff(noise(3, 4, channels=2), "minisblack", extrasamples=["unassalpha"])) == "alpha"
-
-
-def test_unused_byte_of_a_32_bit_bmp_is_ignored() -> None:
-    assert pixels_of(bmp(1, 1, 32, b"\3\2\1\0")).tolist() == [[[1, 2, 3]]]
+def test_gray_with_alpha_is_accepted_where_opencv_keeps_it() -> None:
+    assert pixels_of(png(2, 8, 4, bytes([5, 255, 170, 255])))[0, :, 0].tolist() == [5, 170]
 
 
 # Refusals -------------------------------------------------------------------------------------------------------------
-
-
-def test_no_bytes_are_empty() -> None:
-    assert reason_of(b"") == "empty"
-
-
-@pytest.mark.parametrize("data", [b"GIF89a" + bytes(40), b"hello", b"\0", b"\0\0\0\x1cftypheic", b"II+\0\x08\0\0\0"])
-def test_other_formats_are_unsupported(data: bytes) -> None:
-    assert reason_of(data) == "unsupported"
 
 
 @pytest.mark.parametrize(("brand", "name"), [(b"heic", "HEIC"), (b"avif", "AVIF")])
@@ -333,38 +300,44 @@ def test_heif_content_is_named_with_advice(brand: bytes, name: str) -> None:
 
 
 GRADES = noise(4, 6, channels=1)[..., 0]
-UNSUPPORTED = {
-    "12-bit jpeg": pillow(smooth(), "JPEG").replace(b"\xff\xc0\0\x11\x08", b"\xff\xc0\0\x11\x0c"),
-    "float tiff": tiff(GRADES.astype(np.float32), "minisblack"),
-    "signed tiff": tiff(GRADES.astype(np.int16), "minisblack"),
-    "lab tiff": tiff(noise(4, 6), "cielab"),
-    "planes of 16 bits": tiff(noise(3, 40, np.uint16, 61), planarconfig="separate"),
-    "small tiles": tiff(noise(40, 61), tile=(16, 16)),
-    "lzma tiff": tiff(noise(4, 6), compression="lzma"),
-    "huge tiles": retagged(tiff(noise(40, 61), tile=(32, 64), compression="zlib"), {322: 2**15, 323: 2**15}),
-    "thumbnail first": tiff(noise(4, 6), subfiletype=1),
-    "16-bit bmp": bmp(1, 1, 16, b"\x1f\x7c\0\0"),
-    "bmp with masks": bmp(1, 1, 32, bytes(4), (0xFF0000, 0xFF00, 0xFF, 0)),
+CMYK = Image.new("CMYK", (5, 4), (10, 20, 30, 40))
+MORE = {"save_all": True, "append_images": [Image.fromarray(smooth(seed=seed)) for seed in (50, 90)]}
+REFUSED = {
+    "nothing": (b"", "empty"),
+    "gif": (b"GIF89a" + bytes(40), "unsupported"),
+    "text": (b"hello", "unsupported"),
+    "zero": (b"\0", "unsupported"),
+    "heic": (b"\0\0\0\x1cftypheic", "unsupported"),
+    "big tiff": (b"II+\0\x08\0\0\0", "unsupported"),
+    "12-bit jpeg": (pillow(smooth(), "JPEG").replace(b"\xff\xc0\0\x11\x08", b"\xff\xc0\0\x11\x0c"), "unsupported"),
+    "float tiff": (tiff(GRADES.astype(np.float32), "minisblack"), "unsupported"),
+    "signed tiff": (tiff(GRADES.astype(np.int16), "minisblack"), "unsupported"),
+    "lab tiff": (tiff(noise(4, 6), "cielab"), "unsupported"),
+    "planes of 16 bits": (tiff(noise(3, 40, np.uint16, 61), planarconfig="separate"), "unsupported"),
+    "small tiles": (tiff(noise(40, 61), tile=(16, 16)), "unsupported"),
+    "lzma tiff": (tiff(noise(4, 6), compression="lzma"), "unsupported"),
+    "huge tiles": (
+        retagged(tiff(noise(40, 61), tile=(32, 64), compression="zlib"), {322: 2**15, 323: 2**15}),
+        "unsupported",
+    ),
+    "thumbnail first": (tiff(noise(4, 6), subfiletype=1), "unsupported"),
+    "16-bit bmp": (bmp(1, 1, 16, b"\x1f\x7c\0\0"), "unsupported"),
+    "bmp with masks": (bmp(1, 1, 32, bytes(4), (0xFF0000, 0xFF00, 0xFF, 0)), "unsupported"),
+    "inks, jpeg": (pillow(CMYK, "JPEG"), "cmyk"),
+    "inks, tiff": (pillow(CMYK, "TIFF"), "cmyk"),
+    "animated png": (pillow(smooth(), "PNG", **MORE), "animated"),
+    "animated webp": (pillow(smooth(), "WEBP", **MORE), "animated"),
+    "pages of a tiff": (pillow(smooth(), "TIFF", **MORE), "animated"),
+    "gray png of alpha": (png(2, 8, 4, bytes([5, 255, 170, 254])), "alpha"),
+    "gray png of a transparent value": (png(4, 8, 0, b"\5\6\7\x08", chunk(b"tRNS", b"\0\4")), "alpha"),
+    "gray tiff of alpha": (tiff(noise(3, 4, channels=2), "minisblack", extrasamples=["unassalpha"]), "alpha"),
 }
 
 
-@pytest.mark.parametrize("kind", UNSUPPORTED)
-def test_kinds_that_opencv_would_read_wrongly_are_unsupported(kind: str) -> None:
-    assert reason_of(UNSUPPORTED[kind]) == "unsupported"
-
-
-CMYK = Image.new("CMYK", (5, 4), (10, 20, 30, 40))
-
-
-@pytest.mark.parametrize("kind", ["JPEG", "TIFF"])
-def test_printing_inks_are_refused(kind: str) -> None:
-    assert reason_of(pillow(CMYK, kind)) == "cmyk"
-
-
-@pytest.mark.parametrize("kind", ["PNG", "WEBP", "TIFF"])
-def test_more_than_one_picture_is_animated(kind: str) -> None:
-    more = [Image.fromarray(smooth(seed=seed)) for seed in (50, 90)]
-    assert reason_of(pillow(smooth(), kind, save_all=True, append_images=more)) == "animated"
+@pytest.mark.parametrize("kind", REFUSED)
+def test_pictures_that_cannot_be_read_correctly_are_refused(kind: str) -> None:
+    data, reason = REFUSED[kind]
+    assert reason_of(data) == reason
 
 
 def test_thumbnail_page_next_to_a_full_one_is_accepted() -> None:
@@ -405,19 +378,32 @@ def test_only_srgb_profiles_are_accepted_when_asked(kind: str) -> None:
         assert reason_of(pillow(smooth(), kind, icc_profile=profile), icc="refuse") == "icc"
 
 
-def test_ignored_profiles_leave_pixels_unchanged() -> None:
-    data = pillow(smooth(), "PNG", icc_profile=swapped_primaries())
-    np.testing.assert_array_equal(pixels_of(data, icc="ignore"), smooth())
-
-
 def test_profile_in_many_segments_is_joined() -> None:
     profile = SRGB + bytes(150_000)
     assert probe(pillow(smooth(), "JPEG", icc_profile=profile)).icc == profile
 
 
-def test_broken_png_profile_is_refused_under_icc_refuse() -> None:
-    data = png(1, 8, 2, b"abc", chunk(b"iCCP", b"name\0\0not deflated"))
-    assert reason_of(data, icc="refuse") == "icc"
+def with_cicp(primaries: int, transfer: int, matrix: int = 0, full_range: int = 1, **options: object) -> bytes:
+    """Return a PNG that declares its colours by code points (cICP, before the pixels)."""
+    data = pillow(smooth(), "PNG", **options)
+    return data[:33] + chunk(b"cICP", bytes((primaries, transfer, matrix, full_range))) + data[33:]
+
+
+@pytest.mark.parametrize("codes", [(9, 16), (9, 18), (1, 8), (1, 13, 9, 1), (1, 13, 0, 0)])
+def test_png_whose_codes_are_not_display_referred_rgb_is_unsupported(codes: tuple[int, ...]) -> None:
+    assert reason_of(with_cicp(*codes)) == "unsupported"
+
+
+def test_broken_profiles_and_other_primaries_are_refused_when_asked() -> None:
+    assert reason_of(png(1, 8, 2, b"abc", chunk(b"iCCP", b"name\0\0not deflated")), icc="refuse") == "icc"
+    assert reason_of(with_cicp(12, 13), icc="refuse") == "icc"
+    for data in (with_cicp(12, 13), pillow(smooth(), "PNG", icc_profile=swapped_primaries())):
+        np.testing.assert_array_equal(pixels_of(data, icc="ignore"), smooth())
+
+
+def test_srgb_code_points_override_the_profile_of_a_png() -> None:
+    data = with_cicp(1, 13, icc_profile=swapped_primaries())
+    np.testing.assert_array_equal(pixels_of(data, icc="refuse"), smooth())
 
 
 # Truncation and damage ------------------------------------------------------------------------------------------------
@@ -461,7 +447,11 @@ def test_bytes_after_the_end_are_accepted(kind: str) -> None:
         np.testing.assert_array_equal(pixels_of(CUTTABLE[kind] + tail), pixels_of(CUTTABLE[kind]))
 
 
+NOISY = pillow(noise(64, 64), "JPEG", quality=85)
+DEFLATED = pillow(noise(64, 64), "TIFF", compression="tiff_deflate")
 CORRUPT = {
+    **{f"jpeg without bytes from {cut}": NOISY[: cut + 400] + NOISY[-2:] for cut in (300, 1410, 2890)},
+    "tiff of broken data": DEFLATED[:400] + bytes(byte ^ 0x55 for byte in DEFLATED[400:460]) + DEFLATED[460:],
     "jpeg without a frame": b"\xff\xd8\xff\xe0\0\4ab\xff\xd9",
     "jpeg of height 0": pillow(smooth(), "JPEG").replace(struct.pack(">HH", 40, 61), struct.pack(">HH", 0, 61), 1),
     "png with a flipped bit": CUTTABLE["png"][:-40] + bytes([CUTTABLE["png"][-40] ^ 1]) + CUTTABLE["png"][-39:],
@@ -502,23 +492,11 @@ def test_a_header_is_what_pillow_reads(kind: str) -> None:
         assert header.format == (image.format or "").lower()
 
 
-# What a file lost from its middle -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("cut", [300, 1410, 2890])
-def test_jpeg_without_its_middle_is_corrupt(cut: int) -> None:
-    data = pillow(noise(64, 64), "JPEG", quality=85)
-    assert reason_of(data[: cut + 400] + data[-2:]) == "corrupt"
-
-
-def test_a_tiff_whose_compressed_data_are_broken_is_corrupt() -> None:
-    data = bytearray(pillow(noise(64, 64), "TIFF", compression="tiff_deflate"))
-    data[400:460] = bytes(byte ^ 0x55 for byte in data[400:460])
-    assert reason_of(bytes(data)) == "corrupt"
+# Messages of codecs ---------------------------------------------------------------------------------------------------
 
 
 def test_a_refusal_leaves_stderr_clean(capfd: pytest.CaptureFixture[str]) -> None:
-    test_jpeg_without_its_middle_is_corrupt(1410)
+    test_damage_is_corrupt("jpeg without bytes from 1410")
     assert capfd.readouterr().err == ""
 
 
@@ -535,27 +513,6 @@ def test_codec_warning_is_logged_with_the_name_of_its_file(
     decode(pillow(smooth(), "PNG"), max_pixels=2**26, icc="ignore", name="sub/a.png")
     assert caplog.messages == ["sub/a.png: something harmless"]
     assert capfd.readouterr().err == ""
-
-
-def with_cicp(primaries: int, transfer: int, matrix: int = 0, full_range: int = 1, **options: object) -> bytes:
-    """Return a PNG that declares its colours by code points (cICP, before the pixels)."""
-    data = pillow(smooth(), "PNG", **options)
-    return data[:33] + chunk(b"cICP", bytes((primaries, transfer, matrix, full_range))) + data[33:]
-
-
-@pytest.mark.parametrize("codes", [(9, 16), (9, 18), (1, 8), (1, 13, 9, 1), (1, 13, 0, 0)])
-def test_png_whose_codes_are_not_display_referred_rgb_is_unsupported(codes: tuple[int, ...]) -> None:
-    assert reason_of(with_cicp(*codes)) == "unsupported"
-
-
-def test_other_primaries_of_a_png_are_treated_like_a_profile() -> None:
-    assert reason_of(with_cicp(12, 13), icc="refuse") == "icc"
-    np.testing.assert_array_equal(pixels_of(with_cicp(12, 13), icc="ignore"), smooth())
-
-
-def test_srgb_code_points_override_the_profile_of_a_png() -> None:
-    data = with_cicp(1, 13, icc_profile=swapped_primaries())
-    np.testing.assert_array_equal(pixels_of(data, icc="refuse"), smooth())
 
 
 def test_reason_of_damage_does_not_depend_on_the_codec_version(monkeypatch: pytest.MonkeyPatch) -> None:
