@@ -65,7 +65,8 @@ def profile_at(noise: NoiseConfig, iso: float) -> Physics | None:
     assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
     sensor = SensorConfig(noise.bits, noise.black_level_dn, noise.white_level_dn)
     config = Config(noise=replace(noise, iso=iso), sensor=sensor)
-    return PhysicalNoise(config).draw([0.5] * DRAW_COUNT, 0, 0)
+    profile = PhysicalNoise(config)
+    return profile.physics(profile.draw([0.5] * DRAW_COUNT, 0, 0))
 
 
 def by_colour(physics: Physics) -> tuple[float, ...]:

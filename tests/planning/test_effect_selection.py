@@ -24,8 +24,8 @@ from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, Plan, Srgb
-from unprocess_gen.planning.effect_selection import Prediction, Selection, effect_rules, facts_of, omit_weakest
-from unprocess_gen.planning.frame_model import FrameModel, SignalRange, signal_range
+from unprocess_gen.planning.effect_selection import EffectRules, Prediction, Selection, facts_of, omit_weakest
+from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.plan import plan_image, plan_levels
 from unprocess_gen.simulation.effects import BY_NAME, Physics
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
@@ -221,11 +221,10 @@ def automatic(config: Config, tolerance: float = TOLERANCE) -> Config:
 
 def all_predictions(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[Prediction, ...]:
     """Return the predictions for a body whose only frame is that of the facts."""
-    rules = effect_rules(config)
-    frame = FrameModel(physics, facts, light, rules.black_level_dn, rules.converter_dn)
-    free = [effect for effect, forced in rules.forced.items() if forced is None]
-    on = frozenset(effect for effect, forced in rules.forced.items() if forced is None or forced.on)
-    return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free)).predictions()
+    rules = EffectRules(config)
+    frame = rules.frame(physics, facts, light)
+    on = omit_weakest(rules.tolerance, frame, rules.on, [*rules.patterns, *rules.temporal])
+    return Selection(rules, frame, on).predictions()
 
 
 def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[str, ...]:

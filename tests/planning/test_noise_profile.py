@@ -53,7 +53,8 @@ def on_its_own_sensor(settings: Settings, noise: str, iso: float, *overrides: st
 
 
 def physics(config: Config, key: int = 0, **uniforms: float) -> Physics:
-    return PhysicalNoise(config).draw([uniforms.get(name, 0.5) for name in NAMES], key, config.seed)
+    profile = PhysicalNoise(config)
+    return profile.physics(profile.draw([uniforms.get(name, 0.5) for name in NAMES], key, config.seed))
 
 
 def close(value: float, expected: Any, rel: float = 1e-15) -> bool:

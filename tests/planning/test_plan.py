@@ -24,6 +24,7 @@ from unprocess_gen.core import fixed_point
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Distribution, Facts, Plan
 from unprocess_gen.planning import noise_profile
+from unprocess_gen.planning import plan as planning
 from unprocess_gen.planning.draws import DRAW_COUNT, Draw
 from unprocess_gen.planning.plan import TwoNumberLevel, plan_camera, plan_image, plan_pairs
 from unprocess_gen.simulation.effects import NUMBERS
@@ -312,6 +313,14 @@ def test_planning_imports_neither_numba_nor_opencv() -> None:
 PHYSICAL_PROFILES = ("sony_a7s2", "nikon_d850", "canon_5d4", "imx385", "oppo_reno10x")
 
 
+def forget_plans() -> None:
+    """Drop what is kept for a config, so that its numbers are computed again."""
+    planning._planners.clear()
+    known = planning._planner_without_seed, noise_profile._in_table, noise_profile._linear_in_table
+    for function in (*known, noise_profile._on_line):
+        function.cache_clear()  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -329,8 +338,9 @@ def test_plans_have_the_digits_of_decimal(
     config, facts = settings(*overrides), Facts(128, 128, 256, 3, 250)
     plans = [plan_pairs(config, f"{image:064x}", facts=facts) for image in range(count)]
     monkeypatch.setattr(distributions, "FIXED_POINT", {})
-    monkeypatch.setattr(fixed_point, "nearest_log_linear", lambda *numbers: None)
-    noise_profile._on_line.cache_clear()
+    for name in ("nearest_log_linear", "nearest_log_between", "nearest_between"):
+        monkeypatch.setattr(fixed_point, name, lambda *numbers: None)
+    forget_plans()
     for image, plan in enumerate(plans):
         assert plan_pairs(config, f"{image:064x}", facts=facts) == plan
 
@@ -339,9 +349,7 @@ def test_plans_have_the_digits_of_decimal(
 def test_plans_do_not_depend_on_the_decimal_context(settings: Settings, iso: int) -> None:
     config = settings("noise=canon_5d4", f"noise.iso={iso}", "noise.assumed=[]")
     facts, narrow = Facts(128, 128, 256, 3, 250), plan_image(config, SHA, facts=Facts(128, 128, 256, 3, 250))
-    known = noise_profile._logarithm, noise_profile._in_table, noise_profile._linear_in_table, noise_profile._on_line
-    for function in known:
-        function.cache_clear()  # type: ignore[attr-defined]
+    forget_plans()
     with decimal.localcontext(prec=60):
         assert plan_image(config, SHA, facts=facts) == narrow
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from statistics import NormalDist
@@ -270,3 +271,39 @@ def nearest_log_linear(uniform: float, x: float, slope: float, intercept: float,
     line = times(logarithm_x, slope) + times(ONE, intercept) + times(normal[0], std)
     error = times(error, abs(slope)) + times(normal[1], abs(std)) + 8 + DECIMAL_ERROR
     return nearest_exp(line, error)
+
+
+def nearest_log_between(x: float, low_x: float, high_x: float, low: float, high: float) -> float | None:
+    """Interpolate ln y linearly in ln x; all numbers but x are those of two points. None if the error is too large."""
+    if low <= 0 or high <= 0:
+        return None
+    (bottom, bottom_error), (top, top_error) = logarithm(low), logarithm(high)
+    share, share_error = _share(x, low_x, high_x)
+    error = bottom_error + top_error + (share_error * abs(top - bottom) >> BITS) + 2 + DECIMAL_ERROR
+    return nearest_exp(bottom + (share * (top - bottom) >> BITS), error)
+
+
+def nearest_between(
+    x: float, low_x: float, high_x: float, low: Sequence[float], high: Sequence[float]
+) -> tuple[float, ...] | None:
+    """Interpolate several y linearly in ln x, between two points. None if the error of any is too large."""
+    share, share_error = _share(x, low_x, high_x)
+    values = []
+    for start, end in zip(low, high, strict=True):
+        bottom, top = times(ONE, start), times(ONE, end)
+        error = (share_error * abs(top - bottom) >> BITS) + 5 + DECIMAL_ERROR
+        value = nearest(bottom + (share * (top - bottom) >> BITS), error)
+        if value is None:
+            return None
+        values.append(value)
+    return tuple(values)
+
+
+def _share(x: float, low: float, high: float) -> tuple[int, int]:
+    """Return ln(x / low) / ln(high / low), from 0 to 1, and its error.
+
+    The quotient is within its error times the reciprocal of the divisor, and one unit.
+    """
+    (bottom, bottom_error), (top, top_error), (middle, middle_error) = map(logarithm, (low, high, x))
+    span, error = top - bottom, 2 * bottom_error + top_error + middle_error
+    return (middle - bottom) * ONE // span, (error + 1) * ONE // (span - error) + 2

@@ -15,8 +15,8 @@ body has its pattern in all images or in none.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from unprocess_gen.config.interpretation import (
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Facts, RawParts, Srgb
-from unprocess_gen.planning.frame_model import FrameModel, SignalRange, ratio_to_noise
+from unprocess_gen.planning.frame_model import FIXED, RARE, FrameModel, SignalRange, ratio_to_noise
 from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS, Physics
 from unprocess_gen.simulation.effects.prediction import STATISTICS
 
@@ -59,36 +59,17 @@ def facts_for(config: Config, srgb: Srgb, frames: int = 1, raw: RawParts | None 
     return facts_of(srgb, frames, raw) if is_physical(config.noise) or raw is not None else None
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """Decision about one effect, and why.
-
-    Attributes
-    ----------
-    effect : str
-        Name of the effect.
-    statistic : str
-        One of `STATISTICS`: where the effect is strongest compared with the masking noise.
-    predicted_dn, masking_dn : float
-        Contribution and masking noise in that statistic, DN.
-    outliers : float
-        Expected number of pixels per frame that the effect moves by more than one standard deviation.
-    simulated : bool
-        Whether the effect is simulated.
-    forced : bool
-        Whether the configuration decided, not the image.
-    why : str
-        The comparison with the tolerance, or the reason in the configuration.
-    """
+class Prediction(NamedTuple):
+    """Decision about one effect, and why, in the statistic where the effect is strongest against the masking noise."""
 
     effect: str
-    statistic: str
-    predicted_dn: float
+    statistic: str  # one of `STATISTICS`
+    predicted_dn: float  # contribution in that statistic
     masking_dn: float
-    outliers: float
+    outliers: float  # expected pixels per frame that the effect moves by more than one standard deviation
     simulated: bool
-    forced: bool
-    why: str
+    forced: bool  # the configuration decided, not the image
+    why: str  # the comparison with the tolerance, or the reason in the configuration
 
     @property
     def reason(self) -> str:
@@ -111,8 +92,7 @@ IN_DARK_FRAMES = "contained in the dark frames"
 """Reason for which effects of the read-out are skipped if their noise is sampled from dark frames."""
 
 
-@dataclass(frozen=True, slots=True)
-class ForcedDecision:
+class ForcedDecision(NamedTuple):
     """Decision of the configuration to turn an effect on or off, and its reason."""
 
     on: bool
@@ -141,115 +121,108 @@ def _forced_decision(config: Config, name: str) -> ForcedDecision | None:
     return next((ForcedDecision(on, reason) for holds, on, reason in rules if holds), None)
 
 
-@dataclass(frozen=True, slots=True)
 class EffectRules:
-    """Decisions of a configuration about the effects of a physical noise profile, the same for all images.
+    """Decisions of a configuration about the effects of its physical noise profile, the same for all images.
 
-    Attributes
-    ----------
-    forced : mapping of str to ForcedDecision or None
-        For each of `PHYSICAL_EFFECTS` the decision of the configuration; None if the image decides.
-    tolerance : float
-        Largest ratio of the omitted effects to the masking noise.
-    black_level_dn : float
-        Black level of the sensor, DN.
-    assumed : mapping of str to tuple of str
-        Assumed numbers that each effect uses.
-    dark_frames : bool
-        Whether ``dark_frame`` takes the place of ``read``. Its variance is then the read variance of `Physics`.
-    converter_dn : float
-        Highest value of the converter, DN above black; infinity without clipping.
-    body_light_dn : float
-        Most light of the scene, DN above black, for which fixed patterns are decided.
+    ``forced`` has a decision for each of `PHYSICAL_EFFECTS`, or None if the image (``temporal``) or the body
+    (``patterns``) decides.
     """
 
-    forced: Mapping[str, ForcedDecision | None]
-    tolerance: float
-    black_level_dn: float
-    assumed: Mapping[str, tuple[str, ...]]
-    dark_frames: bool
-    converter_dn: float
-    body_light_dn: float
+    def __init__(self, config: Config) -> None:
+        noise, sensor, effects = config.noise, config.sensor, PHYSICAL_EFFECTS
+        ratio = lowest(parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO))
+        self.forced = {effect: _forced_decision(config, effect) for effect in effects}
+        self.on = frozenset(effect for effect, decision in self.forced.items() if decision is None or decision.on)
+        free = [effect for effect, decision in self.forced.items() if decision is None]
+        self.patterns = [effect for effect in free if effect in FIXED]
+        self.temporal = [effect for effect in free if effect not in FIXED]
+        self.tolerance, self.black_level_dn = config.effects.tolerance, float(sensor.black_level_dn)
+        self.assumed = {effect: assumed_numbers(noise, effect) for effect in effects}
+        self.dark_frames = uses_dark_frames(noise)  # `dark_frame` takes the place of `read`, whose variance it has
+        unclipped = sensor.clip == UNCLIPPED
+        self.converter_dn = math.inf if unclipped else 2.0**sensor.bits - 1 - sensor.black_level_dn  # above black
+        self.body_light_dn = min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn)  # most of the scene
+
+    def frame(self, physics: Physics, facts: Facts, signals: SignalRange) -> FrameModel:
+        """Model of a frame of the sensor."""
+        return FrameModel(physics, facts, signals, self.black_level_dn, self.converter_dn)
 
 
-def effect_rules(config: Config) -> EffectRules:
-    """Return the decisions of a configuration about the effects of its physical noise profile."""
-    noise, sensor, effects = config.noise, config.sensor, PHYSICAL_EFFECTS
-    ratio = lowest(parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO))
-    return EffectRules(
-        {effect: _forced_decision(config, effect) for effect in effects},
-        config.effects.tolerance,
-        float(config.sensor.black_level_dn),
-        {effect: assumed_numbers(noise, effect) for effect in effects},
-        uses_dark_frames(noise),
-        math.inf if sensor.clip == UNCLIPPED else 2.0**sensor.bits - 1 - sensor.black_level_dn,
-        min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn),
+class BodySelection(NamedTuple):
+    """Decision about the fixed patterns of a body, and all effects that are simulated in its largest frame."""
+
+    frame: FrameModel
+    on: frozenset[str]
+    reasons: dict[str, str]  # of the patterns that are omitted
+
+
+def select_patterns(rules: EffectRules, physics: Physics, is_clip: bool) -> BodySelection | None:
+    """Decide about the fixed patterns of a body, for all of its images; None if the configuration decides about all."""
+    if not rules.patterns:
+        return None
+    height, width = BODY_FRAME
+    facts = Facts(width, height, codes=256, dark_code=0, bright_code=255, frames=BODY_CLIP if is_clip else 1)
+    frame = rules.frame(physics, facts, SignalRange(0.0, rules.body_light_dn))
+    on = omit_weakest(rules.tolerance, frame, rules.on, [*rules.patterns, *rules.temporal])
+    omitted = [effect for effect in rules.patterns if effect not in on]
+    return BodySelection(
+        frame, on, {effect: _prediction(effect, frame, on, None, rules.tolerance).reason for effect in omitted}
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Selection:
-    """Effects that are simulated for one image (``on``), and predictions for all effects on demand.
-
-    ``body`` is the frame for which fixed patterns are decided, with all effects that are simulated there, if it is not
-    the image.
-    """
+class Selection(NamedTuple):
+    """Effects that are simulated for one image (``on``), and predictions for all effects on demand."""
 
     rules: EffectRules
     frame: FrameModel
     on: frozenset[str]
-    body: tuple[FrameModel, frozenset[str]] | None = None
+    body: BodySelection | None = None
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Return the simulated effects, in the order of image formation."""
-        on = (effect for effect in PHYSICAL_EFFECTS if effect in self.on)
-        return tuple("dark_frame" if self.rules.dark_frames and effect == "read" else effect for effect in on)
+        """The simulated effects, in the order of image formation."""
+        on = [effect for effect in PHYSICAL_EFFECTS if effect in self.on]
+        return (
+            tuple("dark_frame" if effect == "read" else effect for effect in on) if self.rules.dark_frames else (*on,)
+        )
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """Return the assumed numbers that the simulated effects use."""
+        """The assumed numbers that the simulated effects use."""
         used = (key for effect in self.effects for key in self.rules.assumed.get(effect, ()))
         return tuple(dict.fromkeys(used))
 
     @property
     def skipped(self) -> tuple[str, ...]:
-        """Return the other effects with the reasons that rows record; predicts only what the image decided."""
-        off = (effect for effect in PHYSICAL_EFFECTS if effect not in self.on)
+        """The other effects with the reasons that rows record; predicts only what the image decided."""
         replaced = (f"read: {IN_DARK_FRAMES}",) if self.rules.dark_frames else ()
+        off = [effect for effect in PHYSICAL_EFFECTS if effect not in self.on]
         return (*replaced, *(f"{effect}: {self._reason(effect)}" for effect in off))
 
     def _reason(self, effect: str) -> str:
         forced = self.rules.forced[effect]
-        return forced.reason if forced is not None else self.prediction(effect).reason
+        if forced is not None:
+            return forced.reason
+        return self.body.reasons[effect] if self.body and effect in FIXED else self.prediction(effect).reason
 
     def prediction(self, effect: str) -> Prediction:
-        """Return the prediction of one effect; ``read`` has the prediction of dark frames if they replace it."""
-        frame, on = (self.frame, self.on) if self.body is None or not BY_NAME[effect].is_fixed else self.body
+        """Prediction of one effect; ``read`` has the prediction of dark frames if they replace it."""
+        frame, on = (self.frame, self.on) if self.body is None or effect not in FIXED else self.body[:2]
         prediction = _prediction(effect, frame, on, self.rules.forced[effect], self.rules.tolerance)
-        return replace(prediction, effect="dark_frame") if self.rules.dark_frames and effect == "read" else prediction
+        return prediction._replace(effect="dark_frame") if self.rules.dark_frames and effect == "read" else prediction
 
     def predictions(self) -> tuple[Prediction, ...]:
-        """Return the prediction of each of `PHYSICAL_EFFECTS`, in the order of image formation."""
+        """Prediction of each of `PHYSICAL_EFFECTS`, in the order of image formation."""
         return tuple(self.prediction(effect) for effect in PHYSICAL_EFFECTS)
 
 
-def select_effects(rules: EffectRules, physics: Physics, facts: Facts, signals: SignalRange) -> Selection:
-    """Decide about every effect of a physical noise profile for one image."""
-    frame = FrameModel(physics, facts, signals, rules.black_level_dn, rules.converter_dn)
-    free = [effect for effect, decision in rules.forced.items() if decision is None]
-    on = frozenset(effect for effect, decision in rules.forced.items() if decision is None or decision.on)
-    patterns = [effect for effect in free if BY_NAME[effect].is_fixed]
-    if not patterns:
-        return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free))
-    height, width = BODY_FRAME
-    largest = replace(facts, width=width, height=height, frames=BODY_CLIP if facts.frames > 1 else 1)
-    body = FrameModel(physics, largest, SignalRange(0.0, rules.body_light_dn), rules.black_level_dn, rules.converter_dn)
-    simulated = omit_weakest(rules.tolerance, body, on, free)
-    omitted = [effect for effect in patterns if effect not in simulated]
-    temporal = [effect for effect in free if effect not in patterns]
-    on = omit_weakest(rules.tolerance, frame, on - frozenset(omitted), temporal, omitted)
-    return Selection(rules, frame, on, (body, simulated))
+def select_effects(
+    rules: EffectRules, physics: Physics, facts: Facts, signals: SignalRange, body: BodySelection | None
+) -> Selection:
+    """Decide about every effect of a physical noise profile for one image, after those of its ``body``."""
+    frame, omitted = rules.frame(physics, facts, signals), [*body.reasons] if body else []
+    on = omit_weakest(rules.tolerance, frame, rules.on.difference(omitted), rules.temporal, omitted)
+    return Selection(rules, frame, on, body)
 
 
 def omit_weakest(
@@ -269,7 +242,7 @@ def omit_weakest(
     for effect in sorted(free, key=strength):
         omitted.append(effect)
         rest = on - {effect}
-        if any(frame.outliers(other, rest) >= MIN_OUTLIERS for other in omitted):
+        if any(frame.outliers(rare, rest) >= MIN_OUTLIERS for rare in omitted if rare in RARE):
             break
         if frame.ratio(omitted, rest) > tolerance:
             break
@@ -281,11 +254,12 @@ def _prediction(
     effect: str, frame: FrameModel, on: frozenset[str], forced: ForcedDecision | None, tolerance: float
 ) -> Prediction:
     """Describe an effect at the signal and in the statistic where it is strongest; the first one if several are."""
-    candidates = [(level_dn, frame.ratios([effect], level_dn, on)) for level_dn in frame.levels(on - {effect})]
+    squares = ((level_dn, frame.squares([effect], level_dn, on)) for level_dn in frame.levels(on - {effect}))
+    candidates = [(level_dn, [*map(math.sqrt, own)]) for level_dn, own in squares]
     level_dn, ratios = max(candidates, key=lambda candidate: max(candidate[1]))
     index = next(n for n, ratio in enumerate(ratios) if ratio >= max(ratios) * (1 - 1e-9))
     masking = frame.masking_variance(effect, level_dn, on)
-    contribution = frame.contribution(effect, level_dn, masking)
+    contribution, _ = frame.contribution(effect, level_dn, masking)
     predicted_dn = math.sqrt(contribution.variances[index] + contribution.offset_dn * contribution.offset_dn)
     simulated, outliers = effect in on, frame.outliers(effect, on)
     why = f"{ratios[index]:.3g} of the noise there"

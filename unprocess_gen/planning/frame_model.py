@@ -6,21 +6,25 @@ are the same on every machine and in every tier. Derivations: ``docs/design/effe
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from operator import add, mul
-from typing import NamedTuple
 
 from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, SourcePlan
 from unprocess_gen.simulation.effects import BY_NAME, EFFECTS, Physics
-from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, PerStatistic
+from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
 from unprocess_gen.simulation.tone_curves import linear_table
 
 MASKING = tuple(effect for effect in EFFECTS if effect.masks)
 """Random effects of single pixels, which mask others."""
+
+FIXED, RARE, BEFORE_WELL = (
+    frozenset(effect.name for effect in EFFECTS if getattr(effect, property_))
+    for property_ in ("is_fixed", "has_outliers", "is_before_well")
+)
+"""Names of the effects with these properties; only of rare pixels the contribution depends on the masking noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,110 +77,100 @@ class FrameModel(FrameFacts):
         full_dn = physics.full_well_e * physics.dn_per_e
         self._levels = signals.dark_dn, signals.bright_dn
         self._levels_in_well = min(signals.dark_dn, full_dn), min(signals.bright_dn, full_dn)
-        self._ratios, self._variances = functools.cache(self._compute_ratios), functools.cache(self._compute_variances)
+        self._variances: dict[float, list[tuple[str, float]]] = {}
+        self._contributions: dict[tuple[str, float, float], tuple[Contribution, list[float]]] = {}
 
     def levels(self, on: frozenset[str]) -> tuple[float, float]:
-        """Return the two signals at which effects are predicted, DN above black; between them no ratio is larger."""
+        """The two signals at which effects are predicted, DN above black; between them no ratio is larger."""
         return self._levels_in_well if "full_well" in on else self._levels
 
     def masking_variance(self, effect: str, level_dn: float, on: frozenset[str]) -> float:
-        """Return the variance of a pixel at a signal due to all random effects in ``on`` except ``effect``, DN²."""
+        """Variance of a pixel at a signal due to all random effects in ``on`` except ``effect``, DN²."""
         rounding = VARIANCE_DN2 if "quantise" in on and effect != "quantise" else 0.0
-        if BY_NAME[effect].is_fixed and self.physics.fixed_pattern_in_clean:
+        if self.physics.fixed_pattern_in_clean and effect in FIXED:
             return rounding
         variance = 0.0
-        for name, effect_dn2 in self._variances(level_dn):
+        for name, effect_dn2 in self._variances_at(level_dn):
             if name in on and name != effect:
                 variance += effect_dn2
         return rounding + variance
 
-    def _compute_variances(self, level_dn: float) -> list[tuple[str, float]]:
-        """Return the variance of a pixel due to each of `MASKING` at a signal, DN²."""
-        return [(effect.name, effect.variance(self, level_dn)) for effect in MASKING]
+    def _variances_at(self, level_dn: float) -> list[tuple[str, float]]:
+        """Variance of a pixel due to each of `MASKING` at a signal, DN²."""
+        known = self._variances.get(level_dn)
+        if known is None:
+            known = self._variances[level_dn] = [(effect.name, effect.variance(self, level_dn)) for effect in MASKING]
+        return known
 
-    def _compute_ratios(self, effect: str, level_dn: float, masking: float) -> _Ratios:
-        """Return the ratios of one effect to a masking noise at a signal."""
-        contribution = BY_NAME[effect].contribution(self, level_dn, masking)
-        squares = ratios_to_noise(map(mul, contribution.variances, self.counts), masking)
-        offset_dn, offsets = abs(contribution.offset_dn), None
-        if offset_dn:
-            offsets = ratios_to_noise([offset_dn * root for root in self._roots], math.sqrt(masking))
-        return _Ratios(contribution, squares, offsets)
+    def contribution(self, effect: str, level_dn: float, masking: float) -> tuple[Contribution, list[float]]:
+        """Contribution of an effect where the other noise has the variance ``masking``, and its variances by count."""
+        key = effect, level_dn, masking if effect in RARE else 0.0
+        known = self._contributions.get(key)
+        if known is None:
+            predicted = BY_NAME[effect].contribution(self, level_dn, masking)
+            known = self._contributions[key] = predicted, [*map(mul, predicted.variances, self.counts)]
+        return known
 
-    def contribution(self, effect: str, level_dn: float, masking: float) -> Contribution:
-        """Return the contribution of an effect at a signal, where the other noise has the variance ``masking``, DN²."""
-        return self._ratios(effect, level_dn, masking).contribution
-
-    def ratios(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> PerStatistic:
-        """Return the ratio of several effects together to the masking noise, in each statistic.
+    def squares(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> list[float]:
+        """Square of the ratio of several effects together to the masking noise, in each statistic.
 
         Variances add; offsets add linearly.
         """
-        return tuple(map(math.sqrt, self._squares(effects, level_dn, on)))
-
-    def _squares(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> list[float]:
-        """Return the square of each of `ratios`."""
         squares: list[float] = []
-        offsets: list[float] | None = None
+        offsets: list[float] = []
         before_well = 0.0
         for effect in effects:
-            ratios = self._ratios(effect, level_dn, self.masking_variance(effect, level_dn, on))
-            squares = list(map(add, squares, ratios.squares)) if squares else ratios.squares
-            if ratios.offsets is not None:
-                offsets = ratios.offsets if offsets is None else list(map(add, offsets, ratios.offsets))
-            if BY_NAME[effect].is_before_well:
-                before_well += ratios.contribution.variances[0]
-        if before_well and "full_well" in on:
+            masking = self.masking_variance(effect, level_dn, on)
+            contribution, weighted = self.contribution(effect, level_dn, masking)
+            own = _ratios(weighted, masking)
+            squares = [*map(add, squares, own)] if squares else own
+            if contribution.offset_dn:
+                size = abs(contribution.offset_dn)
+                own = _ratios([size * root for root in self._roots], math.sqrt(masking))
+                offsets = [*map(add, offsets, own)] if offsets else own
+            if effect in BEFORE_WELL:
+                before_well += contribution.variances[0]
+        if before_well and "full_well" in on and (lost_dn := self._lost_in_well(before_well, level_dn, on)):
             masking = self.masking_variance("full_well", level_dn, on)
-            lost_dn = self.lost_in_well(before_well, level_dn, on)
-            if lost_dn:
-                lost = [lost_dn * math.sqrt(ratio_to_noise(count, masking)) for count in self.counts]
-                offsets = lost if offsets is None else list(map(add, offsets, lost))
-        if offsets is None:
-            return squares
-        return [square + offset * offset for square, offset in zip(squares, offsets, strict=True)]
+            own = [lost_dn * math.sqrt(ratio_to_noise(count, masking)) for count in self.counts]
+            offsets = [*map(add, offsets, own)] if offsets else own
+        if offsets:
+            return [square + offset * offset for square, offset in zip(squares, offsets, strict=True)]
+        return squares
 
-    def lost_in_well(self, variance: float, level_dn: float, on: frozenset[str]) -> float:
-        """Return the drop of the mean signal due to clipping ``variance`` at the full well, DN.
+    def _lost_in_well(self, variance: float, level_dn: float, on: frozenset[str]) -> float:
+        """Drop of the mean signal due to clipping ``variance`` at the full well, DN.
 
         At a signal that fills the well the upper half of the distribution is cut, which lowers the mean of a normal
         distribution by σ/√(2π).
         """
-        if self.contribution("full_well", level_dn, 0.0).offset_dn == 0:
+        if self.contribution("full_well", level_dn, 0.0)[0].offset_dn == 0:
             return 0.0
         other = 0.0
-        for name, effect_dn2 in self._variances(level_dn):
-            if name in on and BY_NAME[name].is_before_well:
+        for name, effect_dn2 in self._variances_at(level_dn):
+            if name in on and name in BEFORE_WELL:
                 other += effect_dn2
         return MEAN_ABS_NORMAL / 2 * (math.sqrt(other + variance) - math.sqrt(other))
 
     def ratio(self, effects: Sequence[str], on: frozenset[str]) -> float:
-        """Return the largest ratio of several effects together, over all statistics and both signals."""
+        """Largest ratio of several effects together, over all statistics and both signals."""
         dark_dn, bright_dn = self.levels(on)
-        return math.sqrt(max(*self._squares(effects, dark_dn, on), *self._squares(effects, bright_dn, on)))
+        return math.sqrt(max(*self.squares(effects, dark_dn, on), *self.squares(effects, bright_dn, on)))
 
     def outliers(self, effect: str, on: frozenset[str]) -> float:
-        """Return the expected number of pixels per frame that an effect moves by more than one standard deviation."""
-        if not BY_NAME[effect].has_outliers:
+        """Expected number of pixels per frame that an effect moves by more than one standard deviation."""
+        if effect not in RARE:
             return 0.0
         levels = ((level_dn, self.masking_variance(effect, level_dn, on)) for level_dn in self.levels(on))
         shares = [BY_NAME[effect].outliers(self, level_dn, masking) for level_dn, masking in levels]
         return self.facts.width * self.facts.height * max(shares)
 
 
-class _Ratios(NamedTuple):
-    """A contribution, and the ratios of its variances (``squares``) and of its offset, if any, to the masking noise."""
-
-    contribution: Contribution
-    squares: list[float]
-    offsets: list[float] | None
-
-
 def ratio_to_noise(size: float, noise: float) -> float:
-    """Return ``size / noise``; without noise, 0 for no size and infinity otherwise."""
+    """``size / noise``; without noise, 0 for no size and infinity otherwise."""
     return size / noise if noise else math.inf if size else 0.0
 
 
-def ratios_to_noise(sizes: Iterable[float], noise: float) -> list[float]:
-    """Return `ratio_to_noise` of each size."""
+def _ratios(sizes: list[float], noise: float) -> list[float]:
+    """`ratio_to_noise` of each size."""
     return [size / noise for size in sizes] if noise else [ratio_to_noise(size, noise) for size in sizes]

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import bisect
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from decimal import Decimal, localcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
-from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.limits import EXPOSURE_S, ISO, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
@@ -30,6 +29,16 @@ MIDDLE = 0.5
 """Uniform at which a line has no scatter."""
 
 
+class DrawnSensor(NamedTuple):
+    """What is drawn of a sensor: the numbers of its effects follow from it."""
+
+    iso: float
+    exposure_s: float
+    temperature_c: float
+    unit: str
+    seed: int
+
+
 class PhysicalNoise:
     """A physical noise profile in a scene and on a sensor, with its distributions parsed."""
 
@@ -42,47 +51,44 @@ class PhysicalNoise:
         self.exposure_s = parse_drawn("exposure_s", scene.exposure_s, EXPOSURE_S)
         self.temperature_c = parse_drawn("temperature_c", scene.temperature_c, TEMPERATURE_C)
         self.scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
+        self.has_lens_shading = any(noise.lens_shading or ())
+        self._numbers = [self._numbers_of(branch) for branch in noise.branches]
 
-    def draw(self, uniforms: Sequence[float], stream_key: int, seed: int) -> Physics:
-        """Draw ISO, exposure, temperature and the scatter of the profile, and convert its numbers to the sensor's DN.
+    def _numbers_of(self, branch: BranchConfig) -> list[tuple[str, Number, Any]]:
+        """Names, declarations and values of the numbers that the profile has in a branch."""
+        values = (
+            (name, declared, getattr(branch if declared.in_branch else self.noise, declared.key or name))
+            for name, declared in NUMBERS.items()
+        )
+        return [number for number in values if number[2] is not None]
 
-        DN of the profile become DN of the sensor by the factor s = (W - B) / (W_profile - B_profile). ``uniforms`` are
-        those of `draws`; ``stream_key`` identifies the camera body if ``sensor.units=image``.
-        """
-        noise, sensor = self.noise, self.sensor
-        iso = draw_parameter(self.iso, uniforms[Draw.ISO])
-        seconds = draw_parameter(self.exposure_s, uniforms[Draw.EXPOSURE_S])
-        celsius = draw_parameter(self.temperature_c, uniforms[Draw.TEMPERATURE_C])
-        branch = branch_of(noise, iso)
-        assert branch is not None
-        units = sensor.units
-        unit = f"{stream_key:016x}" if units == "image" else str(int(uniforms[Draw.SENSOR_UNIT] * units))
-        body = body_key(seed, noise.name, unit)
-        exposure = seconds, _doublings(celsius, noise.dark_reference_c, noise.dark_doubling_c)
-        return Physics(
-            iso=iso,
-            exposure_s=seconds,
-            temperature_c=celsius,
-            dark_offset=sensor.dark_offset,
-            sensor_unit=unit,
-            body_key=body,
-            fixed_pattern_in_clean=self.fixed_pattern_in_clean,
-            **self._numbers(branch, iso, exposure, self._scatter(body)),
+    def draw(self, uniforms: Sequence[float], stream_key: int, seed: int) -> DrawnSensor:
+        """Draw ISO, exposure, temperature and sensor unit; ``stream_key`` identifies it with ``sensor.units=image``."""
+        units = self.sensor.units
+        return DrawnSensor(
+            draw_parameter(self.iso, uniforms[Draw.ISO]),
+            draw_parameter(self.exposure_s, uniforms[Draw.EXPOSURE_S]),
+            draw_parameter(self.temperature_c, uniforms[Draw.TEMPERATURE_C]),
+            f"{stream_key:016x}" if units == "image" else str(int(uniforms[Draw.SENSOR_UNIT] * units)),
+            seed,
         )
 
-    def _numbers(
-        self, branch: BranchConfig, iso: float, exposure: tuple[float, float], uniform: Callable[[Number], float]
-    ) -> dict[str, Any]:
-        """Return the numbers of the effects that the profile has; ``exposure`` is the time and the warmth."""
+    def physics(self, drawn: DrawnSensor) -> Physics:
+        """Convert the numbers of the profile to DN of the sensor, with the scatter of the unit.
+
+        DN of the profile become DN of the sensor by the factor s = (W - B) / (W_profile - B_profile).
+        """
+        noise, iso, key = self.noise, drawn.iso, body_key(drawn.seed, self.noise.name, drawn.unit)
+        number = next(n for n, branch in enumerate(noise.branches) if branch.iso[0] <= iso <= branch.iso[1])
+        scatter = None if noise.scatter == "off" else _scatter_of_body(key)
+        heat = _doublings(drawn.temperature_c, noise.dark_reference_c, noise.dark_doubling_c)
         values: dict[str, Any] = {}
-        for name, declared in NUMBERS.items():
-            value = getattr(branch if declared.in_branch else self.noise, declared.key or name)
-            if value is None:
-                continue
+        for name, declared, value in self._numbers[number]:
             if declared.kind == RATE:
-                value = value * exposure[0] * exposure[1]
+                value = value * drawn.exposure_s * heat
             elif declared.kind == DN:
-                value = evaluate(value, iso, uniform(declared)) * self.scale
+                uniform = MIDDLE if scatter is None or declared.counter < 0 else scatter[declared.counter]
+                value = evaluate(value, iso, uniform) * self.scale
             elif declared.kind == SHAPE:
                 (value,) = linear_values(value, iso)
             elif declared.kind == SITES:
@@ -91,14 +97,16 @@ class PhysicalNoise:
             elif declared.count > 1:
                 value = tuple(map(float, value))
             values[name] = value
-        return values
-
-    def _scatter(self, body: int) -> Callable[[Number], float]:
-        """Return the uniform at which each number of a body is drawn."""
-        if self.noise.scatter == "off":
-            return lambda declared: MIDDLE
-        scatter = _scatter_of_body(body)
-        return lambda declared: MIDDLE if declared.counter < 0 else scatter[declared.counter]
+        return Physics(
+            iso=iso,
+            exposure_s=drawn.exposure_s,
+            temperature_c=drawn.temperature_c,
+            dark_offset=self.sensor.dark_offset,
+            sensor_unit=drawn.unit,
+            body_key=key,
+            fixed_pattern_in_clean=self.fixed_pattern_in_clean,
+            **values,
+        )
 
 
 def evaluate(form: Any, iso: float, uniform: float = MIDDLE) -> float:
@@ -139,38 +147,44 @@ def _on_line(iso: float, uniform: float, slope: float, intercept: float, std: fl
 @functools.lru_cache(maxsize=256)
 def _in_table(iso: float, *pairs: float) -> float:
     """Interpolate in a table of ISO, x, …: ln x is linear in ln ISO between neighbours."""
-    share, low, high = _neighbours(iso, pairs)
-    if not share:
+    isos, low, high = _neighbours(iso, pairs)
+    if low == high or isos[0] == isos[1]:
         return float(low)
+    value = fixed_point.nearest_log_between(iso, *isos, low, high)
+    if value is not None:
+        return value
     with localcontext(prec=DIGITS):
-        return float((_logarithm(low) + share * (_logarithm(high) - _logarithm(low))).exp())
+        share = _share(iso, *isos)
+        return float((Decimal(low).ln() + share * (Decimal(high).ln() - Decimal(low).ln())).exp())
 
 
 @functools.lru_cache(maxsize=256)
 def _linear_in_table(iso: float, *pairs: Any) -> tuple[float, ...]:
     """Interpolate in a table of ISO, number or four numbers, …: linear in ln ISO between neighbours."""
-    share, *ends = _neighbours(iso, pairs)
+    isos, *ends = _neighbours(iso, pairs)
     count = max((len(end) for end in ends if isinstance(end, tuple)), default=1)
     low, high = (end if isinstance(end, tuple) else (end,) * count for end in ends)
+    if isos[0] == isos[1]:
+        return tuple(map(float, low))
+    values = fixed_point.nearest_between(iso, *isos, low, high)
+    if values is not None:
+        return values
     with localcontext(prec=DIGITS):
+        share = _share(iso, *isos)
         return tuple(float(Decimal(a) + share * (Decimal(b) - Decimal(a))) for a, b in zip(low, high, strict=True))
 
 
-def _neighbours(iso: float, pairs: Sequence[Any]) -> tuple[Decimal, Any, Any]:
-    """Return the place of an ISO between its neighbours in a table, from 0 to 1 in ln ISO, and their values."""
+def _neighbours(iso: float, pairs: Sequence[Any]) -> tuple[tuple[float, float], Any, Any]:
+    """Return the neighbours of an ISO in a table, and their values; twice the same one if the table has the ISO."""
     isos, values = pairs[::2], pairs[1::2]
     above = bisect.bisect_left(isos, iso)
-    if isos[above] == iso:
-        return Decimal(0), values[above], values[above]
-    low, high = isos[above - 1 : above + 1]
-    with localcontext(prec=DIGITS):
-        return _logarithm(iso, low) / _logarithm(high, low), values[above - 1], values[above]
+    below = above if isos[above] == iso else above - 1
+    return (isos[below], isos[above]), values[below], values[above]
 
 
-@functools.lru_cache(maxsize=256)
-def _logarithm(x: float, unit: float = 0.0) -> Decimal:
-    """Return ln x, or ln (x / unit), in the decimal context of the callers; most are the same for all images."""
-    return (Decimal(x) / Decimal(unit) if unit else Decimal(x)).ln()
+def _share(iso: float, low: float, high: float) -> Decimal:
+    """Place of an ISO between its neighbours, from 0 to 1 in ln ISO, in the decimal context of the caller."""
+    return (Decimal(iso) / Decimal(low)).ln() / (Decimal(high) / Decimal(low)).ln()
 
 
 @functools.lru_cache(maxsize=256)

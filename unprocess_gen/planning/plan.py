@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
@@ -24,14 +25,17 @@ from unprocess_gen.core.types import DarkFrames, Facts, Plan, SourcePlan
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
+    BodySelection,
+    EffectRules,
     Prediction,
     Selection,
-    effect_rules,
     select_effects,
+    select_patterns,
 )
 from unprocess_gen.planning.frame_model import SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
+from unprocess_gen.simulation.effects import Physics
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
@@ -334,18 +338,27 @@ class PhysicalLevel:
     def __init__(self, config: Config, number: int) -> None:
         self._noise, self._number = PhysicalNoise(config), number
         self._clip, self._saturated = config.sensor.clip, interpretation.saturated_as(config)
-        self._rules = effect_rules(config)
+        self._rules = EffectRules(config)
+        self._sensors: Recent[tuple[Any, ...], tuple[Physics, BodySelection | None]] = Recent(64)
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
         """Draw the numbers of the sensor and select the effects of an image at this level."""
         assert image.facts is not None and image.signals is not None
-        physics = self._noise.draw(uniforms, image.stream_key, image.seed)
-        if image.dark_frames is not None:
-            read_std_dn = math.sqrt(image.dark_frames.variance_dn2)
-            physics = replace(physics, read_law="gaussian", read_shape=0.0, read_std_dn=read_std_dn)
-        if any(physics.lens_shading):
-            physics = replace(physics, frame_size=(image.facts.height, image.facts.width))
-        selection = select_effects(self._rules, physics, image.facts, image.signals)
+        facts, lens, dark = image.facts, self._noise.has_lens_shading, image.dark_frames
+        drawn = self._noise.draw(uniforms, image.stream_key, image.seed)
+        key = drawn, dark and dark.variance_dn2, facts.frames > 1, (facts.height, facts.width) if lens else None
+        known = self._sensors.get(key)
+        if known is None:
+            physics = self._noise.physics(drawn)
+            if dark is not None:
+                physics = replace(
+                    physics, read_law="gaussian", read_shape=0.0, read_std_dn=math.sqrt(dark.variance_dn2)
+                )
+            if lens:
+                physics = replace(physics, frame_size=(facts.height, facts.width))
+            known = self._sensors.keep(key, (physics, select_patterns(self._rules, physics, facts.frames > 1)))
+        physics, patterns = known
+        selection = select_effects(self._rules, physics, facts, image.signals, patterns)
         profile = self._noise.noise
         plan = types.NoisePlan(
             profile.name,

@@ -177,7 +177,8 @@ class Profile:
             scene = dataclasses.replace(scene, temperature_c=celsius)
         config, middle = dataclasses.replace(self.config, scene=scene), [0.5] * DRAW_COUNT
         if is_physical(config.noise):
-            physics = PhysicalNoise(config).draw(middle, 0, 0)
+            profile = PhysicalNoise(config)
+            physics = profile.physics(profile.draw(middle, 0, 0))
             return {name: self._number(name, physics) for name in EFFECT_OF_NUMBER if name != "b_dn2"}
         a, b = TwoNumberLevel(config, 0).two_numbers(middle)
         two: dict[str, float | None] = {"dn_per_e": a, "b_dn2": b, "read_std_dn": None, "read_shape": None}
