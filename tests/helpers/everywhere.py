@@ -48,8 +48,6 @@ from unprocess_gen.cli import main as cli
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels import body, render
-from unprocess_gen.simulation.kernels.electrons import Electrons
-from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.kernels.strips import STRIP, allocate_scratch
 from unprocess_gen.simulation.pair import make_pair
 
@@ -78,7 +76,7 @@ TARGETS = {
 # Facts about the process ----------------------------------------------------------------------------------------------
 
 
-def facts(given: str) -> dict[str, Any]:
+def facts() -> dict[str, Any]:
     import cv2  # imported late: it reads its settings at import, and the run decides when
 
     from unprocess_gen.pipeline import generate as runner
@@ -94,7 +92,6 @@ def facts(given: str) -> dict[str, Any]:
         "product": product(),
         "libm": digest(repr([function(k / 999) for k in range(1, 999) for function in LIBM]).encode()),
         "kernels": kernels(),
-        "doubles": [given, doubles()],
     }
 
 
@@ -105,17 +102,22 @@ def opencv_features() -> list[str]:
     return [one[1:] for one in cv2.getCPUFeaturesLine().split() if one[0] == "*" and one[-1] != "?"]
 
 
-def hash_kernel_arguments() -> Any:
-    """Hash all arguments of later calls of the outer kernel, except the last four, which it fills."""
-    kernel, arguments_digest = render._render, hashlib.sha256()
+def hash_kernel_values() -> Any:
+    """Hash all arguments of the outer kernel after each of its later calls: a change of one bit shows.
 
-    def hash_and_call(*arguments: Any) -> None:
-        for one in members(arguments[:-4]):
-            arguments_digest.update(np.asarray(one).tobytes())
+    Frames would show such a change once in 10^12 sites. The scratch memory holds the unrounded values of all stages for
+    the last strip, including counts and deviates; it is hashed for complete strips, since its padding is undefined.
+    """
+    kernel, values = render._render, hashlib.sha256()
+
+    def call_and_hash(*arguments: Any) -> None:
         kernel(*arguments)
+        has_padding = arguments[0].shape[1] % STRIP
+        for one in members((*arguments[:-4], *arguments[-3:], () if has_padding else arguments[-4])):
+            values.update(np.asarray(one).tobytes())
 
-    render._render = hash_and_call
-    return arguments_digest
+    render._render, render.scratch_of_thread = call_and_hash, allocate_scratch
+    return values
 
 
 def members(value: Any) -> Iterator[Any]:
@@ -130,11 +132,8 @@ def members(value: Any) -> Iterator[Any]:
 LIBM: tuple[Callable[[float], float], ...] = (math.sin, math.asin, math.exp, math.log, lambda x: x**2.2)
 
 
-def digest(*parts: Any) -> str:
-    found = hashlib.sha256()
-    for part in parts:
-        found.update(part)
-    return found.hexdigest()
+def digest(data: Any) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def product() -> str:
@@ -155,34 +154,12 @@ def kernels() -> dict[str, Any]:
     }
 
 
-# Doubles before they are rounded --------------------------------------------------------------------------------------
-
-
-def doubles() -> str:
-    """Return the digest of the kernels' values before rounding to DN, which shows a change of one bit.
-
-    Frames would show such a change once in 10^12 sites. After the kernel has run, the scratch memory holds the values
-    of all stages for the last strip, including counts and deviates.
-    """
+def make_pairs_of_all_kernels() -> None:
+    """Make a pair of each of `plans`, in which every code of a photograph occurs."""
     n = np.arange(2 * STRIP)
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8).reshape(2, STRIP, 3)
-    found = []
     for plan in plans():
-        shape, origin = codes.shape[:2], (5, 7)
-        clean_dtype, dtype = (
-            np.float32 if is_float else np.uint16 for is_float in (plan.output.clean_normalised, plan.output.normalised)
-        )
-        form = render._form((plan,), shape, (origin[0] % 2, origin[1] % 2), 256)
-        scene, noise = render._records(form, (plan,), shape, origin)
-        scratch = allocate_scratch(np.float32 if uses_scene32(plan) else np.float64)
-        clean, noisy = np.empty(codes[..., 0].size, clean_dtype), np.empty((1, codes[..., 0].size), dtype)
-        counts = np.zeros((1, render.COUNT_FIELDS), dtype=np.int64)
-        fixed = codes, scene, noise, form.keys, origin, form.readout
-        render._render(*fixed, scratch, clean, noisy, counts)
-        found += [clean, noisy, counts, scratch]
-        if isinstance(noise, Electrons):
-            found += members(noise.body)
-    return digest(*map(np.ascontiguousarray, found))
+        make_pair(codes, plan, origin=(5, 7))
 
 
 def plans() -> list[Plan]:
@@ -296,9 +273,10 @@ def main(facts_path: str, *arguments: str) -> int:
         exit_code, report = 0, code()
     else:
         sys.argv[1:] = arguments
-        arguments_digest = hash_kernel_arguments()
+        values = hash_kernel_values()
         exit_code = cli.main()
-        report = facts(arguments_digest.hexdigest())
+        make_pairs_of_all_kernels()
+        report = {**facts(), "doubles": values.hexdigest()}
     Path(facts_path).write_text(json.dumps(report), encoding="utf-8")
     return exit_code
 

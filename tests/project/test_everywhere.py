@@ -46,7 +46,6 @@ SCRIPT = Path(everywhere.__file__)
 class Made(NamedTuple):
     """A dataset, and the facts that its process reported."""
 
-    tree: str
     facts: dict[str, Any]
     out: Path
 
@@ -84,7 +83,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Make:
+def make(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Make:
     """Return a function that makes the dataset in a new process: Python and its flags, environment."""
 
     def made(*python: str | Path, **env: str) -> Made:
@@ -96,7 +95,7 @@ def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: 
             pytest.skip("this processor lacks instructions of another")
         assert done.returncode == 0, done.stdout + done.stderr
         facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
-        return Made(tree_hash(folder / "ds"), facts, folder / "ds")
+        return Made(facts, folder / "ds")
 
     return made
 
@@ -125,9 +124,7 @@ def files(made: Made) -> dict[str, bytes]:
 
 def assert_same(made: Made, plain: Made) -> None:
     mine, theirs = files(made), files(plain)
-    differing = sorted(name for name in mine | theirs if mine.get(name) != theirs.get(name))
-    assert differing in (["dataset.json"], [])
-    assert made.tree == plain.tree
+    assert {name for name in mine | theirs if mine.get(name) != theirs.get(name)} <= {"dataset.json"}
     assert made.facts["doubles"] == plain.facts["doubles"]
 
 
@@ -142,16 +139,11 @@ WITHOUT_FMA = "glibc.cpu.hwcaps=" + ",".join(
     f"-{name}" for name in ("AVX2", "FMA", "FMA4", "AVX2_Usable", "FMA_Usable")
 )
 
-SURROUNDINGS = {
-    "LC_ALL": "tr_TR.UTF-8",
-    "MALLOC_PERTURB_": "165",
-    "OPENCV_LOG_LEVEL": "SILENT",
-    "OPENCV_IO_MAX_IMAGE_PIXELS": "100",
-}
-
+SURROUNDINGS = {"LC_ALL": "tr_TR.UTF-8", "MALLOC_PERTURB_": "165", "OPENCV_IO_MAX_IMAGE_PIXELS": "100"}
 
 OLD_OPENCV = {"OPENCV_CPU_DISABLE": ",".join(everywhere.opencv_features()), "OPENCV_IPP": "disabled"}
 """Disable all optional vector code of OpenCV."""
+
 LIBRARIES = OLD_OPENCV | {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED), "GLIBC_TUNABLES": WITHOUT_FMA}
 
 
@@ -177,8 +169,7 @@ def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
 # One setting ----------------------------------------------------------------------------------------------------------
 
 SETTINGS = [
-    *({"LC_ALL": "C.UTF-8"}, {"LC_ALL": "tr_TR.UTF-8"}, {"LC_ALL": "", "LANG": "tr_TR.UTF-8"}),
-    *({name: value} for name, value in SURROUNDINGS.items() if name != "LC_ALL"),
+    *({name: value} for name, value in SURROUNDINGS.items()),
     *(OLD_OPENCV, {"GLIBC_TUNABLES": WITHOUT_FMA}),
     *({"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED[first:])} for first in range(len(ENABLED))),
     *({"OPENBLAS_CORETYPE": core} for core in ("Prescott", "Nehalem", "Haswell", "Zen", "SkylakeX")),
