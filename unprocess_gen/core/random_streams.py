@@ -61,91 +61,33 @@ Words = NDArray[np.uint32]
 
 
 def stream_key(seed: int, source_sha256: str, occurrence: int = 0) -> int:
-    """Return the key of the random streams of an image.
+    """64-bit key of the random streams of an image, which adding or removing other files does not change.
 
-    Adding or removing other files does not change it.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the dataset.
-    source_sha256 : str
-        SHA-256 of the source file, as hex digits.
-    occurrence : int
-        Number of identical files before this one in the listing.
-
-    Returns
-    -------
-    int
-        64-bit key.
+    ``occurrence`` is the number of identical files before this one in the listing.
     """
-    name = f"unprocess_gen stream 1\0{seed}\0{source_sha256}\0{occurrence}"
-    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+    return _hash64(f"unprocess_gen stream 1\0{seed}\0{source_sha256}\0{occurrence}")
 
 
 def split_uniform(seed: int, source_sha256: str) -> float:
-    """Return the number that decides the split of an image.
+    """Number in [0, 1) that decides the split of an image, from the SHA-256 of its file, or of its clip's first.
 
     Identical files have the same number, because copies of a photograph must not be in training and test data. Adding
     or removing files does not change it.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the dataset.
-    source_sha256 : str
-        SHA-256 of the source file, or of the first file of its clip, as hex digits.
-
-    Returns
-    -------
-    float
-        k·2**-53 with a 53-bit integer k; in [0, 1).
     """
-    name = f"unprocess_gen split 1\0{seed}\0{source_sha256}"
-    return float(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big") >> 11) * 2.0**-53
+    return float(_hash64(f"unprocess_gen split 1\0{seed}\0{source_sha256}") >> 11) * 2.0**-53
 
 
 def body_key(seed: int, profile: str, unit: str) -> int:
-    """Return the key of the fixed patterns of a camera body, shared by all frames of this body.
+    """64-bit key of the fixed patterns of a sensor unit of a noise profile, shared by all its frames."""
+    return _hash64(f"unprocess_gen body 1\0{seed}\0{profile}\0{unit}")
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the dataset.
-    profile : str
-        Name of the noise profile.
-    unit : str
-        Name of the camera body (column ``sensor_unit``).
 
-    Returns
-    -------
-    int
-        64-bit key.
-    """
-    name = f"unprocess_gen body 1\0{seed}\0{profile}\0{unit}"
+def _hash64(name: str) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
 def purpose(stream: str, level: int = 0, draw: int = 0) -> int:
-    """Return word 2 of the counter, for a stream of `STREAMS`.
-
-    Parameters
-    ----------
-    stream : str
-        Key of `STREAMS`.
-    level, draw : int
-        Numbers of the noise level and of the draw, 0 to 4095.
-
-    Returns
-    -------
-    int
-        32-bit word.
-
-    Raises
-    ------
-    ValueError
-        If ``level`` or ``draw`` is out of range.
-    """
+    """Word 2 of the counter for a stream of `STREAMS`; ValueError unless level and draw are 0 to 4095."""
     if not (0 <= level < 4096 and 0 <= draw < 4096):
         raise ValueError(f"level={level}, draw={draw}: out of range; expected 0 to 4095")
     return STREAMS[stream] << 24 | level << 12 | draw
@@ -156,25 +98,7 @@ EPOCHS, CLIP_FRAMES = 2**14, 2**18
 
 
 def frame_word(frame: int, epoch: int = 0) -> int:
-    """Return word 3 of the counter.
-
-    Parameters
-    ----------
-    frame : int
-        Number of the frame in its clip; in epochs after the first, less than `CLIP_FRAMES`.
-    epoch : int
-        Number of the epoch, less than `EPOCHS`.
-
-    Returns
-    -------
-    int
-        32-bit word; the frame itself in epoch 0.
-
-    Raises
-    ------
-    ValueError
-        If ``epoch`` or ``frame`` is out of range.
-    """
+    """Word 3 of the counter, the frame itself in epoch 0; ValueError beyond `EPOCHS`, later beyond `CLIP_FRAMES`."""
     if not 0 <= epoch < EPOCHS or (epoch and frame >= CLIP_FRAMES):
         raise ValueError(
             f"epoch={epoch}, frame={frame}: out of range; expected epochs 0 to {EPOCHS - 1}, and after epoch 0 frames "
@@ -186,17 +110,7 @@ def frame_word(frame: int, epoch: int = 0) -> int:
 def philox4x32(counter: tuple[NDArray[np.uint64], ...], key: int) -> tuple[Words, Words, Words, Words]:
     """Compute Philox4x32-10, as in Random123 (known answers: its ``kat_vectors``).
 
-    Parameters
-    ----------
-    counter : tuple of four ndarrays of uint64
-        Words of the counters, each below 2**32; shapes that broadcast.
-    key : int
-        64-bit key.
-
-    Returns
-    -------
-    tuple of four ndarrays of uint32
-        Output words, of the broadcast shape.
+    The counter is four uint64 arrays of words below 2**32 that broadcast; the output words have the broadcast shape.
     """
     low, shift = np.uint64(LOW), np.uint64(32)
     m0, m1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
@@ -221,26 +135,7 @@ def words(
     level: int = 0,
     draw: int = 0,
 ) -> Words:
-    """Return one random word for each pixel of a tile.
-
-    Parameters
-    ----------
-    key : int
-        Key from `stream_key` or `body_key`.
-    stream : str
-        Key of `STREAMS`.
-    shape : (int, int)
-        Height and width of the tile.
-    origin : (int, int)
-        Row and column of the tile's first pixel in the full frame.
-    frame, level, draw : int
-        Numbers of the frame in its clip, of the noise level and of the draw.
-
-    Returns
-    -------
-    ndarray of uint32, [H, W]
-        Random words.
-    """
+    """Draw one random word for each pixel of a tile, uint32 [H, W]; ``origin`` is its place in the full frame."""
     y = np.arange(origin[0], origin[0] + shape[0], dtype=np.uint64)[:, None]
     x = np.arange(origin[1], origin[1] + shape[1], dtype=np.uint64)[None, :]
     block, lane, lanes = np.uint64(BLOCK), x % np.uint64(LANES), np.uint64(LANES)
@@ -251,134 +146,47 @@ def words(
 
 
 def patch_words(key: int, count: int, epoch: int = 0) -> list[tuple[int, int]]:
-    """Return two random words for each of the first ``count`` patches of an image.
+    """Draw two 32-bit words for each of the first ``count`` patches of an image.
 
     Patch n uses counter (0, n) of the stream ``patch``, so that a larger ``count`` does not move the first patches.
-
-    Parameters
-    ----------
-    key : int
-        Key from `stream_key`.
-    count : int
-        Number of patches.
-    epoch : int
-        Number of the epoch.
-
-    Returns
-    -------
-    list of (int, int)
-        Two 32-bit words for each patch.
     """
     first, second = _outputs(key, count, purpose("patch"), frame_word(0, epoch))[:2]
     return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
 def crop_words(key: int, patch: int, level: int, draw: int, word_3: int, crop: int = 0) -> tuple[int, int]:
-    """Return two random words for the place of a live crop in a patch.
+    """Draw two 32-bit words for the place of a live crop in a patch; ``word_3`` is `frame_word`.
 
     They are a hash: one counter of Philox in Python takes 10 µs, a twentieth of a patch of 128 x 128.
-
-    Parameters
-    ----------
-    key : int
-        Key from `stream_key`.
-    patch, level, draw : int
-        Numbers of the patch, of the noise level and of the draw.
-    word_3 : int
-        Frame and epoch (`frame_word`).
-    crop : int
-        Number of the crop in the patch.
-
-    Returns
-    -------
-    tuple of int
-        Two 32-bit words.
     """
-    name = f"unprocess_gen crop 1\0{key}\0{patch}\0{level}\0{draw}\0{word_3}\0{crop}"
-    number = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+    number = _hash64(f"unprocess_gen crop 1\0{key}\0{patch}\0{level}\0{draw}\0{word_3}\0{crop}")
     return number >> 32, number & 0xFFFFFFFF
 
 
 def shuffled(length: int, seed: int, epoch: int) -> NDArray[np.int64]:
-    """Return the numbers from 0 to ``length`` - 1 in a random order, the same on every machine.
-
-    Parameters
-    ----------
-    length : int
-        Number of items, less than 2**32.
-    seed : int
-        Seed of the order.
-    epoch : int
-        Number of the epoch, less than 2**32.
-
-    Returns
-    -------
-    ndarray of int64, [length]
-        A permutation: the order of 64-bit words, one for each item.
-    """
-    name = f"unprocess_gen order 1\0{seed}"
-    key = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
-    high, low, _, _ = _outputs(key, length, 0, epoch)
+    """Draw a permutation of 0 to ``length`` - 1, the same on every machine: the order of 64-bit words."""
+    high, low, _, _ = _outputs(_hash64(f"unprocess_gen order 1\0{seed}"), length, 0, epoch)
     return np.argsort(high.astype(np.uint64) << np.uint64(32) | low, kind="stable")
 
 
 def dark_frame_words(key: int) -> tuple[int, int, int]:
-    """Return the random words that choose a dark frame, its row and its column.
-
-    Parameters
-    ----------
-    key : int
-        Key from `stream_key`.
-
-    Returns
-    -------
-    tuple of int
-        Three 32-bit words: the output of counter (0, 0) of the stream ``dark_frame``.
-    """
+    """Draw three 32-bit words, which choose a dark frame, its row and its column."""
     chosen, row, column, _ = _outputs(key, 1, purpose("dark_frame"), 0)
     return int(chosen[0]), int(row[0]), int(column[0])
 
 
 def parameter_uniforms(key: int, count: int, level: int = 0, epoch: int = 0) -> list[float]:
-    """Return uniform deviates for the drawn parameters of an image.
+    """Draw uniform deviates (k + ½)·2**-52 with a 52-bit integer k, for the parameters of an image.
 
     Parameter n uses counter (0, n) of the stream ``parameters``: add new parameters at the end, never renumber.
-
-    Parameters
-    ----------
-    key : int
-        Key from `stream_key`.
-    count : int
-        Number of parameters.
-    level : int
-        Number of the noise level.
-    epoch : int
-        Number of the epoch.
-
-    Returns
-    -------
-    list of float
-        (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
     return _uniforms(key, count, purpose("parameters", level), frame_word(0, epoch))
 
 
 def scatter_uniforms(key: int, count: int) -> list[float]:
-    """Return uniform deviates for the numbers of a camera body.
+    """Draw uniform deviates as `parameter_uniforms` for the numbers of a sensor unit, from its `body_key`.
 
     Number n uses counter n of the stream ``scatter``: add new numbers at the end, never renumber.
-
-    Parameters
-    ----------
-    key : int
-        Key from `body_key`.
-    count : int
-        Number of deviates.
-
-    Returns
-    -------
-    list of float
-        (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
     return _uniforms(key, count, purpose("scatter"), 0)
 
@@ -410,5 +218,5 @@ def _uniforms(key: int, count: int, word_2: int, word_3: int) -> list[float]:
 
 @functools.cache
 def _packed(count: int) -> tuple[int, int]:
-    """Return ``count`` ones, and the numbers below ``count``, at intervals of 64 bits."""
+    """``count`` ones, and the numbers below ``count``, at intervals of 64 bits."""
     return sum(1 << 64 * n for n in range(count)), sum(n << 64 * n for n in range(count))
