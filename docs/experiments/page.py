@@ -185,49 +185,41 @@ judged patch at each level. Medians over patches with 95 % intervals; the real c
 """
 
 
-def trained_on_pictures(srgb: dict[str, Any]) -> str:
-    """Return the tables of models trained on pictures of one scene."""
+def training(results: dict[str, Any]) -> str:
+    """Return the page of experiment 4."""
+    srgb, scenes = results["srgb"], (results["srgb"], results["srgb_daylight"])
+    measures = (("psnr_db", "psnr_difference_db"), ("ssim", "ssim_difference"))
+    head = ["PSNR, dB", "SSIM", "daylight: PSNR, dB", "daylight: SSIM"]
     cells = [
-        [NAMES[model], with_interval(srgb["psnr_db"][model]), with_interval(srgb["ssim"][model])]
+        [NAMES[model], *(with_interval(scene[name][model]) for scene in scenes for name, _ in measures)]
         for model in srgb["psnr_db"]
     ]
     differences = [
         [
             " − ".join(NAMES[name] for name in pair.split(" - ")),
-            with_interval(values),
-            with_interval(srgb["ssim_difference"][pair]),
+            *(with_interval(scene[name][pair]) for scene in scenes for _, name in measures),
         ]
-        for pair, values in srgb["psnr_difference_db"].items()
+        for pair in srgb["psnr_difference_db"]
     ]
-    noise = srgb["noise_codes"]
-    return f"""The median noise of the training patches has a standard deviation of {noise["trained"]:.1f} codes,
-that of the real pictures {noise["judged"]:.1f}.
-
-{table(["training noise", "PSNR, dB", "SSIM"], cells)}
-
-Paired differences; an interval that contains 0 shows no difference:
-
-{table(["difference", "PSNR, dB", "SSIM"], differences)}
-"""
-
-
-def training(results: dict[str, Any]) -> str:
-    """Return the page of experiment 4."""
-    srgb = results["srgb"]
+    low, daylight = (scene["noise_codes"] for scene in scenes)
     page = f"""# Does it train better
 
 One network of {srgb["parameters"]} parameters was trained on {results["photographs"]} photographs with each kind of
 noise, in {results["steps"]} steps, with {results["seeds"]} seeds. It was judged on {srgb["pairs"]}
 real sRGB pairs of {srgb["scenes"]} scenes; 95 % intervals over scenes.
 
-## On pictures, with the noise of low light
+## On pictures
 
-{trained_on_pictures(srgb)}
-## On pictures, with the noise of daylight
+The median noise of the training patches has a standard deviation of {low["trained"]:.1f} codes in low light and
+{daylight["trained"]:.1f} by daylight, that of the real pictures {low["judged"]:.1f}. Daylight was added after the
+first result, because the noise of low light is stronger than that of the real pictures.
 
-This part was added after the first result, because the noise of low light is stronger than that of the real pictures.
+{table(["training noise", *head], cells)}
 
-{trained_on_pictures(results["srgb_daylight"])}"""
+Paired differences; an interval that contains 0 shows no difference:
+
+{table(["difference", *head], differences)}
+"""
     if "raw" not in results:
         return page
     raw = results["raw"]
