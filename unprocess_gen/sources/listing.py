@@ -19,7 +19,7 @@ import os
 import posixpath
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -40,11 +40,12 @@ from unprocess_gen.sources.reading import opened, read_bytes
 NAMED_SUFFIXES = 5
 """Suffixes of unmatched files that `unmatched_sentence` names; the others are summed."""
 
-READABLE_SUFFIXES = frozenset((".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
-"""Suffixes of photographs that can be decoded; `unmatched_sentence` advises to extend ``source.include``."""
-
-CONVERTIBLE_SUFFIXES = frozenset((".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"))
-"""Suffixes of pictures that photographs are not read from; `unmatched_sentence` advises to convert them."""
+ADVICE = {
+    "extend source.include to read {}": {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"},
+    "convert {} to JPEG, PNG or TIFF": {".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"},
+    "source.kind=raw reads {}": {*RAW_FILES},
+}
+"""Advice of `unmatched_sentence` about files, by their suffixes."""
 
 MAX_LISTED = 4096
 """Characters of the longest path in a list."""
@@ -108,7 +109,7 @@ def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int |
     single = single_file(root)
     if single is not None:
         return Listing((_source(0, single),))
-    matches = matcher(include)
+    matches = _matcher(include)
     matched: list[Entry] = []
     suffixes, skipped_links = Counter[str](), 0
     try:
@@ -118,11 +119,16 @@ def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int |
             elif entry.kind is EntryKind.FILE:
                 suffixes[PurePosixPath(encode_name(entry.path)).suffix.lower()] += 1
             elif entry.kind is EntryKind.UNREADABLE and recursive:  # may be a folder of photographs
-                raise _unreadable_folder(root, entry.path, entry.problem)
+                raise OSError(0, entry.problem, os.path.join(root, entry.path))
             skipped_links += recursive and entry.kind is EntryKind.LOOP
     except OSError as error:
-        raise _unreadable_folder(
-            root, os.path.relpath(error.filename, str(root)), error.strerror or str(error)
+        folder = os.path.relpath(error.filename, root)
+        name, ways_out = "the folder itself", "change its permissions"
+        if folder != os.curdir:
+            name, ways_out = encode_name(folder), f"{ways_out}, move it, or set source.recursive=false"
+        raise ConfigError(
+            f"source.root={root}: {name} cannot be read ({error.strerror or error}); expected readable folders; "
+            f"{ways_out}"
         ) from None
     unmatched = dict(sorted(suffixes.items(), key=lambda item: (-item[1], item[0])))
     if not matched:
@@ -132,9 +138,8 @@ def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int |
             f"source.root={root}: no file matches source.include={list(include)} "
             f"({'with' if recursive else 'without'} sub-folders); {advice}"
         )
-    in_order = sorted(matched, key=lambda entry: os.fsencode(entry.path))
-    sources = tuple(_source(index, entry) for index, entry in enumerate(itertools.islice(in_order, limit)))
-    return Listing(sources, skipped_links, unmatched)
+    matched.sort(key=lambda entry: os.fsencode(entry.path))
+    return Listing(tuple(map(_source, itertools.count(), matched[:limit])), skipped_links, unmatched)
 
 
 def list_file(root: str, file: str, limit: int | None) -> Listing:
@@ -155,8 +160,7 @@ def list_file(root: str, file: str, limit: int | None) -> Listing:
     if not lines:
         raise ConfigError(f"source.list={file}: names no file; expected a path in each line")
     in_order = sorted(lines, key=os.fsencode)[:limit]
-    entries = any_path(root).map(partial(_listed_entry, root), in_order)
-    return Listing(tuple(_source(index, entry) for index, entry in enumerate(entries)))
+    return Listing(tuple(map(_source, itertools.count(), any_path(root).map(partial(_listed_entry, root), in_order))))
 
 
 def _listed_paths(file: str) -> Iterator[tuple[int, str]]:
@@ -199,40 +203,24 @@ def unmatched_sentence(unmatched: dict[str, int]) -> str:
     total = sum(unmatched.values())
     if not total:
         return ""
-    named = [f"{count} {suffix or 'without suffix'}" for suffix, count in list(unmatched.items())[:NAMED_SUFFIXES]]
-    others = sum(list(unmatched.values())[NAMED_SUFFIXES:])
-    kinds = ", ".join([*named, *([f"{others} others"] if others else [])])
+    kinds = [f"{count} {suffix or 'without suffix'}" for suffix, count in unmatched.items()]
+    if others := sum(list(unmatched.values())[NAMED_SUFFIXES:]):
+        kinds[NAMED_SUFFIXES:] = [f"{others} others"]
     files = "1 file is" if total == 1 else f"{total} files are"
-    readable, convertible, raw = (
-        ", ".join(sorted(unmatched.keys() & suffixes))
-        for suffixes in (READABLE_SUFFIXES, CONVERTIBLE_SUFFIXES, set(RAW_FILES))
-    )
-    return (
-        f"{files} not matched by source.include ({kinds})"
-        + (f"; extend source.include to read {readable}" if readable else "")
-        + (f"; convert {convertible} to JPEG, PNG or TIFF" if convertible else "")
-        + (f"; source.kind=raw reads {raw}" if raw else "")
-    )
+    sentence = f"{files} not matched by source.include ({', '.join(kinds)})"
+    for advice, suffixes in ADVICE.items():
+        if found := sorted(unmatched.keys() & suffixes):
+            sentence += f"; {advice.format(', '.join(found))}"
+    return sentence
 
 
-def matcher(include: Iterable[str]) -> Callable[[str], bool]:
+def _matcher(include: Sequence[str]) -> Callable[[str], bool]:
     """Compile globs, case-insensitive: those with ``/`` match the relative path, others the name of the file."""
-    patterns: dict[bool, list[str]] = {True: [], False: []}
-    for glob in include:
-        patterns["/" in glob].append(fnmatch.translate(glob))
     matches_path, matches_name = (
-        re.compile("|".join(patterns[is_full]) or r"(?!)", re.IGNORECASE).match for is_full in (True, False)
+        re.compile("|".join(map(fnmatch.translate, globs)) or r"(?!)", re.IGNORECASE).match
+        for globs in ([glob for glob in include if "/" in glob], [glob for glob in include if "/" not in glob])
     )
     return lambda path: matches_name(path.rpartition("/")[2]) is not None or matches_path(path) is not None
-
-
-def _unreadable_folder(root: str, folder: str, reason: str) -> ConfigError:
-    name = "" if folder == os.curdir else encode_name(folder)
-    ways_out = "change its permissions, move it, or set source.recursive=false" if name else "change its permissions"
-    return ConfigError(
-        f"source.root={root}: {name or 'the folder itself'} cannot be read ({reason}); expected readable folders; "
-        f"{ways_out}"
-    )
 
 
 def single_file(root: str) -> Entry | None:
