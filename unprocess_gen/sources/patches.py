@@ -11,7 +11,7 @@ positions none is more likely than another by more than n / 2**32.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable
 
 from unprocess_gen.core.random_streams import patch_words
 from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchRule, Srgb
@@ -24,29 +24,22 @@ def list_patches(
     if rule is None:
         side = 2 if layout == PACKED else 1
         return (Patch(0, 0, 0, height // side * side, width // side * side),)
-    corners = _grid(rule, height, width) if rule.kind == "grid" else _random(rule, stream_key, height, width, epoch)
+    corners: Iterable[tuple[int, int]]
+    if rule.kind == "grid":
+        rows, columns = (range(0, length - rule.side + 1, rule.stride) for length in (height, width))
+        corners = itertools.product(rows, columns)
+    else:
+        words = patch_words(stream_key, rule.count, epoch)
+        corners = (even_corner(place, rule.side, height, width) for place in words)
     return tuple(Patch(number, y, x, rule.side, rule.side) for number, (y, x) in enumerate(corners))
 
 
-def _grid(rule: PatchRule, height: int, width: int) -> Iterator[tuple[int, int]]:
-    rows, columns = (range(0, length - rule.side + 1, rule.stride) for length in (height, width))
-    return itertools.product(rows, columns)
-
-
-def _random(rule: PatchRule, stream_key: int, height: int, width: int, epoch: int) -> Iterator[tuple[int, int]]:
-    for place in patch_words(stream_key, rule.count, epoch):
-        yield even_corner(place, rule.side, height, width)
-
-
 def even_corner(place: tuple[int, int], side: int, height: int, width: int) -> tuple[int, int]:
-    """Return the even row and column of a square in a rectangle that two random words choose."""
+    """Even row and column of a square in a rectangle that two random words choose."""
     rows, columns = (height - side) // 2 + 1, (width - side) // 2 + 1
     return 2 * (place[0] * rows >> 32), 2 * (place[1] * columns >> 32)
 
 
 def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:
-    """Return the pixels of a patch.
-
-    The result is array, [patch.height, patch.width, 3].
-    """
+    """Cut the pixels of a patch from [H, W, 3]."""
     return srgb[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width]

@@ -32,22 +32,17 @@ SHARED_MEMORY = Path("/dev/shm")
 
 
 class PixelCache:
-    """Cache decoded pixels as NPY files, shared by all processes that have the folder.
+    """Cache of decoded pixels as NPY files, shared by all processes that have the folder.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Folder, created if necessary; ``"memory"`` for a temporary one in shared memory, which is deleted with the cache
-        of the process that created it.
-    most_bytes : int
-        Size up to which pixels are added; none are removed. Processes that add at once can exceed it by one image each.
+    The folder is created if necessary; ``"memory"`` means a temporary one in shared memory, which is deleted with the
+    cache of the process that created it. Pixels are added up to ``most_bytes``; none are removed. Processes that add at
+    once can exceed it by one image each.
     """
 
     def __init__(self, folder: str | os.PathLike[str], most_bytes: int) -> None:
         self._most_bytes = most_bytes
         if folder == "memory":
-            root = SHARED_MEMORY if SHARED_MEMORY.is_dir() else None
-            folder = tempfile.mkdtemp(prefix="unprocess_gen_", dir=root)
+            folder = tempfile.mkdtemp(prefix="unprocess_gen_", dir=SHARED_MEMORY if SHARED_MEMORY.is_dir() else None)
             weakref.finalize(self, _delete, folder, os.getpid())
         self._maps: Recent[str, Srgb] = Recent(MAPS)
         self._compared: set[str] = set()
@@ -60,18 +55,18 @@ class PixelCache:
             ) from None
 
     def get(self, name: str, decode: Callable[[], Srgb]) -> Srgb:
-        """Return the pixels of a name; decode them if they are not in the cache, and add them if there is space."""
+        """Pixels of a name, decoded if they are not in the cache, and then added if there is space."""
         pixels = self._maps.get(name)
-        if pixels is None:
-            path = self._folder / f"{name}.npy"
-            with machine_errors(path):
-                pixels = self._mapped(path)
-            if pixels is None:
-                decoded = decode()
-                if self._bytes() + HEADER_BYTES + decoded.nbytes + DIGEST_BYTES <= self._most_bytes:
-                    self._add(path, decoded)
-                return decoded
-            self._maps.keep(name, pixels)
+        if pixels is not None:
+            return pixels
+        path = self._folder / f"{name}.npy"
+        with machine_errors(path):
+            pixels = self._mapped(path)
+        if pixels is not None:
+            return self._maps.keep(name, pixels)
+        pixels = decode()
+        if self._bytes() + HEADER_BYTES + pixels.nbytes + DIGEST_BYTES <= self._most_bytes:
+            self._add(path, pixels)
         return pixels
 
     def _mapped(self, path: Path) -> Srgb | None:
