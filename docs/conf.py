@@ -11,7 +11,7 @@ from sphinx.application import Sphinx
 import unprocess_gen
 
 RECORDS = (
-    "core.types.Counts",
+    "simulation.frames.Counts",
     "simulation.effects.Physics",
     "pipeline.generate.Summary",
     "pipeline.replay.ReplayResult",

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import unprocess_gen as ug
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.sources import synthetic
 

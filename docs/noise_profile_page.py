@@ -18,7 +18,7 @@ from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.planning.draws import DRAW_COUNT
 from unprocess_gen.planning.noise_profile import PhysicalNoise
-from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.plan import Physics
 
 SOURCES = Path(__file__).parent / "noise_sources.yaml"
 

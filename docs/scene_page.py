@@ -11,12 +11,12 @@ from unprocess_gen.config.interpretation import assumed_numbers, branch_of
 from unprocess_gen.config.option_files import group_options
 from unprocess_gen.config.schema import Config, NoiseConfig, SceneConfig
 from unprocess_gen.config.serialization import read_option
-from unprocess_gen.core.types import Facts
 from unprocess_gen.planning.dark_scene import physical_profiles
 from unprocess_gen.planning.effect_selection import Prediction
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.simulation.effects import BY_NAME
+from unprocess_gen.simulation.facts import Facts
 
 FACTS = Facts(width=6000, height=4000, codes=256, dark_code=0, bright_code=255)
 """A photograph of 24 megapixels with black and white in it."""

@@ -9,8 +9,8 @@ import pytest
 from helpers.cases import slow_except
 
 import unprocess_gen as ug
-from unprocess_gen.core.types import Plan
 from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 
@@ -105,7 +105,7 @@ def test_gradients_equal_finite_differences(look: str, highlight: str, pair: ug.
 @pytest.mark.parametrize(("look", "highlight"), CASES)
 def test_gradients_are_finite_at_black_white_and_beyond(look: str, highlight: str, pair: ug.RawPair) -> None:
     plan = with_look(pair, look, highlight)
-    levels = [-1e3, -0.1, -1e-30, 0.0, 1e-40, 1e-30, 1e-12, 1e-8, plan.camera.highlight_threshold, 1.0, 1.1, 1e3]
+    levels = [-1e3, -0.1, -1e-30, 0.0, 1e-40, 1e-30, 1e-12, 1e-8, plan.isp.highlight_threshold, 1.0, 1.1, 1e3]
     for dtype in LIMIT:
         flat = torch.tensor(levels, dtype=dtype)[:, None, None].repeat(1, 6, 6).requires_grad_()
         generator = torch.Generator().manual_seed(1)

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
         SourceError,
         UnprocessGenError,
     )
-    from unprocess_gen.core.types import Plan
     from unprocess_gen.dataset.clips import Clip, RawClips
     from unprocess_gen.dataset.reader import RawPairs, Sample
     from unprocess_gen.dataset.sampler import EpochSampler
     from unprocess_gen.dataset.training import noise_std, pack, random_crop, to_light
     from unprocess_gen.pipeline.live import LivePairs, LiveSample
+    from unprocess_gen.simulation.plan import Plan
 
 __version__ = "0.3.0"
 
@@ -76,12 +76,12 @@ _MODULES = {
     "core.errors": (
         *("ConfigError", "DamageError", "LockedError", "MachineError", "SourceError", "UnprocessGenError"),
     ),
-    "core.types": ("Plan",),
     "dataset.clips": ("Clip", "RawClips"),
     "dataset.reader": ("RawPairs", "Sample"),
     "dataset.sampler": ("EpochSampler",),
     "dataset.training": ("noise_std", "pack", "random_crop", "to_light"),
     "pipeline.live": ("LivePairs", "LiveSample"),
+    "simulation.plan": ("Plan",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -23,22 +23,27 @@ from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.values import refusal
+from unprocess_gen.core.arrays import PACKED, Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.types import PACKED, Frame, Pair, Patch, Photograph, Plan, Row, Source, Srgb, Value
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import pair_row, plan_from_row
 from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.dataset.row import Row, Value
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline import generate as _generate
 from unprocess_gen.pipeline import replay as _replay
 from unprocess_gen.pipeline import verify as _verify
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.frames import Pair, Patch
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.patches import list_patches
+from unprocess_gen.sources.photograph import Photograph
 
 ARRAY_NAME = "array"
 """The column ``source`` of a pair made from an array."""
@@ -79,7 +84,7 @@ class RawPair:
         return dict(pair_row(key_text(0), self._source, identity, 1, 0, self.plan, pair, digests, self._patch))
 
     def __repr__(self) -> str:
-        return f"RawPair({self.clean.dtype} {list(self.clean.shape)}, noise={self.plan.noise.name})"
+        return f"RawPair({self.clean.dtype} {list(self.clean.shape)}, noise={self.plan.noise.noise})"
 
 
 def array_identity(srgb: Srgb) -> str:
@@ -195,7 +200,7 @@ def make_pair(
     identity = _identity(pixels, key)
     if not isinstance(config, Plan):
         image = _planned(pixels, identity, config, seed)
-    elif config.noise.dark.sha256:
+    elif config.dark is not None:
         raise ConfigError("make_pair: the plan names a dark frame, whose folder it lacks; expected a config")
     elif config.source.is_raw:
         raise ConfigError("make_pair: the plan is of a raw frame; expected that of a photograph; use ug.LivePairs")

@@ -20,11 +20,14 @@ from unprocess_gen.api import array_pixels, array_settings, array_source, key_id
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import refusal
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import FLOAT32, MOSAIC, Frame, Pair, Photograph, Plan, Srgb
 from unprocess_gen.pipeline.pairs import plan_pixels
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.frames import Pair
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
+from unprocess_gen.sources.photograph import Photograph
 
 Float32 = NDArray[np.float32]
 

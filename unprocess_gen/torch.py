@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unprocess_gen.core.types import Plan, Value
 from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.row import Value
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS, plane_sites, tile
 
@@ -86,12 +87,12 @@ def development_parameters(row: Mapping[str, Value] | Plan) -> DevelopmentParame
     plan = row if isinstance(row, Plan) else plan_from_row(row)
     values = (
         FILTERS.index(plan.sensor.pattern),
-        list(isp.HIGHLIGHTS).index(plan.camera.highlight),
+        list(isp.HIGHLIGHTS).index(plan.isp.highlight),
         list(isp.TONES).index(plan.isp.tone),
         SRGB if plan.isp.gamma == "srgb" else float(plan.isp.gamma),
         np.array([plan.sensor.black_level_dn, plan.sensor.white_level_dn], np.float64),
         float(plan.scene.exposure_ratio),
-        float(plan.camera.highlight_threshold),
+        float(plan.isp.highlight_threshold),
         np.array(plan.camera.inverse_gains),
         np.array(isp.cam2rgb(plan)).reshape(3, 3),
     )

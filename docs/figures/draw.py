@@ -26,11 +26,12 @@ from numpy.typing import NDArray
 import unprocess_gen as ug
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import read_option
+from unprocess_gen.core.arrays import Float, Frame, Srgb
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import Float, Frame, Plan, Srgb
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp, unprocess
 from unprocess_gen.simulation.reference.cfa import CHANNELS, mosaic, tile
 from unprocess_gen.sources.listing import list_photographs
@@ -159,7 +160,7 @@ def steps(photo: Photograph) -> Figure:
             "gamma inverted": lambda light: unprocess.expand_gamma(light, plan.isp.gamma),
             "colour matrix inverted": lambda light: unprocess.apply_ccm(light, camera.rgb2cam),
             "gains inverted": lambda light: unprocess.invert_gains(
-                light, camera.inverse_gains, camera.highlight, camera.highlight_threshold
+                light, camera.inverse_gains, isp.highlight, isp.highlight_threshold
             ),
         }.items(),
         start=1,

@@ -29,13 +29,16 @@ from helpers.configs import composed
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.types import Patch, Plan, Source, Srgb
+from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
+from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.pair import make_pair, make_pairs
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.decode import decode
 

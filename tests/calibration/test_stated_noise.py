@@ -55,7 +55,7 @@ def numbers_at(profile: Path, *isos: float) -> list[tuple[float, float]]:
     for iso in isos:
         scene = dataclasses.replace(config.scene, iso=iso)
         plan = ug.plan_image(np.zeros((32, 32, 3), np.uint8), dataclasses.replace(config, scene=scene))
-        numbers.append((plan.noise.physics.dn_per_e * scale, plan.noise.physics.read_std_dn * scale))
+        numbers.append((plan.physics.dn_per_e * scale, plan.physics.read_std_dn * scale))
     return numbers
 
 
@@ -67,7 +67,7 @@ def test_tags_of_own_files_give_back_their_numbers(run_main: RunMain, tmp_path: 
         pair = Camera("sony_a7s2", iso, side=32).pair(0.2, 0.001, 0)
         for name in ("noisy", "clean"):  # the clean frame has no noise, and no tag
             (folder / f"{iso}.{name}.dng").write_bytes(encode(pair.noisy, pair.row, name))
-        expected[iso] = pair.plan.noise.physics.dn_per_e, dark_variance_dn2(pair.plan)
+        expected[iso] = pair.plan.physics.dn_per_e, dark_variance_dn2(pair.plan)
     done = run_main("calibrate", folder, "--from", "noise_profile", "--to", profile)
     assert done.code == 0, done.err
     assert "6 of 12" in done.err

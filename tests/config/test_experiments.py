@@ -18,7 +18,7 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.serialization import read_dataset_yaml
-from unprocess_gen.core.types import Srgb
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.loader import downscaled
 

@@ -38,10 +38,11 @@ from unprocess_gen.config.serialization import (
 )
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import parse_yaml_mapping
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import FLOAT32, MOSAIC, PACKED, UINT16, Facts
 from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.simulation import tone_curves
+from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.reference import cfa, unprocess
 from unprocess_gen.sources.image.decode import ICC_CHOICES
 
@@ -316,7 +317,7 @@ def test_auto_pins_saturated_sites_of_limited_physical_profiles(
 ) -> None:
     config = settings(*overrides)
     validate_config(config)
-    assert plan_image(config, "0" * 64, facts=Facts(64, 48, 256, 0, 255)).noise.saturated == decided
+    assert plan_image(config, "0" * 64, facts=Facts(64, 48, 256, 0, 255)).sensor.saturated_as == decided
 
 
 SPELLINGS = [

@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from unprocess_gen.config import distributions
-from unprocess_gen.config.distributions import DISTRIBUTIONS, FIXED_POINT, draw_parameter
+from unprocess_gen.config.distributions import DISTRIBUTIONS, FIXED_POINT, Distribution, draw_parameter
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.fixed_point import (
     BITS,
@@ -24,7 +24,6 @@ from unprocess_gen.core.fixed_point import (
     normal_quantile,
     times,
 )
-from unprocess_gen.core.types import Distribution
 
 DIGITS = 100
 uniforms = st.one_of(

@@ -24,10 +24,10 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Plan
 from unprocess_gen.dataset import dng
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.colour import CAMERAS
 from unprocess_gen.simulation.reference.isp import apply_gains
 from unprocess_gen.simulation.reference.unprocess import camera_light, linear_light
@@ -196,10 +196,8 @@ def errors(developed: np.ndarray, srgb: np.ndarray, plan: Plan) -> tuple[np.ndar
     """
     light = linear_light(srgb, plan.isp.tone, plan.isp.gamma)
     native = camera_light(srgb, plan)
-    used = (apply_gains(native, plan.camera.inverse_gains, "none", 0.9) < plan.camera.highlight_threshold).all(axis=-1)
-    used &= (
-        (light < plan.camera.highlight_threshold).all(axis=-1) & (native < 1).all(axis=-1) & (native > 0).all(axis=-1)
-    )
+    used = (apply_gains(native, plan.camera.inverse_gains, "none", 0.9) < plan.isp.highlight_threshold).all(axis=-1)
+    used &= (light < plan.isp.highlight_threshold).all(axis=-1) & (native < 1).all(axis=-1) & (native > 0).all(axis=-1)
     used &= (developed > 0).all(axis=-1) & (developed < developed.max()).all(axis=-1)
     return (developed - light)[used], float(used.mean())
 

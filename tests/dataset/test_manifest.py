@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 from helpers.datasets import Settings
@@ -16,20 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import REASONS, DamageError
-from unprocess_gen.core.types import (
-    TIERS,
-    CameraPlan,
-    DarkFramePlan,
-    IspPlan,
-    NoisePlan,
-    Patch,
-    Plan,
-    Row,
-    ScenePlan,
-    SensorPlan,
-    Source,
-    SourcePlan,
-)
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS, Range, columns_of
 from unprocess_gen.dataset.manifest import (
     failed_row,
@@ -41,8 +29,22 @@ from unprocess_gen.dataset.manifest import (
     without_empty,
     write_rows,
 )
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.frames import Patch
+from unprocess_gen.simulation.plan import (
+    TIERS,
+    CameraPlan,
+    DarkFramePlan,
+    IspPlan,
+    NoisePlan,
+    Physics,
+    Place,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+)
 
 CONTRACT = [
     *("key", "source", "source_sha256", "status", "reason", "width", "height", "orientation", "shard", "seed"),
@@ -98,7 +100,7 @@ def levels(bits: int) -> st.SearchStrategy[tuple[int, int, int]]:
     return black.flatmap(lambda low: st.tuples(st.just(bits), st.just(low), st.integers(low + 1, 2**bits - 1)))
 
 
-NUMBERS = [field.name for field in dataclasses.fields(Physics) if field.type == "float" and field.name in BY_NAME]
+NUMBERS = [name for name, kind in get_type_hints(Physics).items() if kind is float and name in BY_NAME]
 word = st.text(st.characters(codec="ascii", categories=["Ll", "Nd"]), min_size=1, max_size=9)
 physics = st.builds(
     Physics,
@@ -121,33 +123,36 @@ plans = st.builds(
     scene=st.builds(ScenePlan, word, number("exposure_ratio")),
     camera=st.builds(
         CameraPlan,
-        name=word,
+        camera=word,
         weights=st.tuples(*[number("w_nexus_6p")] * 4),
         rgb2cam=st.tuples(*[number("rgb2cam_00")] * 9),
-        highlight=st.sampled_from(["per_channel", "gray_mean", "none"]),
-        **{name: number(name) for name in ("red_gain", "blue_gain", "inverse_rgb_gain", "highlight_threshold")},
+        **{name: number(name) for name in ("red_gain", "blue_gain", "inverse_rgb_gain")},
     ),
-    isp=st.builds(IspPlan, st.sampled_from(["smoothstep", "none"]), st.just("srgb") | st.floats(0.1, 10)),
+    isp=st.builds(
+        IspPlan,
+        st.sampled_from(["smoothstep", "none"]),
+        st.just("srgb") | st.floats(0.1, 10),
+        st.sampled_from(["per_channel", "gray_mean", "none"]),
+        number("highlight_threshold"),
+    ),
     sensor=st.builds(
-        lambda pattern, levels: SensorPlan(pattern, *levels),
+        lambda pattern, levels, clip, saturated: SensorPlan(pattern, *levels, clip, saturated),
         st.sampled_from(["RGGB", "BGGR", "GRBG", "GBRG"]),
         st.integers(1, 16).flatmap(levels),
+        st.sampled_from(["sensor", "black"]),
+        st.sampled_from(["noisy", "white"]),
     ),
     noise=st.builds(
         NoisePlan,
-        name=word,
-        law=st.sampled_from(["gaussian", "poisson"]),
+        noise=word,
+        noise_law=st.sampled_from(["gaussian", "poisson"]),
         a_dn=number("a_dn"),
         b_dn2=number("b_dn2"),
         effects=st.lists(word, max_size=3).map(tuple),
         skipped=st.lists(word, max_size=3).map(tuple),
-        sensor_clip=st.sampled_from(["sensor", "black"]),
-        saturated=st.sampled_from(["noisy", "white"]),
-        physics=st.none() | physics,
-        level=st.integers(0, 99),
-        draw=st.integers(0, 99),
-        frame=st.integers(0, 10**9),
     ),
+    physics=st.none() | physics,
+    place=st.builds(Place, st.integers(0, 10**9), st.integers(0, 99), st.integers(0, 99)),
     accuracy=st.sampled_from(TIERS),
     split=st.sampled_from(["", "train", "fold-3"]),
 )

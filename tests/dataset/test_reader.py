@@ -19,7 +19,7 @@ from helpers.photographs import fill
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset import reader
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.planning.plan import plan_image

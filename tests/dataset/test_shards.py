@@ -21,7 +21,6 @@ import xxhash
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.types import Counts, Pair
 from unprocess_gen.dataset import shards
 from unprocess_gen.dataset.manifest import without_empty
 from unprocess_gen.dataset.shards import (
@@ -31,6 +30,7 @@ from unprocess_gen.dataset.shards import (
     map_array,
     read_index,
 )
+from unprocess_gen.simulation.frames import Counts, Pair
 
 COUNTS = Counts(0, 0, 0, 0, 0, 0)
 

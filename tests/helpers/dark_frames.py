@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.core.types import Raw
+from unprocess_gen.core.arrays import Raw
 
 
 class DarkPixelsInMemory:
-    """Hold the pixels of dark frames by name, as `core.types.DarkPixels`."""
+    """Hold the pixels of dark frames by name, as `simulation.facts.DarkPixels`."""
 
     def __init__(self, frames: dict[str, Raw]) -> None:
         self.frames = frames

@@ -34,7 +34,6 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -45,11 +44,11 @@ import numpy as np
 from numba.core.typing.templates import builtin_registry
 
 from unprocess_gen.cli import main as cli
-from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels import body, render
 from unprocess_gen.simulation.kernels.strips import STRIP, allocate_scratch
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import Plan
 
 KERNELS = {
     f"{module_name}.{name}": value
@@ -166,11 +165,11 @@ def plans() -> list[Plan]:
     """Return plans that need all kernels."""
     golden = [plan for plan in selftest.GOLDEN_PLANS.values() if plan.accuracy != "reference"]
     full = selftest.GOLDEN_PLANS["physical"]
-    averaged = full.replace(physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True))
+    averaged = full.replace(physics=selftest.GOLDEN_PHYSICS.replace(fixed_pattern_in_clean=True))
     dark = selftest.GOLDEN_PLAN.replace(a_dn=0.01, b_dn2=-1.0)
-    few = selftest.GOLDEN_PLAN.replace(law="poisson", a_dn=900.0)
+    few = selftest.GOLDEN_PLAN.replace(noise_law="poisson", a_dn=900.0)
     float32 = selftest.GOLDEN_PLANS["float32"].replace(highlight="gray_mean")
-    pinned = full.replace(saturated="white", exposure_ratio=9.0)
+    pinned = full.replace(saturated_as="white", exposure_ratio=9.0)
     return [*golden, averaged, averaged.replace(dtype="float32"), dark, few, float32, pinned]
 
 

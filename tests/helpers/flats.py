@@ -18,15 +18,15 @@ from helpers.moments import bernstein
 from helpers.records import PLAN
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.types import CameraPlan, IspPlan, Plan, SensorPlan, Srgb
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.effects import Physics
 from unprocess_gen.simulation.effects.dead_pixels import DeadPixels
 from unprocess_gen.simulation.effects.effect import Crop
 from unprocess_gen.simulation.effects.hot_pixels import HotPixels
 from unprocess_gen.simulation.effects.prnu import Prnu
 from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, Plan, SensorPlan
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.sources import synthetic
 
@@ -80,8 +80,8 @@ def assert_same(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Non
 
 
 def with_physics(plan: Plan, **changes: Any) -> Plan:
-    assert plan.noise.physics is not None
-    return plan.replace(physics=replace(plan.noise.physics, **changes))
+    assert plan.physics is not None
+    return plan.replace(**changes)
 
 
 BLACK, WHITE = 4096, 65535
@@ -97,11 +97,13 @@ SILENT = Physics(
 
 def plan_with(*on: str, frame: int = 0xF4A3E, **changes: Any) -> Plan:
     """Return a plan with only these effects, a 16-bit sensor, and light equal to the code divided by 65535."""
-    physics = replace(SILENT, **changes)
+    physics = SILENT.replace(**changes)
     return PLAN.replace(
         stream_key=frame,
-        camera=CameraPlan("identity", (0.0,) * 4, IDENTITY, 1.0, 1.0, 1.0, "none", highlight_threshold=0.9),
-        isp=IspPlan("none", gamma=1.0),
+        camera=CameraPlan(
+            camera="identity", weights=(0.0,) * 4, rgb2cam=IDENTITY, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=1.0
+        ),
+        isp=IspPlan("none", gamma=1.0, highlight="none"),
         sensor=SensorPlan("RGGB", bits=16, black_level_dn=BLACK, white_level_dn=WHITE),
         a_dn=physics.dn_per_e, b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"), physics=physics,
         accuracy="exact",

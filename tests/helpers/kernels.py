@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import Words
-from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels.jit import inner, kernel
 from unprocess_gen.simulation.kernels.normal import (
     Quantiles,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.sensor import to_dn
 from unprocess_gen.simulation.reference.unprocess import unprocess
 
@@ -33,8 +34,8 @@ def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[
     with_all, with_some = (np.mean(clip, axis=0) for clip in clips)
     omitted = with_all - with_some
     variance = noise_variance(clean_dn, auto) + 1 / 12
-    if auto.noise.physics is not None and "dark_current" in auto.noise.effects:
-        variance = variance + auto.noise.physics.dn_per_e**2 * auto.noise.physics.dark_e
+    if auto.physics is not None and "dark_current" in auto.noise.effects:
+        variance = variance + auto.physics.dn_per_e**2 * auto.physics.dark_e
     variance = variance / frames
     height, width = omitted.shape
     planes = [(omitted[y::2, x::2], variance[y::2, x::2]) for y in range(min(height, 2)) for x in range(min(width, 2))]

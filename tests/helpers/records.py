@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import (
+from unprocess_gen.core.source import Source
+from unprocess_gen.simulation.facts import Facts
+from unprocess_gen.simulation.frames import Counts, Pair, Patch
+from unprocess_gen.simulation.plan import (
     CameraPlan,
-    Counts,
-    Facts,
     IspPlan,
     NoisePlan,
-    Pair,
-    Patch,
+    Physics,
     Plan,
     ScenePlan,
     SensorPlan,
-    Source,
     SourcePlan,
 )
-from unprocess_gen.simulation.effects import Physics
 
 SHA256 = "ab" * 32
 
@@ -38,14 +36,13 @@ PLAN = Plan(
     source=SourcePlan(downscale=1, dequantize="off"),
     scene=ScenePlan("daylight", exposure_ratio=1.0),
     camera=CameraPlan(
-        "convex", weights=(0.1, 0.2, 0.3, 0.4), rgb2cam=(0.6, 0.3, 0.1) * 3, red_gain=2.0, blue_gain=1.7,
-        inverse_rgb_gain=0.8, highlight="per_channel", highlight_threshold=0.9,
+        camera="convex", weights=(0.1, 0.2, 0.3, 0.4), rgb2cam=(0.6, 0.3, 0.1) * 3, red_gain=2.0, blue_gain=1.7,
+        inverse_rgb_gain=0.8,
     ),
-    isp=IspPlan("smoothstep", gamma=2.2),
+    isp=IspPlan("smoothstep", 2.2, "per_channel", highlight_threshold=0.9),
     sensor=SensorPlan("RGGB", bits=12, black_level_dn=240, white_level_dn=4095),
     noise=NoisePlan(
-        "imx385_iso3200", "gaussian", a_dn=7.0, b_dn2=38.0, effects=("heteroscedastic", "quantise"), skipped=(),
-        sensor_clip="sensor", saturated="noisy",
+        "imx385_iso3200", "gaussian", a_dn=7.0, b_dn2=38.0, effects=("heteroscedastic", "quantise"), skipped=()
     ),
     accuracy="exact",
 )  # fmt: skip

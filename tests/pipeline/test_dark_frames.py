@@ -20,11 +20,11 @@ from PIL import Image
 import unprocess_gen as ug
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import ConfigError, MachineError
-from unprocess_gen.core.types import DarkFrames
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.noise_check.checks import Checker
+from unprocess_gen.simulation.facts import DarkFrames
 from unprocess_gen.sources.dark_frames import open_dark_frames
 
 NOISE = ("noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit", "camera=identity", "gains=unity")
@@ -113,9 +113,9 @@ def test_frames_of_a_clip_take_turns_at_one_place(darks: Path) -> None:
         plan for frame in range(3) for plan in plan_pairs(config, "a" * 64, 0, facts, frame=frame, dark_frames=frames)
     ]
     digests = [one.sha256 for one in frames.frames]
-    first = digests.index(plans[0].noise.dark.sha256)
-    assert [plan.noise.dark.sha256 for plan in plans] == [digests[(first + number) % 3] for number in range(6)]
-    assert len({plan.noise.dark.shift for plan in plans}) == 1
+    first = digests.index(plans[0].dark.dark_frame)
+    assert [plan.dark.dark_frame for plan in plans] == [digests[(first + number) % 3] for number in range(6)]
+    assert len({plan.dark.shift for plan in plans}) == 1
 
 
 def test_effects_are_judged_against_the_noise_of_the_frames(tmp_path: Path) -> None:
@@ -138,8 +138,8 @@ def test_noise_without_light_is_the_dark_frame(darks: Path) -> None:
     config = ug.load_config([*NOISE[:2], "sensor.black_level_dn=512", "sensor.bits=14", "sensor.white_level_dn=16300",
                              f"noise.dark_frames={darks}", "noise.dark_frames_black_dn=512"])  # fmt: skip
     pair = ug.make_pair(np.zeros((150, 200, 3), np.uint8), config)
-    frame = open_frames(darks)[pair.plan.noise.dark.sha256]
-    y, x = pair.plan.noise.dark.shift
+    frame = open_frames(darks)[pair.plan.dark.dark_frame]
+    y, x = pair.plan.dark.shift
     expected = np.tile(frame, (5, 5))[y : y + 150, x : x + 200]
     np.testing.assert_array_equal(pair.noisy, expected)
 
@@ -392,7 +392,7 @@ def test_noise_of_a_real_camera_has_its_variance_and_its_bands(settings: Setting
     pair = ug.make_pair(np.zeros((480, 640, 3), np.uint8), config)
     real = cv2.imread(str(names[0]), cv2.IMREAD_UNCHANGED).astype(float)
     noise = pair.noisy.astype(float) - 100
-    scale = pair.plan.noise.dark.scale
+    scale = pair.plan.dark.dark_scale
     assert noise.var() == pytest.approx(scale**2 * real.var(), rel=0.15)
     assert noise.mean(axis=1).var() == pytest.approx(scale**2 * real.mean(axis=1).var(), rel=0.4)
     assert noise.mean(axis=1).var() > 2 * noise.var() / 640

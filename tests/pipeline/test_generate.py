@@ -25,7 +25,7 @@ from unprocess_gen import RawPairs
 from unprocess_gen.cli.messages import logging_to_stderr
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import worker

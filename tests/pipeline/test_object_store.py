@@ -27,7 +27,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.object_store import TEMPORARY_PREFIX, ObjectPath
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline import workspace as workspaces
 from unprocess_gen.pipeline.generate import Summary, generate
 from unprocess_gen.pipeline.run_records import write_listing

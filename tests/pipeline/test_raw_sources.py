@@ -12,11 +12,14 @@ import pytest
 
 import unprocess_gen as ug
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
-from unprocess_gen.core.types import Pair, Photograph, Plan, Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset import dng
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import PairRegenerator
+from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.pair import reference_pair
+from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.sources.photograph import Photograph
 from unprocess_gen.sources.raw.frames import read_raw_source
 
 SENSORS = [("BGGR", 12, 241), ("GBRG", 16, 4097)]
@@ -250,5 +253,5 @@ def test_recipe_makes_dark_pairs_with_unrounded_clean_frames(tmp_path: Path) -> 
     image = plan_pixels(PairSettings(config), photograph, Source(0, "a", "a", 1), "00" * 32)
     assert len(image.patches) == 16
     plan = image.plans[0]
-    assert (plan.noise.name, plan.output.clean_dtype, plan.sensor.white_level_dn) == ("sony_a7s2", "float32", 16300)
+    assert (plan.noise.noise, plan.output.clean_dtype, plan.sensor.white_level_dn) == ("sony_a7s2", "float32", 16300)
     assert 10 <= plan.scene.exposure_ratio <= 300

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from pathlib import Path
 
@@ -30,7 +29,8 @@ def plan_with(**values: object) -> ug.Plan:
 
 
 PATTERNS_IN_CLEAN = _PHYSICAL.replace(
-    physics=dataclasses.replace(_PHYSICAL.physics, fixed_pattern_in_clean=True, gain_by_colour=(0.9, 1.0, 1.2)),
+    fixed_pattern_in_clean=True,
+    gain_by_colour=(0.9, 1.0, 1.2),
     effects=(*_PHYSICAL.noise.effects, "gain_by_colour"),
 )
 PLANS = {

@@ -22,15 +22,17 @@ from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, Plan, Srgb
 from unprocess_gen.planning.effect_selection import EffectRules, Prediction, Selection, facts_of, omit_weakest
 from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.plan import plan_image, plan_levels
-from unprocess_gen.simulation.effects import BY_NAME, Physics
+from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.effects.black_error import BlackError
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
+from unprocess_gen.simulation.facts import Facts
+from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, Plan
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.sensor import to_dn
@@ -143,8 +145,7 @@ def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
         return float(middle * 10 ** rng.uniform(-decades, decades))
 
     gain, read = around(1.0), around(2.0)
-    return replace(
-        physics,
+    return physics.replace(
         dn_per_e=gain,
         prnu_std=min(around(0.01), 0.3),
         dark_e=around(0.05),
@@ -176,13 +177,13 @@ def test_omitted_effects_are_masked_for_any_sensor(
     for number in range(sensors):
         srgb = pictures[names[number % len(names)]]
         plan = switched(config, "on", srgb, number).replace(exposure_ratio=float(10 ** rng.uniform(-0.5, 2.5)))
-        assert plan.noise.physics is not None
-        plan = of_sensor(plan, sensor(rng, plan.noise.physics))
+        assert plan.physics is not None
+        plan = of_sensor(plan, sensor(rng, plan.physics))
         effects = decided(config, plan, srgb, frames)
         left_out |= set(EFFECTS) - set(effects)
         found: dict[str, list[np.ndarray]] = {}
         for body in range(4 if frames == 1 else 2):
-            everything = plan.replace(stream_key=body, physics=replace(plan.noise.physics, body_key=body + 1000))
+            everything = plan.replace(stream_key=body, body_key=body + 1000)
             auto = everything.replace(effects=effects)
             if "dead_pixels" not in effects:  # counted instead
                 everything = everything.replace(effects=tuple(one for one in EFFECTS if one != "dead_pixels"))
@@ -203,10 +204,10 @@ def of_sensor(plan: Plan, physics: Physics) -> Plan:
 
 def decided(config: Config, plan: Plan, srgb: Srgb, frames: int = 1) -> tuple[str, ...]:
     """Return the effects that ``auto`` simulates with the numbers of a plan."""
-    assert plan.noise.physics is not None
+    assert plan.physics is not None
     facts, span_dn = facts_of(srgb, frames), float(plan.sensor.span_dn)
     light = signal_range(facts, plan.isp, plan.camera, plan.scene.exposure, span_dn)
-    return chosen(automatic(config), plan.noise.physics, facts, light)
+    return chosen(automatic(config), plan.physics, facts, light)
 
 
 def automatic(config: Config, tolerance: float = TOLERANCE) -> Config:
@@ -242,7 +243,7 @@ def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, 
         config = replaced(config, {"noise.branches": branches})
         for srgb in pictures.values():
             auto = switched(config, "auto", srgb, 1)
-            physics = auto.noise.physics
+            physics = auto.physics
             assert physics is not None
             light = unprocess(srgb, auto) * auto.scene.exposure
             levels = (auto.sensor.black_level_dn, auto.sensor.white_level_dn)
@@ -295,7 +296,7 @@ def test_a_full_well_is_simulated_only_below_the_end_of_the_converter(
         settings, "noise=nikon_d850", "scene=daylight", "sensor=generic_12bit", f"noise.full_well_e={electrons}"
     )
     plan = switched(config, "auto", flat(255, 255, 255), 0)
-    physics = replace(plan.noise.physics, dn_per_e=0.25, read_std_dn=1.0)
+    physics = plan.physics.replace(dn_per_e=0.25, read_std_dn=1.0)
     light = SignalRange(0.0, float(plan.sensor.span_dn))
     assert ("full_well" in chosen(config, physics, facts_of(flat(255, 255, 255)), light)) == simulated
 
@@ -308,9 +309,8 @@ def base(settings: Settings) -> tuple[Config, Physics]:
     """Return a config with every effect on ``auto``, and a sensor on which only shot and read noise are simulated."""
     config = configured(settings, "noise=nikon_d850", "scene=daylight", "noise.assumed=[]", "noise.full_well_e=1000")
     plan = switched(config, "on", flat(9, 9, 9), 0)
-    assert plan.noise.physics is not None
-    physics = replace(
-        plan.noise.physics,
+    assert plan.physics is not None
+    physics = plan.physics.replace(
         dn_per_e=1.0,
         prnu_std=1e-5,
         dark_e=1e-4,
@@ -349,7 +349,7 @@ def test_only_the_strong_effect_is_simulated(
 ) -> None:
     """Strong dark current can mask even read noise."""
     config, physics = base
-    on = set(chosen(config, replace(physics, **numbers), FACTS, LIGHT))
+    on = set(chosen(config, physics.replace(**numbers), FACTS, LIGHT))
     assert effect in on
     assert on - {"read"} == {"shot", "quantise", effect}
 
@@ -367,7 +367,7 @@ def test_pattern_masked_in_one_frame_is_simulated_for_a_clip(
     base: tuple[Config, Physics], effect: str, numbers: dict[str, float]
 ) -> None:
     config, physics = base
-    physics = replace(physics, **numbers)
+    physics = physics.replace(**numbers)
     assert effect not in chosen(config, physics, FACTS, LIGHT)
     predictions = all_predictions(config, physics, replace(FACTS, frames=100_000), LIGHT)
     found = next(one for one in predictions if one.effect == effect)
@@ -377,7 +377,7 @@ def test_pattern_masked_in_one_frame_is_simulated_for_a_clip(
 
 def test_temporal_noise_is_no_stronger_in_a_clip(base: tuple[Config, Physics]) -> None:
     config, physics = base
-    physics = replace(physics, row_std_dn=0.01, dark_e=0.01)
+    physics = physics.replace(row_std_dn=0.01, dark_e=0.01)
     for one, many in zip(
         all_predictions(config, physics, FACTS, LIGHT),
         all_predictions(config, physics, replace(FACTS, frames=100), LIGHT),
@@ -400,7 +400,7 @@ def test_hot_pixels_are_simulated_from_a_tenth_of_an_outlier(
     base: tuple[Config, Physics], share: float, electrons: float, side: int, dark: float
 ) -> None:
     config, physics = base
-    physics = replace(physics, hot_pixel_share=10**share, hot_pixel_e=10**electrons)
+    physics = physics.replace(hot_pixel_share=10**share, hot_pixel_e=10**electrons)
     facts = replace(FACTS, width=side, height=side)
     expected = expected_hot(physics, facts, dark)
     hot = next(
@@ -412,7 +412,7 @@ def test_hot_pixels_are_simulated_from_a_tenth_of_an_outlier(
 
 def test_dead_pixels_that_read_black_are_invisible_in_black_images_only(base: tuple[Config, Physics]) -> None:
     config, physics = base
-    physics = replace(physics, dead_pixel_share=1e-4, dead_pixel_level=1.0)
+    physics = physics.replace(dead_pixel_share=1e-4, dead_pixel_level=1.0)
     assert "dead_pixels" not in chosen(config, physics, FACTS, SignalRange(0.0, 0.0))
     assert "dead_pixels" in chosen(config, physics, FACTS, LIGHT)
 
@@ -430,9 +430,9 @@ def test_omitted_offsets_add_linearly(base: tuple[Config, Physics]) -> None:
     plane_dn = math.sqrt((9 + 10 + 1 / 12) / (384 * 256))
     one = {"black_error_dn": (0.07 * plane_dn,) * 4}
     other = {"dark_offset": "kept", "dark_e": 0.07 * plane_dn}
-    assert "black_error" not in chosen(config, replace(physics, **one), FACTS, LIGHT)
-    assert "dark_current" not in chosen(config, replace(physics, **other), FACTS, LIGHT)
-    both = chosen(config, replace(physics, **one, **other), FACTS, LIGHT)
+    assert "black_error" not in chosen(config, physics.replace(**one), FACTS, LIGHT)
+    assert "dark_current" not in chosen(config, physics.replace(**other), FACTS, LIGHT)
+    both = chosen(config, physics.replace(**one, **other), FACTS, LIGHT)
     assert len({"black_error", "dark_current"} & set(both)) == 1
 
 
@@ -461,7 +461,9 @@ def test_all_sites_are_within_the_signal_range(settings: Settings, highlight: st
 
 def test_signal_range_of_gray_by_hand() -> None:
     curve = linear_table("none", 1, 256)
-    camera = CameraPlan("identity", (0.0,) * 4, IDENTITY, 4.0, 8.0, 2.0, "none", 0.9)
+    camera = CameraPlan(
+        camera="identity", weights=(0.0,) * 4, rgb2cam=IDENTITY, red_gain=4.0, blue_gain=8.0, inverse_rgb_gain=2.0
+    )
     light = signal_range(Facts(4, 4, 256, 51, 102), IspPlan("none", 1), camera, 0.5, 1000.0)
     assert light == SignalRange(curve[51] * 0.25 * 0.5 * 1000, curve[102] * 2.0 * 0.5 * 1000)
 
@@ -504,7 +506,7 @@ def test_larger_tolerance_never_simulates_more(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, one: float, other: float
 ) -> None:
     config, physics = base
-    physics, light = replace(physics, **sensor), SignalRange(dark, dark + more)
+    physics, light = physics.replace(**sensor), SignalRange(dark, dark + more)
     narrow, wide = (chosen(automatic(config, tolerance), physics, FACTS, light) for tolerance in sorted((one, other)))
     assert set(wide) <= set(narrow)
 
@@ -514,7 +516,7 @@ def test_tiny_tolerance_simulates_every_contribution(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float
 ) -> None:
     config, physics = base
-    physics = replace(physics, **sensor)
+    physics = physics.replace(**sensor)
     for one in all_predictions(automatic(config, 1e-12), physics, FACTS, SignalRange(dark, dark + more)):
         assert one.simulated == (one.predicted_dn > 1e-9 * one.masking_dn) or 1e-15 < one.ratio < 1e-9
 
@@ -524,7 +526,7 @@ def test_effect_above_tolerance_alone_is_always_simulated(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, tolerance: float
 ) -> None:
     config, physics = base
-    physics = replace(physics, **sensor)
+    physics = physics.replace(**sensor)
     for one in all_predictions(automatic(config, tolerance), physics, FACTS, SignalRange(dark, dark + more)):
         assert one.simulated or (one.ratio <= tolerance * (1 + 1e-9) and one.outliers < 0.1)
 
@@ -600,7 +602,7 @@ def test_reasons_contain_numbers_and_fit_a_row(
 ) -> None:
     config, physics = base
     for one in all_predictions(
-        automatic(config, tolerance), replace(physics, **sensor), FACTS, SignalRange(dark, dark + more)
+        automatic(config, tolerance), physics.replace(**sensor), FACTS, SignalRange(dark, dark + more)
     ):
         assert not {";", "\n"} & set(one.reason)
         assert one.forced or (" DN in the " in one.reason and f"tolerance {tolerance:g}" in one.reason)
@@ -628,7 +630,7 @@ def test_predictions_match_measurements(
 ) -> None:
     """On a gray frame, in the statistic where the effect is strongest, within 5 standard errors of a mean square."""
     config, physics = base
-    physics = replace(physics, **numbers)
+    physics = physics.replace(**numbers)
     srgb = flat(120, 120, 120, height=64, width=96)
     config = replace(config, camera=replace(config.camera, law="identity", name="identity"))
     config = replace(config, gains=replace(config.gains, red=1.0, blue=1.0, inverse_rgb=1.0))
@@ -642,7 +644,7 @@ def test_predictions_match_measurements(
         [
             omission(
                 srgb,
-                *(one.replace(stream_key=n, physics=replace(physics, body_key=n + 1000)) for one in (plan, rest)),
+                *(one.replace(stream_key=n, physics=physics.replace(body_key=n + 1000)) for one in (plan, rest)),
             )[predicted.statistic]
             for n in range(12)
         ]

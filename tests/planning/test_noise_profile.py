@@ -24,7 +24,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.planning.draws import DRAW_COUNT, Draw
 from unprocess_gen.planning.noise_profile import PhysicalNoise, evaluate
-from unprocess_gen.simulation.effects import NUMBERS, Physics
+from unprocess_gen.simulation.plan import NUMBERS, Physics
 
 COUNTERS = {draw.name.lower(): int(draw) for draw in Draw}
 NAMES = [next((name for name, place in COUNTERS.items() if place == n), "") for n in range(DRAW_COUNT)]
@@ -244,7 +244,7 @@ def test_each_number_of_the_scene_is_drawn_from_its_own_uniform(settings: Settin
     }
     for uniform, moved in moves.items():
         other = physics(config, **{uniform: 0.9})
-        fields = Physics.__dataclass_fields__
+        fields = Physics.__struct_fields__
         assert {name for name in fields if getattr(other, name) != getattr(middle, name)} == moved, uniform
 
 

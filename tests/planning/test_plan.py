@@ -18,16 +18,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config import distributions
+from unprocess_gen.config.distributions import Distribution
 from unprocess_gen.config.distributions import draw_parameter as draw
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
-from unprocess_gen.core.types import Distribution, Facts, Plan
 from unprocess_gen.planning import noise_profile
 from unprocess_gen.planning import plan as planning
 from unprocess_gen.planning.draws import DRAW_COUNT, Draw
 from unprocess_gen.planning.plan import TwoNumberLevel, plan_camera, plan_image, plan_pairs
-from unprocess_gen.simulation.effects import NUMBERS
+from unprocess_gen.simulation.facts import Facts
+from unprocess_gen.simulation.plan import NUMBERS, Plan
 from unprocess_gen.simulation.reference import colour
 
 SHA = hashlib.sha256(b"a photograph").hexdigest()
@@ -156,7 +157,7 @@ def test_choice_is_the_quarter_that_contains_the_uniform(settings: Settings, uni
 @pytest.mark.parametrize("name", colour.CAMERAS)
 def test_fixed_camera_has_weight_1(settings: Settings, name: str) -> None:
     plan = plan_of(settings, f"camera={name}")
-    assert plan.camera.name == name
+    assert plan.camera.camera == name
     assert plan.camera.weights == tuple(float(name == other) for other in colour.CAMERAS)
     assert plan.camera.rgb2cam == colour.rgb2cam(colour.CAMERAS[name])
 
@@ -169,13 +170,13 @@ def test_chosen_weights_are_divided_by_their_sum(settings: Settings) -> None:
 
 def test_identity_has_no_weights_and_changes_nothing(settings: Settings) -> None:
     plan = plan_of(settings, "camera=identity")
-    assert (plan.camera.name, plan.camera.weights, plan.camera.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)
+    assert (plan.camera.camera, plan.camera.weights, plan.camera.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)
 
 
 def test_custom_matrix_has_no_weights(settings: Settings) -> None:
     own = list(colour.CAMERAS["sony_a7r"])
     plan = plan_of(settings, "camera=custom", f"camera.xyz2cam={own}")
-    assert (plan.camera.name, plan.camera.weights) == ("custom", (0.0,) * 4)
+    assert (plan.camera.camera, plan.camera.weights) == ("custom", (0.0,) * 4)
     assert plan.camera.rgb2cam == colour.rgb2cam(colour.CAMERAS["sony_a7r"])
 
 
@@ -208,7 +209,7 @@ def test_each_parameter_uses_the_uniform_of_its_name(settings: Settings) -> None
 
 GAIN_DRAWS = ("camera.red_gain", "camera.blue_gain", "camera.inverse_rgb_gain")
 NOISE_DRAWS = ("noise.a_dn", "noise.b_dn2")
-CAMERA_DRAWS = ("camera.name", "camera.weights", "camera.rgb2cam")
+CAMERA_DRAWS = ("camera.camera", "camera.weights", "camera.rgb2cam")
 
 
 @pytest.mark.parametrize(
@@ -261,14 +262,14 @@ def test_stream_key_is_derived_from_seed_and_source(settings: Settings) -> None:
 
 def test_profile_is_unchanged_on_its_own_sensor(settings: Settings) -> None:
     plan = plan_of(settings, "noise=imx385_iso3200")
-    assert (plan.noise.name, plan.noise.a_dn, plan.noise.b_dn2) == ("imx385_iso3200", 6.955588, 38.117816)
+    assert (plan.noise.noise, plan.noise.a_dn, plan.noise.b_dn2) == ("imx385_iso3200", 6.955588, 38.117816)
 
 
 def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
     """Slope times s, intercept times s², s = 15359/3855; two conversions would give s² and s⁴."""
     config = settings("noise=imx385_iso3200", "sensor=generic_14bit")
     s = Fraction(15359, 3855)
-    a, b = TwoNumberLevel(config, 0).two_numbers(named())
+    a, b = TwoNumberLevel(config).two_numbers(named())
     assert abs(Fraction(a) / (Fraction(6.955588) * s) - 1) <= Fraction(21, 10) / 2**53
     assert abs(Fraction(b) / (Fraction(38.117816) * s * s) - 1) <= Fraction(41, 10) / 2**53
     plan = plan_image(config, SHA)
@@ -298,9 +299,9 @@ def test_plan_contains_the_values_of_the_config(settings: Settings) -> None:
         "gains.threshold=0.75", "gains.highlight=gray_mean",
     )  # fmt: skip
     assert (plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.white_level_dn) == (10, 64, 1023)
-    assert (plan.sensor.pattern, plan.noise.sensor_clip) == ("GBRG", "black")
+    assert (plan.sensor.pattern, plan.sensor.sensor_clip) == ("GBRG", "black")
     assert (plan.isp.tone, plan.isp.gamma) == ("none", "srgb")
-    assert (plan.camera.highlight, plan.camera.highlight_threshold) == ("gray_mean", 0.75)
+    assert (plan.isp.highlight, plan.isp.highlight_threshold) == ("gray_mean", 0.75)
 
 
 def test_planning_imports_neither_numba_nor_opencv() -> None:

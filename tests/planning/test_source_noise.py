@@ -11,11 +11,12 @@ from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from PIL import Image
 
-from unprocess_gen.core.types import Plan, Srgb
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.planning.source_noise import noise_ratio, source_noise_dn, tile_noise
 from unprocess_gen.simulation.pair import reference_pair
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.loader import downscaled
 
 

@@ -18,7 +18,6 @@ from helpers.promise_report import Figure
 from unprocess_gen import RawPairs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError, MachineError
-from unprocess_gen.core.types import EXACT, FAST, REFERENCE, TIERS
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.accuracy import measure, report
@@ -26,6 +25,7 @@ from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Input
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE, TIERS
 from unprocess_gen.sources.listing import list_photographs
 
 

@@ -7,7 +7,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,10 @@ from numpy.typing import NDArray
 
 from unprocess_gen import RawPairs, make_pair
 from unprocess_gen.config.schema import replaced
+from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Frame, Plan, Row
 from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.reports.noise_check import repeat
 from unprocess_gen.reports.noise_check.checks import (
     LEAST_SITES,
@@ -37,6 +37,7 @@ from unprocess_gen.reports.noise_check.checks import (
     failed_checks,
 )
 from unprocess_gen.reports.noise_check.scores import Scores, scores_of
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources import synthetic
 from unprocess_gen.statistics.scores import FALSE_ALARM, Score, alarm_limit
 
@@ -114,8 +115,8 @@ def checked(
     pair = make_pair(srgb, replaced(settings(*overrides), {"seed": number}))
     plan = plan_from_row(pair.row)
     if numbers:
-        assert plan.noise.physics is not None
-        pair = make_pair(srgb, plan.replace(physics=replace(plan.noise.physics, **numbers)))
+        assert plan.physics is not None
+        pair = make_pair(srgb, plan.replace(**numbers))
         plan = plan_from_row(pair.row)
     noisy_frames = [fault(srgb, pair.noisy, plan, np.random.default_rng(number)) for fault in faults]
     return [(plan, scores_of_pair(pair.clean, noisy, pair.row)) for noisy in noisy_frames]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ def test_omitted_dead_pixels_change_no_other_pixel() -> None:
     with_it, without = (
         make_pair(flat(20000, 64, 96), plan_with(*on, **ALL)).noisy for on in (EFFECTS[:-1], EFFECTS[:-2])
     )
-    is_dead = dead(replace(SILENT, dead_pixel_share=0.1), (64, 96))
+    is_dead = dead(SILENT.replace(dead_pixel_share=0.1), (64, 96))
     assert (with_it[is_dead] == 0).all()
     assert (with_it[~is_dead] == without[~is_dead]).all()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,7 +75,9 @@ def test_shot_noise_is_poisson_count_of_electrons(code: int) -> None:
 def test_poisson_form_has_mean_variance_and_skewness(code: int) -> None:
     """Only counts have a third moment, a²·u. The fourth is that of a normal plus a⁴·rate; the sixth is a bound."""
     a, b = 12.5, 900.0
-    plan = plan_with().replace(physics=None, effects=("heteroscedastic", "quantise"), law="poisson", a_dn=a, b_dn2=b)
+    plan = plan_with().replace(
+        physics=None, effects=("heteroscedastic", "quantise"), noise_law="poisson", a_dn=a, b_dn2=b
+    )
     deviation = noisy_dn(plan, code) - signal_dn(code)
     rate = signal_dn(code) / a
     variance = a * a * rate + b + 1 / 12
@@ -205,9 +206,9 @@ def test_dark_current_scales_with_temperature_and_exposure_time(settings: Settin
     def dark_e(celsius: float, seconds: float) -> float:
         overrides = ("noise=sony_a7s2", f"noise.dark_doubling_c={doubling}", "noise.dark_e_per_s=3")
         plan = planned(settings, picture(), *overrides, f"scene.temperature_c={celsius}", f"scene.exposure_s={seconds}")
-        assert plan.noise.physics is not None
-        assert plan.noise.physics.hot_pixel_e == pytest.approx(plan.noise.physics.dark_e * 50 / 3, rel=1e-12)
-        return plan.noise.physics.dark_e
+        assert plan.physics is not None
+        assert plan.physics.hot_pixel_e == pytest.approx(plan.physics.dark_e * 50 / 3, rel=1e-12)
+        return plan.physics.dark_e
 
     assert dark_e(25, 2) == 6
     for times in (-3, -1, 1, 2, 5):
@@ -223,7 +224,7 @@ SHARE = 0.01
 @pytest.fixture(scope="module")
 def hot() -> np.ndarray:
     """Return the mean excess of about 10,000 hot pixels of a sensor unit, 0 for other pixels."""
-    return hot_pixel_means(replace(SILENT, hot_pixel_share=SHARE, hot_pixel_e=200.0), (1024, 1024))
+    return hot_pixel_means(SILENT.replace(hot_pixel_share=SHARE, hot_pixel_e=200.0), (1024, 1024))
 
 
 def test_hot_pixels_have_given_fraction(hot: np.ndarray) -> None:
@@ -260,7 +261,7 @@ def test_hot_pixels_add_poisson_count_of_their_mean(hot: np.ndarray) -> None:
 
 def test_hot_and_dead_pixels_are_fixed_per_sensor_unit() -> None:
     plan = plan_with("hot_pixels", "dead_pixels", hot_pixel_share=SHARE, hot_pixel_e=1e4, dead_pixel_share=SHARE)
-    one, later = (noisy_dn(replace(plan, stream_key=frame), 0) for frame in (1, 2))
+    one, later = (noisy_dn(plan.replace(stream_key=frame), 0) for frame in (1, 2))
     shining = [np.abs(frame) > 8 * 500 for frame in (one, later)]  # hot enough, or dead
     assert ((one == -BLACK) == (later == -BLACK)).all()
     assert (shining[0] != shining[1]).mean() < SHARE / 50  # those whose mean is 500
@@ -280,7 +281,7 @@ def test_dead_pixels_read_a_fraction_of_black_and_have_given_fraction(level: flo
 
 
 def test_prnu_has_mean_1_and_given_standard_deviation() -> None:
-    pattern = response(replace(SILENT, prnu_std=0.01), (1024, 1024))
+    pattern = response(SILENT.replace(prnu_std=0.01), (1024, 1024))
     assert bounds_off(pattern, 1, 1e-4, REACH * 0.01) <= 1
     assert bounds_off((pattern - 1) ** 2, 1e-4, 2e-8, (REACH * 0.01) ** 2) <= 1
 
@@ -288,10 +289,10 @@ def test_prnu_has_mean_1_and_given_standard_deviation() -> None:
 @pytest.mark.parametrize("code", [0, 800, 20000, 50000])
 def test_prnu_scales_with_signal_and_is_fixed_between_frames(code: int) -> None:
     plan = plan_with("prnu", prnu_std=0.01)
-    pattern = response(plan.noise.physics, (1024, 1024))  # type: ignore[arg-type]
+    pattern = response(plan.physics, (1024, 1024))  # type: ignore[arg-type]
     frame = noisy_dn(plan, code)
     np.testing.assert_array_equal(frame, np.rint(signal_dn(code) * pattern + BLACK) - BLACK)
-    np.testing.assert_array_equal(frame, noisy_dn(replace(plan, stream_key=2), code))
+    np.testing.assert_array_equal(frame, noisy_dn(plan.replace(stream_key=2), code))
 
 
 def test_black_error_depends_on_cfa_site_alone() -> None:
@@ -327,7 +328,7 @@ def test_clean_frame_with_fixed_patterns_is_mean_of_noisy_frames() -> None:
         fixed_pattern_in_clean=True,
     )  # fmt: skip
     clean = make_pair(flat(5000, *size), plan).clean.astype(np.float64)
-    noisy = [make_pair(flat(5000, *size), replace(plan, stream_key=frame)) for frame in range(frames)]
+    noisy = [make_pair(flat(5000, *size), plan.replace(stream_key=frame)) for frame in range(frames)]
     assert all((one.clean == clean).all() for one in noisy)
     mean = np.mean([one.noisy for one in noisy], axis=0)
     electrons = 5000 * 1.3 / 8 + 5 + 800  # no pixel has more, in the mean
@@ -342,7 +343,7 @@ def test_clean_frame_with_fixed_patterns_keeps_dark_offset_of_frames() -> None:
     plan = plan_with("shot", "dark_current", dark_e=dark_e, dark_offset="kept", fixed_pattern_in_clean=True)
     clean = make_pair(flat(5000, *size), plan).clean
     assert (clean == round(signal_dn(5000) + BLACK + 8 * dark_e)).all()
-    mean = np.mean([make_pair(flat(5000, *size), replace(plan, stream_key=key)).noisy for key in range(frames)], axis=0)
+    mean = np.mean([make_pair(flat(5000, *size), plan.replace(stream_key=key)).noisy for key in range(frames)], axis=0)
     rate = signal_dn(5000) / 8 + dark_e
     assert np.abs(mean - clean).max() <= bernstein(64 * rate, 16 * poisson_reach(rate), frames, 1e-15) + 0.5
     removed = make_pair(flat(5000, *size), with_physics(plan, dark_offset="removed")).clean
@@ -362,9 +363,9 @@ def test_mean_of_frames_does_not_exceed_full_well() -> None:
     full = np.rint(8 * 2000 + BLACK + columns_dn)
     assert (clean <= full).all()
     assert 0.1 < (clean == full).mean() < 0.3
-    noisy = np.array([make_pair(flat(5000, *size), replace(plan, stream_key=key)).noisy for key in range(frames)])
+    noisy = np.array([make_pair(flat(5000, *size), plan.replace(stream_key=key)).noisy for key in range(frames)])
     assert (noisy.mean(axis=0) <= full).all()
-    overfull = hot_pixel_means(plan.noise.physics, size) > 3000  # type: ignore[arg-type]
+    overfull = hot_pixel_means(plan.physics, size) > 3000  # type: ignore[arg-type]
     assert overfull.any()
     assert (noisy[:, overfull] == full[overfull]).all()
     assert (clean[overfull] == full[overfull]).all()

@@ -44,7 +44,7 @@ def test_darkened_scene_equals_darker_photograph(settings: Settings) -> None:
 WHITES = {
     "gaussian": plan_with().replace(physics=None, effects=("heteroscedastic", "quantise"), a_dn=8.0, b_dn2=900.0),
     "poisson": plan_with().replace(
-        physics=None, effects=("heteroscedastic", "quantise"), a_dn=8.0, b_dn2=900.0, law="poisson"
+        physics=None, effects=("heteroscedastic", "quantise"), a_dn=8.0, b_dn2=900.0, noise_law="poisson"
     ),
     "physical": plan_with("shot", "read", "row", read_std_dn=30.0, row_std_dn=5.0),
 }
@@ -76,7 +76,7 @@ def test_pinning_changes_saturated_sites_only(distribution: str) -> None:
     srgb = np.where(np.random.Generator(np.random.Philox(key=5)).random((200, 300, 1)) < 0.3, 65535, 65000)
     srgb = np.broadcast_to(srgb, (200, 300, 3)).astype(np.uint16)
     free, pinned = (
-        make_pair(srgb, WHITES[distribution].replace(saturated=saturated)) for saturated in ("noisy", "white")
+        make_pair(srgb, WHITES[distribution].replace(saturated_as=saturated)) for saturated in ("noisy", "white")
     )
     white = free.clean == WHITE
     assert 0 < white.mean() < 1
@@ -91,7 +91,7 @@ def test_noise_behind_a_full_well_remains(settings: Settings) -> None:
     defects = ("effects.dead_pixels=on", "noise.dead_pixel_share=1e-3", "effects.prnu=off")
     plan = planned(settings, flat(65535), *chosen, *defects)
     pair = make_pair(flat(65535), plan)
-    physics = plan.noise.physics
+    physics = plan.physics
     assert physics is not None and "full_well" in plan.noise.effects
     well_dn = plan.sensor.black_level_dn + physics.full_well_e * physics.dn_per_e
     assert (pair.clean == round(well_dn)).all()

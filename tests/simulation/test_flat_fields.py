@@ -23,9 +23,9 @@ from helpers.moments import REACH, SAMPLER_ERROR, Moments, bernstein, moments, s
 from helpers.promise_report import Figure
 
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 Law = Callable[[Plan, float], tuple[float, float]]
@@ -84,7 +84,7 @@ def promised(plan: Plan, x: float) -> tuple[float, float]:
 
 
 def exact_moments(plan: Plan, x: float, law: Law) -> Moments:
-    low, high = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
+    low, high = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.sensor_clip)
     centre, std = law(plan, x)
     return moments(centre, std, int(low), int(high))
 

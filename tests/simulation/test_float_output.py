@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +14,13 @@ from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.types import REFERENCE, Frame, Plan
+from unprocess_gen.core.arrays import Frame
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import REFERENCE, Plan
 from unprocess_gen.simulation.reference import cfa as bayer
 from unprocess_gen.simulation.reference.sensor import in_dn
 
@@ -29,9 +29,9 @@ ORIGIN = 1, 57
 GOLDEN = selftest.GOLDEN_PLANS
 PLANS = {
     **{name: GOLDEN[name] for name in ("per_channel", "gray_mean", "plain", "physical")},
-    "white": GOLDEN["physical"].replace(saturated="white"),
-    "averaged": GOLDEN["physical"].replace(physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True)),
-    "poisson": GOLDEN["per_channel"].replace(law="poisson"),
+    "white": GOLDEN["physical"].replace(saturated_as="white"),
+    "averaged": GOLDEN["physical"].replace(physics=selftest.GOLDEN_PHYSICS.replace(fixed_pattern_in_clean=True)),
+    "poisson": GOLDEN["per_channel"].replace(noise_law="poisson"),
     "silent": GOLDEN["per_channel"].replace(effects=()),
 }
 """One plan for each set of kernels."""

@@ -17,7 +17,7 @@ import pytest
 import yaml
 from helpers.promise_report import Figure
 
-from unprocess_gen.core import exact_distributions, types
+from unprocess_gen.core import exact_distributions
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.simulation import lookup_tables, tone_curves
 from unprocess_gen.simulation.tone_curves import PUBLISHED_SHA256
@@ -122,7 +122,7 @@ def test_offered_16_bit_curves_are_read_not_computed(
 
 def test_every_isp_option_has_published_curves() -> None:
     options = [yaml.safe_load(path.read_text()) for path in (ROOT / "conf" / "isp").glob("*.yaml")]
-    offered = {(option["tone"], types.gamma_text(option["gamma"])) for option in options}
+    offered = {(option["tone"], tone_curves.gamma_text(option["gamma"])) for option in options}
 
     assert offered == set(CURVES_8) == set(CURVES_16)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import astuple, replace
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -12,13 +12,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.core.types import FAST, Pair, Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
+from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.clean import FLOAT32_CHANGED_SHARE, FLOAT32_CLEAN_DN, is_steep
 from unprocess_gen.simulation.kernels.normal import COARSE_ERROR
 from unprocess_gen.simulation.kernels.render import pass_key
 from unprocess_gen.simulation.pair import FRAMES_PER_PASS, make_pair, make_pairs, reference_pair
+from unprocess_gen.simulation.plan import FAST, Plan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.self_test import GOLDEN_PHYSICS
 from unprocess_gen.sources import synthetic
@@ -88,8 +89,8 @@ def test_kernels_equal_the_reference_on_16_bit_sources(plan: Plan, figure: Figur
 @pytest.mark.parametrize("well_dn", [0.25, 50.8])
 def test_sites_that_round_to_the_full_well_are_saturated(plan: Plan, well_dn: float) -> None:
     codes = np.tile(np.arange(0, 40000, 2, np.uint16)[:, None, None], (1, 8, 3))
-    physics = replace(GOLDEN_PHYSICS, full_well_e=well_dn / GOLDEN_PHYSICS.dn_per_e)
-    assert_same(codes, plan.replace(physics=physics, effects=("shot", "full_well"), saturated="white"))
+    physics = GOLDEN_PHYSICS.replace(full_well_e=well_dn / GOLDEN_PHYSICS.dn_per_e)
+    assert_same(codes, plan.replace(physics=physics, effects=("shot", "full_well"), saturated_as="white"))
 
 
 def test_single_pixels_equal_those_of_the_frame(plan: Plan, scene: np.ndarray, full: Pair) -> None:
@@ -114,10 +115,10 @@ def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
     "options",
     [
         {"accuracy": FAST},
-        {"accuracy": FAST, "highlight": "gray_mean", "saturated": "white"},
-        {"law": "poisson", "b_dn2": 3.0, "accuracy": FAST},
+        {"accuracy": FAST, "highlight": "gray_mean", "saturated_as": "white"},
+        {"noise_law": "poisson", "b_dn2": 3.0, "accuracy": FAST},
         {"physics": GOLDEN_PHYSICS, "effects": EFFECTS},
-        {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
+        {"physics": GOLDEN_PHYSICS.replace(fixed_pattern_in_clean=True), "effects": EFFECTS},
     ],
     ids=",".join,
 )
@@ -143,7 +144,7 @@ def test_levels_of_several_bodies_equal_separate_pairs(scene: np.ndarray, plan: 
     on = tuple(effect for effect in EFFECTS if effect != "full_well")
     plan = plan.replace(dtype=dtype, layout=layout, physics=GOLDEN_PHYSICS)
     plans = [
-        plan.replace(level=n, effects=on, physics=replace(GOLDEN_PHYSICS, **changes))  # type: ignore[arg-type]
+        plan.replace(level=n, effects=on, physics=GOLDEN_PHYSICS.replace(**changes))  # type: ignore[arg-type]
         for n, changes in enumerate(UNITS)
     ]
     assert len({pass_key(one) for one in plans}) > 2
@@ -183,8 +184,8 @@ def test_one_plan_gives_one_pair_and_no_plan_none(scene: np.ndarray, plan: Plan)
         {"stream_key": 1},
         {"pattern": "BGGR"},
         {"white_level_dn": 4000},
-        {"physics": replace(GOLDEN_PHYSICS, full_well_e=1.0), "effects": EFFECTS},
-        {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
+        {"physics": GOLDEN_PHYSICS.replace(full_well_e=1.0), "effects": EFFECTS},
+        {"physics": GOLDEN_PHYSICS.replace(fixed_pattern_in_clean=True), "effects": EFFECTS},
     ],
     ids=lambda other: next(iter(other)),
 )
@@ -238,7 +239,7 @@ def test_float32_is_within_its_error_on_all_colours(plan: Plan, camera: str, fig
     "options",
     [
         {},
-        {"saturated": "white"},
+        {"saturated_as": "white"},
         {"highlight": "gray_mean", "sensor_clip": "black"},
         {"exposure_ratio": 3.0},
         {"a_dn": 8.0034, "b_dn2": -122.69544},

@@ -21,22 +21,14 @@ from helpers.dark_frames import DarkPixelsInMemory
 from helpers.flats import IDENTITY, SILENT, plan_with
 from helpers.promise_report import Figure
 
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16, Srgb
 from unprocess_gen.core.random_streams import words
-from unprocess_gen.core.types import (
-    FLOAT32,
-    MOSAIC,
-    PACKED,
-    REFERENCE,
-    UINT16,
-    DarkFramePlan,
-    DarkPixels,
-    Pair,
-    Plan,
-    Srgb,
-)
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
-from unprocess_gen.simulation.effects import REPLACED, Physics
+from unprocess_gen.simulation.effects import REPLACED
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
+from unprocess_gen.simulation.plan import REFERENCE, DarkFramePlan, Physics, Plan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
 from unprocess_gen.simulation.reference.poisson import poisson
@@ -129,7 +121,7 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
         black_level_dn=black,
         white_level_dn=white,
         sensor_clip=dice.pick(("sensor", "sensor", "black", "none" if dtype == FLOAT32 else "sensor")),
-        saturated=dice.pick(("noisy", "noisy", "white")),
+        saturated_as=dice.pick(("noisy", "noisy", "white")),
         level=dice.pick((0, 0, 1, 99, 4095)),
         draw=dice.pick((0, 0, 1, 99, 4095)),
         frame=dice.pick((0, 0, 1, 12345, 2**31)),
@@ -168,10 +160,9 @@ def with_dark_frame(one: Case, dice: Dice) -> Case:
 
 def with_special_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:
     """Add lens shading, gains by colour, temporal column noise and correlated rows to a plan of a physical profile."""
-    assert plan.noise.physics is not None
+    assert plan.physics is not None
     few_rows = origin[0] < 2**14  # correlated offsets are computed from row 0
-    physics = replace(
-        plan.noise.physics,
+    physics = plan.physics.replace(
         row_correlation=dice.pick((0.0, 0.7, -0.4, 0.999)) if few_rows else 0.0,
         column_temporal_std_dn=dice.at_most(9),
         gain_by_colour=dice.pick(((1.0, 1.0, 1.0), (0.97, 1.0, 1.04), (0.1, 3.0, 10.0))),
@@ -214,24 +205,23 @@ def with_noise(plan: Plan, kind: str, dice: Dice) -> Plan:
     dn_per_e = span_dn * min(1.0, plan.scene.exposure) / brightest_e
     if kind == "poisson":
         a_dn, b_dn2 = dice.pick((dn_per_e, dn_per_e, dn_per_e, 0.0)), dice.at_most(12)
-        return plan.replace(law="poisson", a_dn=a_dn, b_dn2=b_dn2, effects=TWO)
+        return plan.replace(noise_law="poisson", a_dn=a_dn, b_dn2=b_dn2, effects=TWO)
     physics = drawn_physics(dice, dn_per_e, brightest_e)
     on = ("shot", "read", "row", "black_error", "quantise")
     if kind == "shot and read":
-        physics, omitted = replace(physics, read_std_dn=physics.read_std_dn + 2**-10), dice.pick((*on[2:], "none"))
+        physics, omitted = physics.replace(read_std_dn=physics.read_std_dn + 2**-10), dice.pick((*on[2:], "none"))
         on = tuple(one for one in on if one != omitted)
     else:
         share = dice.pick((0.0, 0.2, 0.5))
         on = tuple(one for one in EFFECTS if one not in SPECIAL and not dice.chance(share))
-    physics = replace(physics, fixed_pattern_in_clean=kind.endswith("averaged"))
+    physics = physics.replace(fixed_pattern_in_clean=kind.endswith("averaged"))
     return plan.replace(a_dn=dn_per_e, b_dn2=physics.read_std_dn * physics.read_std_dn, effects=on, physics=physics)
 
 
 def drawn_physics(dice: Dice, dn_per_e: float, brightest_e: float) -> Physics:
     """Draw the numbers of a physical profile with ``brightest_e`` electrons at white."""
     errors = [dice.pick((0.0, dice.between(-4, 4), dice.between(-600, 600))) for _ in range(4)]
-    return replace(
-        SILENT,
+    return SILENT.replace(
         dn_per_e=dn_per_e,
         prnu_std=dice.pick((0.0, 0.005, 0.05, 0.5)),
         dark_e=dice.pick((dice.at_most(3), dice.at_most(10), dice.power(20, 26))),
@@ -338,7 +328,7 @@ def test_float_clean_frames_change_no_noisy_frame(kind: str) -> None:
         rounded = simulate(replace(one, plan=one.plan.replace(clean_dtype="")))
         floats = simulate(replace(one, plan=one.plan.replace(clean_dtype="", dtype=FLOAT32)))
         assert pair.noisy.tobytes() == rounded.noisy.tobytes(), number
-        assert one.plan.noise.averaged or pair.clean.tobytes() == floats.clean.tobytes(), number
+        assert one.plan.averaged or pair.clean.tobytes() == floats.clean.tobytes(), number
 
 
 # Crops and levels -----------------------------------------------------------------------------------------------------
@@ -372,14 +362,14 @@ def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, cou
 
 def with_other_noise(plan: Plan, kinds: Sequence[str], dice: Dice) -> Plan:
     """Draw another noise, level, draw and clipping; the parameters of the clean frame stay as they are."""
-    plan = plan.replace(law="gaussian", physics=None)
+    plan = plan.replace(noise_law="gaussian", physics=None)
     plan = with_noise(plan, dice.pick(kinds), dice)
     return plan.replace(
         effects=tuple(one for one in plan.noise.effects if one != "full_well"),
         level=int(dice.random() * 100),
         draw=int(dice.random() * 100),
         sensor_clip=dice.pick(("sensor", "black")),
-        saturated=dice.pick(("noisy", "noisy", "white")),
+        saturated_as=dice.pick(("noisy", "noisy", "white")),
     )
 
 
@@ -463,8 +453,8 @@ def test_pairs_at_rare_words_equal_the_reference(stream: str, word: int, at: tup
     failed = {}
     for kind, number in itertools.product(kinds, range(12)):
         plan = case(kind, number, dtype).plan.replace(layout=MOSAIC, stream_key=KEY, frame=frame, level=0, draw=0)
-        if plan.noise.physics is not None:
-            plan = plan.replace(physics=replace(plan.noise.physics, body_key=KEY))
+        if plan.physics is not None:
+            plan = plan.replace(body_key=KEY)
         code = np.full((1, 1, 3), (0, 1, 9, 40, 90, 128, 180, 220, 243, 252, 254, 255)[number], dtype=np.uint8)
         one = Case(code, plan, (y, x))
         if text := differences(simulate(one), simulate_reference(one)):
@@ -484,7 +474,7 @@ def test_pixels_at_the_limit_of_a_share_equal_the_reference(effect: str) -> None
             shares = {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0, "dead_pixel_level": 0.3} | {
                 f"{effect.removesuffix('s')}_share": share
             }
-            physics = replace(plan.noise.physics, **numbers, **shares, hot_pixel_e=2e4, full_well_e=1e6, body_key=KEY)
+            physics = plan.physics.replace(**numbers, **shares, hot_pixel_e=2e4, full_well_e=1e6, body_key=KEY)
             one = Case(srgb, plan.replace(physics=physics), (0, 0))
             found.append(simulate(one).noisy)
             assert differences(simulate(one), simulate_reference(one)) == ""

@@ -116,7 +116,7 @@ def test_read_noise_has_given_standard_deviation_for_every_distribution(distribu
     std = 300.0
     plan = plan_with("read", read_law=distribution, read_shape=shape, read_std_dn=std)
     deviation = noisy_dn(plan, 32000) - signal_dn(32000)
-    table = quantile_table(plan.physics.read_law, plan.physics.read_shape)
+    table = quantile_table(plan.numbers.read_law, plan.numbers.read_shape)
     with localcontext(prec=40):
         second = float(draw_variance(table))
     fourth, reach = table_moment(table, 4), float(np.abs(table[0]).sum()) * std + 1
@@ -130,20 +130,20 @@ def test_read_noise_has_given_standard_deviation_for_every_distribution(distribu
 @pytest.mark.parametrize("iso", CRVD)
 def test_imx385_read_noise_has_variance_of_crvd(settings: Settings, iso: int) -> None:
     plan = planned(settings, picture(), "noise=imx385", f"noise.iso={iso}")
-    assert plan.noise.physics is not None
-    assert plan.noise.physics.dn_per_e == CRVD[iso][0]
-    assert plan.noise.physics.read_std_dn**2 == pytest.approx(CRVD[iso][1], rel=1e-12)
-    assert plan.noise.b_dn2 == plan.noise.physics.read_std_dn**2
+    assert plan.physics is not None
+    assert plan.physics.dn_per_e == CRVD[iso][0]
+    assert plan.physics.read_std_dn**2 == pytest.approx(CRVD[iso][1], rel=1e-12)
+    assert plan.noise.b_dn2 == plan.physics.read_std_dn**2
 
 
 @pytest.mark.parametrize("noise", ISOS)
 def test_plan_has_gain_and_read_variance_of_profile(settings: Settings, noise: str) -> None:
     plan = planned(settings, picture(), f"noise={noise}", f"noise.iso={ISOS[noise]}")
-    assert plan.noise.physics is not None
+    assert plan.physics is not None
     assert branch_of(settings(f"noise={noise}").noise, ISOS[noise]) is not None
-    assert (plan.noise.a_dn, plan.noise.b_dn2) == (plan.noise.physics.dn_per_e, plan.noise.physics.read_std_dn**2)
-    assert plan.noise.physics.dn_per_e > 0
-    assert plan.noise.physics.read_std_dn > 0
+    assert (plan.noise.a_dn, plan.noise.b_dn2) == (plan.physics.dn_per_e, plan.physics.read_std_dn**2)
+    assert plan.physics.dn_per_e > 0
+    assert plan.physics.read_std_dn > 0
 
 
 def test_scatter_about_line_is_normal_in_logarithm(settings: Settings) -> None:

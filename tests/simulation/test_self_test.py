@@ -22,9 +22,9 @@ from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.simulation import lookup_tables, tone_curves
 from unprocess_gen.simulation import self_test as selftest
-from unprocess_gen.simulation.effects import NUMBERS
 from unprocess_gen.simulation.kernels import clean, gaussian, normal, philox, readout, render, strips
 from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.plan import NUMBERS
 
 
 @pytest.fixture(autouse=True)
@@ -110,9 +110,9 @@ def test_kernels_are_tested_when_a_plan_first_needs_them(
 
 
 def test_every_law_of_the_noise_has_a_golden_pair() -> None:
-    plans = [plan.noise for plan in selftest.GOLDEN_PLANS.values()]
+    plans = selftest.GOLDEN_PLANS.values()
 
-    assert {plan.law for plan in plans} == set(settings_of(NoiseConfig)["law"].limit.words)
+    assert {plan.noise.noise_law for plan in plans} == set(settings_of(NoiseConfig)["law"].limit.words)
     assert {plan.physics.read_law for plan in plans if plan.physics} == set(NUMBERS["read_law"].words)
 
 

@@ -39,7 +39,7 @@ from PIL import Image
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import REASONS, SourceError
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.tasks import RunContext, ShardTask
 from unprocess_gen.pipeline.worker import make_shard

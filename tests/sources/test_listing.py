@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.sources.listing import TAIL_BYTES, Listing, list_folder, number_twins, unmatched_sentence
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import read_bytes

@@ -16,7 +16,7 @@ from PIL import Image
 
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.planning.plan import plan_image

@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
+from unprocess_gen.config.interpretation import PatchRule
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
-from unprocess_gen.core.types import PatchRule
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify

@@ -17,7 +17,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.object_store import ObjectPath
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.sources import reading
 from unprocess_gen.sources.listing import Listing, list_folder, list_photographs, number_twins

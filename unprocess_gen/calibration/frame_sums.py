@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.statistics.mosaics import TILE, neighbour_products, planes_of
 from unprocess_gen.statistics.scores import Score
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 RANGES = (0.1, 0.3)

@@ -31,8 +31,8 @@ from unprocess_gen.calibration.gain import (
     weighted_mean,
 )
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fill_histogram, fit_shape
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Float
 from unprocess_gen.statistics.mosaics import planes_of
 
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]

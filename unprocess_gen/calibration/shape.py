@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from unprocess_gen.calibration.frame_sums import Measured
 from unprocess_gen.calibration.gain import Estimate
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.core.types import Float
 from unprocess_gen.statistics.mosaics import planes_of
 from unprocess_gen.statistics.scores import NORMAL_95
 

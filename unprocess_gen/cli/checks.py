@@ -14,8 +14,8 @@ from unprocess_gen.cli.sweep import worst
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 from unprocess_gen.core.paths import AnyPath, local_path
-from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.reader import RawPairs
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.repair import repair

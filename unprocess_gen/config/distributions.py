@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from typing import Any
 
@@ -18,7 +19,14 @@ from unprocess_gen.config.limits import Drawn
 from unprocess_gen.config.values import is_number, refusal
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_quantile
-from unprocess_gen.core.types import Distribution
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """Distribution of a parameter: a kind of `DISTRIBUTIONS` and its numbers; ``constant`` has one number."""
+
+    kind: str
+    numbers: tuple[float, ...]
 
 
 def draw_parameter(distribution: Distribution, uniform: float, a: float = 0.0) -> float:

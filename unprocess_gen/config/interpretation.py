@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from unprocess_gen.config import limits
-from unprocess_gen.config.distributions import lowest, parse_drawn
+from unprocess_gen.config.distributions import Distribution, lowest, parse_drawn
 from unprocess_gen.config.schema import (
     BRANCH_FIELDS,
     BranchConfig,
@@ -20,7 +21,7 @@ from unprocess_gen.config.schema import (
     SourceConfig,
 )
 from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
-from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
+from unprocess_gen.core.arrays import FLOAT32
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.dark_current import HEAT
 
@@ -135,6 +136,19 @@ def assumed_numbers(noise: NoiseConfig, effect: str) -> tuple[str, ...]:
 
 
 # ------------------------------------------------------------------------------------------------------------ source
+
+
+@dataclass(frozen=True, slots=True)
+class PatchRule:
+    """Rule for cutting square patches of ``side`` pixels from each image.
+
+    ``kind`` is ``grid`` (corners every ``stride`` pixels) or ``random`` (``count`` patches); the other number is 0.
+    """
+
+    kind: str
+    side: int
+    stride: int = 0
+    count: int = 0
 
 
 def patch_rule(source: SourceConfig) -> PatchRule | None:

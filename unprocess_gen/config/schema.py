@@ -19,10 +19,10 @@ from unprocess_gen.config import limits
 from unprocess_gen.config.limits import Choice, Integers, IsoForm, Limit, NumberList, NumberOrWord, Numbers
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
 from unprocess_gen.config.values import is_number
-from unprocess_gen.core.types import EXACT, TIERS
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
-from unprocess_gen.simulation.effects.numbers import SHAPE, SITES, Number
+from unprocess_gen.simulation.numbers import SHAPE, SITES, Number
+from unprocess_gen.simulation.plan import EXACT, TIERS
 
 
 class FrozenMapping(dict[str, Any]):

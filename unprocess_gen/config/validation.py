@@ -40,11 +40,11 @@ from unprocess_gen.config.schema import (
 )
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import one_of, refusal
+from unprocess_gen.core.arrays import UINT16
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import any_path, local_path
-from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains

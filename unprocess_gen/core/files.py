@@ -16,7 +16,7 @@ from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.object_store import ObjectPath
 
 if TYPE_CHECKING:
-    from unprocess_gen.core.types import Array
+    from unprocess_gen.core.arrays import Array
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors for which the free space of the disk is worth reporting."""
@@ -33,7 +33,7 @@ def little_endian(array: Array) -> Array:
     """Return an array as contiguous little-endian numbers, without a copy if it is that already."""
     import numpy as np  # takes longer than the start of a command may
 
-    from unprocess_gen.core.types import DESCRIPTIONS
+    from unprocess_gen.core.arrays import DESCRIPTIONS
 
     return np.ascontiguousarray(array, dtype=DESCRIPTIONS[array.dtype.name])
 

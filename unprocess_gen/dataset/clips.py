@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Self, SupportsIndex
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.types import Frame
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import Place, RawPairs, dataset_folders
 

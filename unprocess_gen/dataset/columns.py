@@ -17,29 +17,27 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16
+from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.core.types import (
-    FLOAT32,
-    MOSAIC,
-    PACKED,
+from unprocess_gen.dataset.row import Value
+from unprocess_gen.simulation.frames import Counts, Patch
+from unprocess_gen.simulation.plan import (
+    NUMBERS,
     TIERS,
-    UINT16,
     CameraPlan,
-    Counts,
     DarkFramePlan,
     IspPlan,
     NoisePlan,
     OutputPlan,
-    Patch,
+    Physics,
+    Place,
     Plan,
     ScenePlan,
     SensorPlan,
-    Source,
     SourcePlan,
-    Value,
-    gamma_text,
 )
-from unprocess_gen.simulation.effects import NUMBERS, Physics
+from unprocess_gen.simulation.tone_curves import gamma_text
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import Config
@@ -124,7 +122,7 @@ _PERCENT = re.compile("%([0-9A-F]{2})")
 
 Allowed = Range | OneOf | Text | RelativePath
 RecordType = type[Any]
-"""Dataclass of `core.types`: a plan or a part of it, `Physics`, `Patch`, `Counts` or `Source`."""
+"""A plan or a part of it, `Patch`, `Counts` or `Source`."""
 
 
 class Spelling(NamedTuple):
@@ -336,15 +334,15 @@ COLUMNS = (
     Column("split", "part of the dataset that the image belongs to",
            Text(re.compile(r"[\w-]{1,32}", re.ASCII), "up to 32 letters, digits, _ and -"), Plan, needs=SPLITS),
     Column("clip", "name of the clip", ANY_TEXT, Source, needs=CLIPS),
-    Column("frame", "number of the frame in its clip, from 0", COORDINATE, NoisePlan, needs=CLIPS),
+    Column("frame", "number of the frame in its clip, from 0", COORDINATE, Place, needs=CLIPS),
     Column("patch", "number of the patch in its image, from 0", COORDINATE, Patch, "number", needs=PATCHES),
     Column("patch_y", "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels",
            needs=PATCHES),
     Column("patch_x", "first column of the arrays in the full frame; even", COORDINATE, Patch, "x", unit="pixels",
            needs=PATCHES),
-    Column("level", "number of the noise level, from 0", integers(0, 99), NoisePlan, needs=LEVELS),
-    Column("draw", "number of the draw at this level, from 0", integers(0, 99), NoisePlan, needs=LEVELS),
-    Column("camera", "convex, or the name of the camera", ANY_TEXT, CameraPlan, "name"),
+    Column("level", "number of the noise level, from 0", integers(0, 99), Place, needs=LEVELS),
+    Column("draw", "number of the draw at this level, from 0", integers(0, 99), Place, needs=LEVELS),
+    Column("camera", "convex, or the name of the camera", ANY_TEXT, CameraPlan),
     *(
         Column(f"w_{camera}", "weight of this camera in the mix; 0 if it is not part of it", SHARE, CameraPlan,
                "weights")
@@ -365,9 +363,9 @@ COLUMNS = (
     Column("gamma", "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",), number_or_text), IspPlan,
            spelling=GAMMA_SPELLING),
     Column("highlight", "preservation of highlights: per_channel, gray_mean or none",
-           OneOf(("per_channel", "gray_mean", "none")), CameraPlan),
+           OneOf(("per_channel", "gray_mean", "none")), IspPlan),
     Column("highlight_threshold", "linear signal above which highlights are preserved, 1 is white",
-           Range(0, math.nextafter(1, 0)), CameraPlan),
+           Range(0, math.nextafter(1, 0)), IspPlan),
     Column("downscale", "side of the squares of source pixels that were averaged", integers(1, 64), SourcePlan,
            unit="pixels"),
     Column("dequantize", "dequantization of 8-bit codes: off, dither or dither_all",
@@ -400,14 +398,14 @@ COLUMNS = (
     Column("black_level_dn", "black level", integers(0, 65534), SensorPlan, unit="DN"),
     Column("white_level_dn", "white level (saturation)", integers(1, 65535), SensorPlan, unit="DN"),
     Column("sensor_clip", "clipping of the noisy frame: sensor, black or none", OneOf(("sensor", "black", "none")),
-           NoisePlan),
+           SensorPlan),
     Column("saturated_as", "noisy sites whose clean site is saturated: noisy, or white where the converter ends",
-           OneOf(("noisy", "white")), NoisePlan, "saturated"),
-    Column("scene", "name of the scene", ANY_TEXT, ScenePlan, "name"),
+           OneOf(("noisy", "white")), SensorPlan),
+    Column("scene", "name of the scene", ANY_TEXT, ScenePlan),
     Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
-    Column("noise", "name of the noise profile", ANY_TEXT, NoisePlan, "name"),
+    Column("noise", "name of the noise profile", ANY_TEXT, NoisePlan),
     Column("noise_law", "distribution of a two-parameter profile: gaussian or poisson", OneOf(("gaussian", "poisson")),
-           NoisePlan, "law"),
+           NoisePlan),
     Column("a_dn", "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Range(-1e30, 1e30),
            NoisePlan, unit="DN"),
     Column("b_dn2", "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE,
@@ -439,15 +437,15 @@ COLUMNS = (
         for side in ("height", "width")
     ),
     Column("dark_frame", "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256,
-           DarkFramePlan, "sha256", needs=DARK_FRAMES),
+           DarkFramePlan, needs=DARK_FRAMES),
     *(
         Column(f"dark_frame_{axis}", f"first {side} of the dark frame that the full frame uses; even", COORDINATE,
                DarkFramePlan, "shift", unit="pixels", needs=DARK_FRAMES)
         for axis, side in (("y", "row"), ("x", "column"))
     ),
-    Column("dark_black_dn", "black level of the dark frame", Range(0, 65535), DarkFramePlan, "black_dn",
+    Column("dark_black_dn", "black level of the dark frame", Range(0, 65535), DarkFramePlan,
            unit="DN of the dark frame", needs=DARK_FRAMES),
-    Column("dark_scale", "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan, "scale",
+    Column("dark_scale", "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan,
            needs=DARK_FRAMES),
     Column("dtype", "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", OneOf((UINT16, FLOAT32)),
            OutputPlan),

@@ -32,16 +32,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from unprocess_gen.core.arrays import UINT16, Float, Frame
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath, LocalPath
-from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.simulation.effects import dark_variance_dn2
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import CHANNELS, MONO
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 from unprocess_gen.simulation.reference.sensor import quantise
@@ -219,14 +221,14 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
     profile = noise_profile(plan) if name == "noisy" else None
     return [
         Tag(271, ASCII, 0, MAKE),  # Make
-        Tag(272, ASCII, 0, plan.camera.name),  # Model
+        Tag(272, ASCII, 0, plan.camera.camera),  # Model
         Tag(274, SHORT, 1, 1),  # Orientation: frames are upright
         Tag(33421, SHORT, 2, (2, 2)),  # CFARepeatPatternDim
         Tag(33422, BYTE, 4, bytes(CHANNELS.index(letter) for letter in plan.sensor.pattern)),  # CFAPattern
         *_exposure(row),
         Tag(50706, BYTE, 4, bytes((1, 4, 0, 0))),  # DNGVersion
         Tag(50707, BYTE, 4, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-        Tag(50708, ASCII, 0, f"{MAKE} {plan.camera.name}"),  # UniqueCameraModel
+        Tag(50708, ASCII, 0, f"{MAKE} {plan.camera.camera}"),  # UniqueCameraModel
         Tag(50710, BYTE, 3, bytes((0, 1, 2))),  # CFAPlaneColor: red, green, blue
         Tag(50711, SHORT, 1, 1),  # CFALayout: rectangular
         Tag(50713, SHORT, 2, (2, 2)),  # BlackLevelRepeatDim

@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 
-from unprocess_gen.core.types import Patch, Plan, Row
+from unprocess_gen.dataset.row import Row
+from unprocess_gen.simulation.frames import Patch
+from unprocess_gen.simulation.plan import Plan
 
 
 def key_text(index: int) -> str:
@@ -61,7 +63,7 @@ def pair_key(sample: str, plan: Plan, several: bool) -> str:
     str
         The sample's key, with for example ``-l01d02`` for level 1, draw 2.
     """
-    return f"{sample}-l{plan.noise.level:02d}d{plan.noise.draw:02d}" if several else sample
+    return f"{sample}-l{plan.place.level:02d}d{plan.place.draw:02d}" if several else sample
 
 
 def image_key(row: Row) -> str:

@@ -20,20 +20,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, BinaryIO, NamedTuple, TextIO, TypeVar
 
+import msgspec
+
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.types import (
-    PLAN_PARTS,
-    Counts,
-    DarkFramePlan,
-    NoisePlan,
-    Pair,
-    Patch,
-    Plan,
-    Row,
-    Source,
-    Value,
-)
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import (
     ALWAYS,
     CLIPS,
@@ -46,7 +37,22 @@ from unprocess_gen.dataset.columns import (
 )
 from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import key_text
-from unprocess_gen.simulation.effects import Physics, dark_variance_dn2
+from unprocess_gen.dataset.row import Row, Value
+from unprocess_gen.simulation.effects import dark_variance_dn2
+from unprocess_gen.simulation.frames import Counts, Pair, Patch
+from unprocess_gen.simulation.plan import (
+    CameraPlan,
+    DarkFramePlan,
+    IspPlan,
+    NoisePlan,
+    OutputPlan,
+    Physics,
+    Place,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+)
 
 RowPart = TypeVar("RowPart")
 
@@ -188,12 +194,11 @@ _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\
 
 def _plan_cells(plan: Plan) -> dict[str, Value]:
     """Return the values of a plan by column, with those of a physical profile or a dark frame if it has one."""
-    noise, cells = plan.noise, dict[str, Value]()
-    for record in (plan, *(getattr(plan, part) for part in PLAN_PARTS)):
-        cells |= _cells(record)
-    if noise.physics is not None:
-        cells |= _cells(noise.physics)
-    return cells | _cells(noise.dark) if noise.dark.sha256 else cells
+    cells = _cells(plan)
+    for part in PLAN_PARTS:
+        if (record := getattr(plan, part)) is not None:
+            cells |= _cells(record)
+    return cells
 
 
 def _cells(record: Any) -> dict[str, Value]:
@@ -209,8 +214,19 @@ def _cells(record: Any) -> dict[str, Value]:
     return cells
 
 
-_DEFAULTS = {record: {field.name: field.default for field in dataclasses.fields(record)} for record in COLUMNS_OF}
-"""Default of each field; `dataclasses.MISSING` for fields without one."""
+PLAN_PARTS: dict[str, Any] = {
+    "place": Place, "camera": CameraPlan, "isp": IspPlan, "source": SourcePlan, "sensor": SensorPlan,
+    "scene": ScenePlan, "noise": NoisePlan, "physics": Physics, "dark": DarkFramePlan, "output": OutputPlan,
+}  # fmt: skip
+_OPTIONAL_PARTS = {"physics": "iso", "dark": "dark_frame"}
+
+_DEFAULTS = {
+    record: {field.name: field.default for field in msgspec.structs.fields(record)}
+    if issubclass(record, msgspec.Struct)
+    else {field.name: field.default for field in dataclasses.fields(record)}
+    for record in COLUMNS_OF
+}
+"""Default of each field; `dataclasses.MISSING` or `msgspec.NODEFAULT` for fields without one."""
 
 
 def _row(source: Source, sha256: str | None, shard: int, seed: int, values: Mapping[str, Value]) -> Row:
@@ -245,10 +261,11 @@ def plan_from_row(row: Row) -> Plan:
         If a value is missing, of another type or not allowed.
     """
     try:
-        physics = None if row.get("iso") is None else _part(row, Physics)
-        noise = NoisePlan(**_fields(row, NoisePlan), physics=physics, dark=_part(row, DarkFramePlan))
-        parts = {name: _part(row, record) for name, record in PLAN_PARTS.items() if record is not NoisePlan}
-        plan = Plan(**_fields(row, Plan), **parts, noise=noise)
+        absent = {name for name, column in _OPTIONAL_PARTS.items() if row.get(column) in (None, "")}
+        parts: dict[str, Any] = {
+            name: None if name in absent else _part(row, record) for name, record in PLAN_PARTS.items()
+        }
+        plan = Plan(**_fields(row, Plan), **parts)
         _check_plan(plan)
     except ValueError as error:
         raise DamageError(f"row {_key_of(row)}: not a plan ({error})") from error
@@ -291,7 +308,10 @@ def _fields(row: Row, record: RecordType) -> dict[str, Any]:
     """
     fields: dict[str, Any] = {}
     for field, columns in COLUMNS_OF[record].items():
-        may_be_empty = columns[0].needs is not ALWAYS and _DEFAULTS[record][field] is not dataclasses.MISSING
+        may_be_empty = columns[0].needs is not ALWAYS and _DEFAULTS[record][field] not in (
+            dataclasses.MISSING,
+            msgspec.NODEFAULT,
+        )
         if may_be_empty and all(row.get(column.name) in (None, "") for column in columns):
             continue
         values = tuple(column.to_field(row) for column in columns)
@@ -301,7 +321,7 @@ def _fields(row: Row, record: RecordType) -> dict[str, Any]:
 
 def _check_plan(plan: Plan) -> None:
     """Raise ValueError for values that are allowed one by one and contradict each other."""
-    sensor, physics = plan.sensor, plan.noise.physics
+    sensor, physics = plan.sensor, plan.physics
     if not sensor.black_level_dn < sensor.white_level_dn < 2**sensor.bits:
         raise ValueError(
             f"white_level_dn={sensor.white_level_dn}: expected more than black_level_dn={sensor.black_level_dn} "

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.columns import KEY_TEXT
 from unprocess_gen.dataset.keys import image_key, key_text, sample_key
 from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.row import Row
 
 KEYS_FORM = (
     "expected source indices and ranges such as 3,7-9, or keys: 00000003 names all pairs of an image, "

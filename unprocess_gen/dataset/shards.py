@@ -26,11 +26,12 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 import xxhash
 
+from unprocess_gen.core.arrays import DESCRIPTIONS, FLOAT32, PACKED, UINT16, Array, Frame
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3, little_endian
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.core.types import DESCRIPTIONS, FLOAT32, PACKED, UINT16, Array, Frame, Row
+from unprocess_gen.dataset.row import Row
 
 RECORD_BYTES = 512
 END = b"\0" * (2 * RECORD_BYTES)

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from unprocess_gen.core.types import Frame, Row
+from unprocess_gen.core.arrays import Frame
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.simulation.reference import cfa
 
 

@@ -16,15 +16,16 @@ import numpy as np
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
+from unprocess_gen.core.arrays import Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.targets import TARGETS
-from unprocess_gen.core.types import Facts, Frame, Pair, Patch, Plan, Srgb, Value
 from unprocess_gen.dataset.columns import COLUMNS, number_or_text
 from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_folders, name_apart
+from unprocess_gen.dataset.row import Value
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -33,7 +34,10 @@ from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.facts import Facts
+from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import CropMaker, crop_maker
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
 
@@ -203,7 +207,7 @@ class LivePairs:
         self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int
     ) -> tuple[Plan, Patch, CropMaker]:
         """Return the plan of an epoch, without its number, the patch, and what makes crops of it."""
-        plan_epoch = epoch if self._redraw == "all" or image.plan.noise.dark.sha256 else 0
+        plan_epoch = epoch if self._redraw == "all" or image.plan.dark else 0
         is_wide = srgb.itemsize > 1 or image.plan.source.dequantize != "off"
         prepared = self._kept[is_wide].get((number, plan_epoch))
         if prepared is None:
@@ -229,7 +233,7 @@ class LivePairs:
             plan = redraw_plan(config, plan, facts, settings.dark_frames, epoch)
             rule = patch_rule(config.source)
             patch = list_patches(rule, plan.stream_key, height, width, plan.output.layout, epoch)[patch.number]
-        if epoch and plan.noise.dark.sha256 and settings.dark_frames is not None:
+        if epoch and plan.dark and settings.dark_frames is not None:
             plan = next_dark_frame(plan, settings.dark_frames, epoch)
         return plan, patch
 
@@ -312,7 +316,7 @@ def _crop(plan: Plan, epoch: int, patch: Patch, side: int, number: int) -> Patch
             f"LivePairs: patch={side}: exceeds a pair of {patch.width} x {patch.height} pixels; expected at most its "
             "shorter side"
         )
-    noise = plan.noise
-    words = crop_words(plan.stream_key, patch.number, noise.level, noise.draw, frame_word(noise.frame, epoch), number)
+    place = plan.place
+    words = crop_words(plan.stream_key, patch.number, place.level, place.draw, frame_word(place.frame, epoch), number)
     y, x = even_corner(words, side, patch.height, patch.width)
     return Patch(patch.number, patch.y + y, patch.x + x, side, side)

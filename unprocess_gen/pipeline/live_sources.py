@@ -12,11 +12,12 @@ from unprocess_gen.config.interpretation import noise_levels, patch_rule
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import Recent
-from unprocess_gen.core.types import Pair, Patch, Photograph, Plan, Source, Srgb, Value
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import (
@@ -27,10 +28,14 @@ from unprocess_gen.dataset.manifest import (
     read_row,
     rows_with_offsets,
 )
+from unprocess_gen.dataset.row import Value
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import PairRegenerator, dark_frames_root, source_of, source_root
 from unprocess_gen.pipeline.run import resolve
+from unprocess_gen.simulation.frames import Pair, Patch
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.photograph import Photograph
 from unprocess_gen.sources.pixel_cache import PixelCache
 
 KEPT = 4096
@@ -70,7 +75,7 @@ class LiveImage:
         digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
         identity = self.source, self.sha256, self.orientation, self.shard
         row = pair_row(self.key, *identity, plan, pair, digests, patch, self.source_noise_dn)
-        return {**row, "epoch": plan.noise.epoch} if plan.noise.epoch else dict(row)
+        return {**row, "epoch": plan.place.epoch} if plan.place.epoch else dict(row)
 
 
 class LiveSource(Protocol):
@@ -143,7 +148,7 @@ class RecordedPairs:
 
     def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
         """Return the row of a pair; the recorded one in epoch 0."""
-        if image.offset is None or plan.noise.epoch or patch != image.patch:
+        if image.offset is None or plan.place.epoch or patch != image.patch:
             return image.row(plan, patch, pair)
         return self._read(image.offset)
 

@@ -10,13 +10,18 @@ from dataclasses import dataclass
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import DarkFrames, Facts, Pair, Patch, Photograph, Plan, Source, Srgb
+from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.source import Source
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.raw_source import with_raw_sensor
+from unprocess_gen.simulation.facts import DarkFrames, Facts
+from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.patches import crop_patch, list_patches
+from unprocess_gen.sources.photograph import Photograph
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,14 +18,15 @@ from typing import Any, NamedTuple
 
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
+from unprocess_gen.core.arrays import Array
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
-from unprocess_gen.core.types import Array, Row
 from unprocess_gen.dataset.columns import columns_of
 from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import has_frames, read_rows, write_rows
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, check_members, shard_name
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, source_changes
 from unprocess_gen.pipeline.run import resolve

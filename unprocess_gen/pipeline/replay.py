@@ -23,8 +23,8 @@ from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.core.types import Photograph, Plan, Row, Source, SourcePlan
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import (
@@ -35,13 +35,16 @@ from unprocess_gen.dataset.manifest import (
     read_rows,
     rows_with_offsets,
 )
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import arrays_of
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.plan import Plan, SourcePlan
 from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
+from unprocess_gen.sources.photograph import Photograph
 from unprocess_gen.sources.reading import source_file
 
 NO_LIMIT = 2**40
@@ -252,13 +255,12 @@ class PairRegenerator:
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
         """Return access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
-        sha256 = plan.noise.dark.sha256
-        if not sha256:
+        if plan.dark is None:
             return None
         if self._dark_frames is None:
             raise SourceChangedError(
-                f"noise.dark_frames is missing: the row names the dark frame {sha256}; expected the folder of "
-                "the dark frames; give noise.dark_frames=…"
+                f"noise.dark_frames is missing: the row names the dark frame {plan.dark.dark_frame}; expected the "
+                "folder of the dark frames; give noise.dark_frames=…"
             )
         try:
             return dark_folder(self._dark_frames)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.planning.dark_scene import dark_scene_warning

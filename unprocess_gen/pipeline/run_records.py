@@ -32,7 +32,7 @@ import msgspec
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.records import Count, Digest, check_record, parse_record
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.dataset_json import ShardFacts, check_shard
 from unprocess_gen.dataset.manifest import rows_text
 from unprocess_gen.dataset.shards import shard_name

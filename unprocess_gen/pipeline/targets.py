@@ -7,12 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import FLOAT32, Array, Frame, Srgb
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.core.types import EXACT, FLOAT32, Array, Frame, Pair, Patch, Plan, Srgb, Value
+from unprocess_gen.dataset.row import Value
 from unprocess_gen.dataset.training import noise_std
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.effects import dark_variance_dn2
+from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import linear_rgb
+from unprocess_gen.simulation.plan import EXACT, Plan
 from unprocess_gen.sources.patches import crop_patch
 
 Targets = dict[str, Array]

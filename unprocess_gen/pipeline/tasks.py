@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Counts, Row, Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.manifest import has_frames
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.simulation.frames import Counts
 
 Item = TypeVar("Item")
 

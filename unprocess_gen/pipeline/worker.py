@@ -22,10 +22,11 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import RESUME, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error, machine_errors
 from unprocess_gen.core.paths import any_path
-from unprocess_gen.core.types import Plan, Row, Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import columns_of
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, has_frames, pair_row, row_json
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels
 from unprocess_gen.pipeline.run_records import MAX_DEATHS, Deaths, commit_shard
@@ -34,6 +35,7 @@ from unprocess_gen.pipeline.targets import kernels_for, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.reading import ReadFile, read_bytes, reading_ahead, source_file
 

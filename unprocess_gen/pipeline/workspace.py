@@ -35,7 +35,7 @@ from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import MAX_BYTES, parse_json
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.dataset_json import FORMAT, check_dataset_json, check_format, check_format_of
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.manifest import header_text, read_rows

@@ -33,10 +33,12 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Facts, RawParts, Srgb
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.planning.frame_model import FIXED, RARE, FrameModel, SignalRange, ratio_to_noise
-from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS, Physics
+from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS
 from unprocess_gen.simulation.effects.prediction import STATISTICS
+from unprocess_gen.simulation.facts import Facts, RawParts
+from unprocess_gen.simulation.plan import Physics
 
 MIN_OUTLIERS = 0.1
 """Expected outliers per frame from which hot and dead pixels are simulated."""

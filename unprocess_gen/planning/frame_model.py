@@ -1,6 +1,6 @@
 """Model a frame for the planner: the range of its signal, what effects contribute to it, and the noise that masks it.
 
-All arithmetic is + - × ÷ √ and `decimal`, and the pixels enter as integer facts only (`core.types.Facts`): predictions
+All arithmetic is + - × ÷ √ and `decimal`, and the pixels enter as integers only (`simulation.facts.Facts`): predictions
 are the same on every machine and in every tier. Derivations: ``docs/design/effect_selection.md``.
 """
 
@@ -11,10 +11,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from operator import add, mul
 
-from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, SourcePlan
-from unprocess_gen.simulation.effects import BY_NAME, EFFECTS, Physics
+from unprocess_gen.simulation.effects import BY_NAME, EFFECTS
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
+from unprocess_gen.simulation.facts import Facts
+from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, SourcePlan
 from unprocess_gen.simulation.tone_curves import linear_table
 
 MASKING = tuple(effect for effect in EFFECTS if effect.masks)

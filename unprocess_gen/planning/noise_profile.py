@@ -21,8 +21,8 @@ from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile
 from unprocess_gen.core.random_streams import body_key, scatter_uniforms
 from unprocess_gen.planning.draws import Draw
-from unprocess_gen.simulation.effects import NUMBERS, Physics
-from unprocess_gen.simulation.effects.numbers import DN, RATE, SHAPE, SITES, Number
+from unprocess_gen.simulation.numbers import DN, RATE, SHAPE, SITES, Number
+from unprocess_gen.simulation.plan import NUMBERS, Physics
 from unprocess_gen.simulation.reference import cfa
 
 MIDDLE = 0.5

@@ -18,10 +18,9 @@ from unprocess_gen.config import interpretation
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
-from unprocess_gen.core import types
+from unprocess_gen.core.arrays import FLOAT32
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, split_uniform, stream_key
 from unprocess_gen.core.sequences import Recent
-from unprocess_gen.core.types import DarkFrames, Facts, Plan, SourcePlan
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
@@ -35,7 +34,20 @@ from unprocess_gen.planning.effect_selection import (
 from unprocess_gen.planning.frame_model import SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
-from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.facts import DarkFrames, Facts
+from unprocess_gen.simulation.plan import (
+    CameraPlan,
+    DarkFramePlan,
+    IspPlan,
+    NoisePlan,
+    OutputPlan,
+    Physics,
+    Place,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+)
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
@@ -71,7 +83,7 @@ def plan_pairs(
     """
     levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
     plans = [
-        plan.replace(draw=draw, frame=frame) if draw or frame else plan
+        plan.replace(place=Place(frame, plan.place.level, draw)) if draw or frame else plan
         for plan, _ in levels
         for draw in range(config.noise.draws)
     ]
@@ -85,18 +97,16 @@ def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: Da
     """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay."""
     planner = _planner(with_raw_sensor(config, parts_of(plan)))
     levels = planner.levels_of_key(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
-    noise = plan.noise
-    redrawn, _ = next(itertools.islice(levels, noise.level, None))
-    if (noise.draw, noise.frame, noise.dark) == (0, 0, redrawn.noise.dark):
-        return redrawn
-    return redrawn.replace(draw=noise.draw, frame=noise.frame, dark=noise.dark)
+    redrawn, _ = next(itertools.islice(levels, plan.place.level, None))
+    return redrawn.replace(place=plan.place, dark=plan.dark)
 
 
 def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
     """Replace the dark frame of a pair by another one in each epoch, at the same place: the body does not move."""
+    assert plan.dark is not None
     digests = [frame.sha256 for frame in dark_frames.frames]
-    number = (digests.index(plan.noise.dark.sha256) + epoch) % len(digests)
-    return plan.replace(dark=replace(plan.noise.dark, sha256=digests[number]))
+    number = (digests.index(plan.dark.dark_frame) + epoch) % len(digests)
+    return plan.replace(dark=plan.dark.replace(dark_frame=digests[number]))
 
 
 def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int) -> Plan:
@@ -105,7 +115,7 @@ def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: i
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
-    return plan.replace(dark=types.DarkFramePlan(frame.sha256, shift, dark_frames.black_dn, dark_frames.scale))
+    return plan.replace(dark=DarkFramePlan(frame.sha256, shift, dark_frames.black_dn, dark_frames.scale))
 
 
 def _even_place(word: int, available: int, needed: int) -> int:
@@ -166,16 +176,24 @@ class Planner:
         levels = [replace(config, noise=noise) for noise in interpretation.noise_levels(config.noise)]
         self._is_physical = interpretation.is_physical(config.noise)
         kind = PhysicalLevel if self._is_physical else TwoNumberLevel
-        self._levels = [kind(level, number) for number, level in enumerate(levels)]
+        self._levels = [kind(level) for level in levels]
         self._accuracy = config.accuracy
-        self._scene_name, self._highlight = config.scene.name, (config.gains.highlight, config.gains.threshold)
-        self._source = types.SourcePlan(config.source.downscale, config.source.dequantize)
-        self._isp = types.IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
+        self._scene_name = config.scene.name
+        self._source = SourcePlan(config.source.downscale, config.source.dequantize)
+        isp, gains, sensor = config.isp, config.gains, config.sensor
+        gamma = "srgb" if isp.gamma == "srgb" else float(isp.gamma)
+        self._isp = IspPlan(isp.tone, gamma, gains.highlight, gains.threshold)
         self._splits: dict[str, float] = config.split or {}
-        sensor = config.sensor
-        self._sensor = types.SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
-        self._output = types.OutputPlan(
-            config.output.dtype, config.output.layout, types.FLOAT32 if interpretation.has_float_clean(config) else ""
+        self._sensor = SensorPlan(
+            sensor.pattern,
+            sensor.bits,
+            sensor.black_level_dn,
+            sensor.white_level_dn,
+            sensor.clip,
+            interpretation.saturated_as(config),
+        )
+        self._output = OutputPlan(
+            config.output.dtype, config.output.layout, FLOAT32 if interpretation.has_float_clean(config) else ""
         )
 
     def levels(
@@ -199,7 +217,7 @@ class Planner:
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
         uniforms = parameter_uniforms(key, DRAW_COUNT, epoch=epoch)
-        scene = types.ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
+        scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
         source, isp = self._source, self._isp
         if raw is None:
@@ -218,9 +236,23 @@ class Planner:
                 drawn_again = parameter_uniforms(key, DRAW_COUNT, number, epoch)
                 for counter in NOISE_COUNTERS:
                     uniforms[counter] = drawn_again[counter]
-            noise, selection = level.draw(image, uniforms)
-            parts = source, scene, camera, isp, self._sensor, noise, self._accuracy, self._output
-            yield Plan(seed, key, *parts, split), selection
+            noise, physics, selection = level.draw(image, uniforms)
+            plan = Plan(
+                seed=seed,
+                stream_key=key,
+                split=split,
+                place=Place(level=number),
+                camera=camera,
+                isp=isp,
+                source=source,
+                sensor=self._sensor,
+                scene=scene,
+                noise=noise,
+                accuracy=self._accuracy,
+                physics=physics,
+                output=self._output,
+            )
+            yield plan, selection
 
     def _draw_split(self, seed: int, source_sha256: str) -> str:
         """Name the split of an image, empty without splits; the last one takes what the others leave."""
@@ -229,7 +261,7 @@ class Planner:
         names, ends = list(self._splits), list(itertools.accumulate(self._splits.values()))
         return names[bisect.bisect_right(ends[:-1], split_uniform(seed, source_sha256))]
 
-    def draw_camera(self, uniforms: Sequence[float]) -> types.CameraPlan:
+    def draw_camera(self, uniforms: Sequence[float]) -> CameraPlan:
         """Draw colours and gains."""
         name, weights, rgb2cam = plan_camera(self._camera, uniforms)
         red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
@@ -237,11 +269,20 @@ class Planner:
         if self._lights:
             light, cct_k, (red, blue) = draw_light(self._lights, xyz2cam(self._camera, weights), uniforms)
         inverse_rgb = draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB])
-        camera = types.CameraPlan(name, weights, rgb2cam, red, blue, inverse_rgb, *self._highlight, light, cct_k)
+        camera = CameraPlan(
+            camera=name,
+            weights=weights,
+            rgb2cam=rgb2cam,
+            light=light,
+            cct_k=cct_k,
+            red_gain=red,
+            blue_gain=blue,
+            inverse_rgb_gain=inverse_rgb,
+        )
         return without_filters(camera) if self._sensor.pattern == MONO else camera
 
 
-def without_filters(camera: types.CameraPlan) -> types.CameraPlan:
+def without_filters(camera: CameraPlan) -> CameraPlan:
     """Return a camera whose channels are equal: each is the mean of the three, gains included.
 
     Highlights are kept like highlights of the mean, whose gain is the mean of the three.
@@ -250,11 +291,11 @@ def without_filters(camera: types.CameraPlan) -> types.CameraPlan:
     sums = [sum(gain * rgb2cam[3 * row + column] for row, gain in enumerate(gains)) for column in range(3)]
     red, green, blue = (value / sum(sums) for value in sums)
     rows = red, green, blue, red, green, blue, red, green, blue
-    return replace(camera, rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=sum(gains) / 3)
+    return camera.replace(rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=sum(gains) / 3)
 
 
-NoiseAndSelection = tuple[types.NoisePlan, Selection | None]
-"""Noise of a plan, and the selection of effects of a physical profile."""
+DrawnNoise = tuple[NoisePlan, Physics | None, Selection | None]
+"""Noise of a plan, and of a physical profile its numbers and the selection of effects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,26 +329,21 @@ class TwoNumberLevel:
     ----------
     config : Config
         The configuration, with the profile of this level.
-    number : int
-        Number of the level.
     """
 
-    def __init__(self, config: Config, number: int) -> None:
-        self._config, self._number, self._saturated = config, number, interpretation.saturated_as(config)
+    def __init__(self, config: Config) -> None:
+        self._config = config
         self._distributions = interpretation.noise_distributions(config.noise)
         self._span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
 
-    def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
+    def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:
         """Draw the two numbers and select the effects of an image at this level."""
         a_dn, b_dn2 = self.two_numbers(uniforms)
         if self._config.source.own_noise == "subtract":  # the variances are lines, so their difference is one
             a_dn, b_dn2 = a_dn - image.source.own_a_dn, b_dn2 - image.source.own_b_dn2
         effects, skipped = plan_effects(self._config, a_dn, b_dn2, self._span_dn)
-        noise, clip = self._config.noise, self._config.sensor.clip
-        plan = types.NoisePlan(
-            noise.name, noise.law, a_dn, b_dn2, effects, skipped, clip, self._saturated, level=self._number
-        )
-        return plan, None
+        noise = self._config.noise
+        return NoisePlan(noise.name, noise.law, a_dn, b_dn2, effects, skipped), None, None
 
     def two_numbers(self, uniforms: Sequence[float]) -> tuple[float, float]:
         """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
@@ -331,17 +367,13 @@ class PhysicalLevel:
     ----------
     config : Config
         The configuration, with the profile of this level.
-    number : int
-        Number of the level.
     """
 
-    def __init__(self, config: Config, number: int) -> None:
-        self._noise, self._number = PhysicalNoise(config), number
-        self._clip, self._saturated = config.sensor.clip, interpretation.saturated_as(config)
-        self._rules = EffectRules(config)
+    def __init__(self, config: Config) -> None:
+        self._noise, self._rules = PhysicalNoise(config), EffectRules(config)
         self._sensors: Recent[tuple[Any, ...], tuple[Physics, BodySelection | None]] = Recent(64)
 
-    def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
+    def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:
         """Draw the numbers of the sensor and select the effects of an image at this level."""
         assert image.facts is not None and image.signals is not None
         facts, lens, dark = image.facts, self._noise.has_lens_shading, image.dark_frames
@@ -351,29 +383,24 @@ class PhysicalLevel:
         if known is None:
             physics = self._noise.physics(drawn)
             if dark is not None:
-                physics = replace(
-                    physics, read_law="gaussian", read_shape=0.0, read_std_dn=math.sqrt(dark.variance_dn2)
-                )
+                read_std_dn = math.sqrt(dark.variance_dn2)
+                physics = physics.replace(read_law="gaussian", read_shape=0.0, read_std_dn=read_std_dn)
             if lens:
-                physics = replace(physics, frame_size=(facts.height, facts.width))
+                physics = physics.replace(frame_size=(facts.height, facts.width))
             known = self._sensors.keep(key, (physics, select_patterns(self._rules, physics, facts.frames > 1)))
         physics, patterns = known
         selection = select_effects(self._rules, physics, facts, image.signals, patterns)
         profile = self._noise.noise
-        plan = types.NoisePlan(
+        plan = NoisePlan(
             profile.name,
             profile.law,
             physics.dn_per_e,
             physics.read_std_dn * physics.read_std_dn,
             selection.effects,
             selection.skipped,
-            self._clip,
-            self._saturated,
-            physics,
-            self._number,
-            assumed=selection.assumed,
+            selection.assumed,
         )
-        return plan, selection
+        return plan, physics, selection
 
 
 # ---------------------------------------------------------------------------------------------------------- camera

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Plan, RawParts, SourcePlan
+from unprocess_gen.simulation.facts import RawParts
+from unprocess_gen.simulation.plan import Plan, SourcePlan
 
 
 def parts_of(plan: Plan) -> RawParts | None:
@@ -22,7 +23,8 @@ def with_raw_sensor(config: Config, raw: RawParts | None) -> Config:
         return config
     sensor = config.sensor
     if sensor.levels == "source":
-        sensor = replace(sensor, **asdict(raw.sensor))
+        levels = ("pattern", "bits", "black_level_dn", "white_level_dn")
+        sensor = replace(sensor, **{name: getattr(raw.sensor, name) for name in levels})
     elif raw.source.shrink == 1:
         sensor = replace(sensor, pattern=raw.sensor.pattern)
     return replace(config, sensor=sensor)
@@ -38,4 +40,4 @@ def own_noise(raw: RawParts, exposure: float, span_dn: float) -> SourcePlan:
         return raw.source
     scale, offset = raw.noise
     dn = exposure * span_dn
-    return replace(raw.source, own_a_dn=scale * dn, own_b_dn2=offset * dn * dn)
+    return raw.source.replace(own_a_dn=scale * dn, own_b_dn2=offset * dn * dn)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.core.arrays import Float, Srgb
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import filters
 from unprocess_gen.simulation.reference.unprocess import camera_light
 from unprocess_gen.simulation.tone_curves import linear_table

@@ -32,7 +32,8 @@ from unprocess_gen.planning.draws import DRAW_COUNT
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.plan import TwoNumberLevel
 from unprocess_gen.reports.formatting import short_number
-from unprocess_gen.simulation.effects import Physics, profile_keys
+from unprocess_gen.simulation.effects import profile_keys
+from unprocess_gen.simulation.plan import Physics
 from unprocess_gen.statistics.scores import NORMAL_95, Score, alarm_limit
 
 EFFECT_OF_NUMBER = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
@@ -180,7 +181,7 @@ class Profile:
             profile = PhysicalNoise(config)
             physics = profile.physics(profile.draw(middle, 0, 0))
             return {name: self._number(name, physics) for name in EFFECT_OF_NUMBER if name != "b_dn2"}
-        a, b = TwoNumberLevel(config, 0).two_numbers(middle)
+        a, b = TwoNumberLevel(config).two_numbers(middle)
         two: dict[str, float | None] = {"dn_per_e": a, "b_dn2": b, "read_std_dn": None, "read_shape": None}
         return {name: [two.get(name, 0.0)] * 5 for name in EFFECT_OF_NUMBER if name != "full_well_e"}
 

@@ -17,7 +17,7 @@ from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import Plan, Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
@@ -27,6 +27,7 @@ from unprocess_gen.planning.effect_selection import Prediction
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.loader import load_source
 
 LOGGER = logging.getLogger("unprocess_gen")

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unprocess_gen.core.types import DarkPixels, Float, Frame, Row
+from unprocess_gen.core.arrays import Float, Frame
 from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.noise_check.repeat import measure_noise
 from unprocess_gen.reports.noise_check.scores import Bins, residual_of
+from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 LEAST_SITES_OF_POINT = 16
@@ -62,7 +64,7 @@ def fit_pair(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | Non
     The line of the row is corrected by the difference of the pair from its repetition, which has all recorded effects.
     """
     plan = plan_from_row(row)
-    if plan.noise.dark.sha256 and dark_pixels is None:
+    if plan.dark and dark_pixels is None:
         return None
     noise = measure_noise(clean, noisy, row, dark_pixels)
     bins, (own, repeated) = Bins(noise, np.s_[:, :]), residual_of(noise)[0].z

@@ -10,13 +10,14 @@ from unprocess_gen.config import interpretation
 from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import value_range, value_text
-from unprocess_gen.core.types import DarkFrames, Plan
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
 from unprocess_gen.planning.sensor_levels import sensor_warning
 from unprocess_gen.reports.estimate import RunEstimate, SourceEstimate
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
+from unprocess_gen.simulation.facts import DarkFrames
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.sources.listing import unmatched_sentence
 
@@ -115,7 +116,7 @@ def noise_lines(
 
 def _scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
     """The scene, and what of it the noise profile ignores."""
-    scene, physics = config.scene, [plan.noise.physics for plan in plans if plan.noise.physics is not None]
+    scene, physics = config.scene, [plan.physics for plan in plans if plan.physics is not None]
     iso, seconds, celsius = (
         value_range([getattr(numbers, name) for numbers in physics]) if physics else value_text(getattr(scene, name))
         for name in ("iso", "exposure_s", "temperature_c")
@@ -150,7 +151,7 @@ def _physical_sentences(config: Config, plans: Sequence[Plan]) -> list[str]:
     """The gain and the read noise of a physical profile, and their conversion to the sensor."""
     noise = config.noise
     assert noise.white_level_dn is not None and noise.black_level_dn is not None
-    physics = [plan.noise.physics for plan in plans if plan.noise.physics is not None]
+    physics = [plan.physics for plan in plans if plan.physics is not None]
     gains, stds = ([getattr(numbers, name) for numbers in physics] for name in ("dn_per_e", "read_std_dn"))
     scale = value_range([plan.sensor.span_dn / (noise.white_level_dn - noise.black_level_dn) for plan in plans])
     return [
@@ -162,7 +163,7 @@ def _physical_sentences(config: Config, plans: Sequence[Plan]) -> list[str]:
 
 def _number_sources(config: Config, plans: Sequence[Plan]) -> list[str]:
     """The source and the uncertainty of each number of a physical profile, and the numbers that have no source."""
-    isos = [plan.noise.physics.iso for plan in plans if plan.noise.physics is not None]
+    isos = [plan.physics.iso for plan in plans if plan.physics is not None]
     sources = interpretation.provenance_at(config.noise, isos)
     stated = [f"{', '.join(each.numbers)}: {each.source}; uncertainty: {each.uncertainty}" for each in sources]
     return [*stated, f"assumed, without a source: {', '.join(config.noise.assumed) or 'none'}"]

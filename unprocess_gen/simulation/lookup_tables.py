@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.exact_distributions import DIGITS, tukey_quantile, tukey_std
-from unprocess_gen.core.types import Float
 
 OCTAVES, SEGMENTS = 32, 32
 

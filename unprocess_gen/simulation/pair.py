@@ -16,24 +16,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from unprocess_gen.core.types import (
-    EXACT,
-    FLOAT32,
-    MOSAIC,
-    PACKED,
-    REFERENCE,
-    Counts,
-    DarkPixels,
-    Float,
-    Frame,
-    Normalised,
-    Pair,
-    Plan,
-    Srgb,
-)
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, Float, Frame, Normalised, Srgb
 from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.frames import Counts, Pair
 from unprocess_gen.simulation.kernels.render import CODES, CropRenderer, pass_key, render_clean, render_pairs
+from unprocess_gen.simulation.plan import EXACT, REFERENCE, Plan
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
 from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
@@ -154,7 +143,7 @@ def crop_maker(
     callable
         `CropMaker`, whose pairs are those of `make_pair` with ``plan.replace(epoch=epoch)``.
     """
-    if plan.noise.dark.sha256 or plan.accuracy == REFERENCE:
+    if plan.dark or plan.accuracy == REFERENCE:
 
         def make(srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
             pair = make_pair(srgb, plan.replace(epoch=epoch), origin, dark_pixels)
@@ -271,10 +260,10 @@ def _reference_pair(
     if plan.pins_saturated:
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
 
-    limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, plan.noise.sensor_clip)
+    limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, plan.sensor.sensor_clip)
     levels_dn = sensor.black_level_dn, sensor.white_level_dn
-    averaged_dn = order.average(clean_dn, plan, origin) if plan.noise.averaged else clean_dn
-    clean = _frame_of(averaged_dn, limits_dn if plan.noise.averaged else levels_dn, output.clean_normalised, levels_dn)
+    averaged_dn = order.average(clean_dn, plan, origin) if plan.averaged else clean_dn
+    clean = _frame_of(averaged_dn, limits_dn if plan.averaged else levels_dn, output.clean_normalised, levels_dn)
     noisy = _frame_of(noisy_dn, limits_dn, output.normalised, levels_dn)
     read_dn = noisy_dn if output.normalised else np.rint(noisy_dn)
     counts = Counts(
@@ -328,8 +317,8 @@ def _check_image(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> None:
         raise ValueError(f"srgb={srgb.dtype} {list(srgb.shape)}: unusable array; expected uint8 or uint16 [H, W, 3]")
     if plan.output.layout == PACKED and (srgb.shape[0] % 2 or srgb.shape[1] % 2):
         raise ValueError(f"srgb={list(srgb.shape)}: odd side; expected even height and width for layout={PACKED}")
-    if plan.noise.physics is not None and "lens_shading" in plan.noise.effects:
-        height, width = plan.noise.physics.frame_size
+    if plan.physics is not None and "lens_shading" in plan.noise.effects:
+        height, width = plan.physics.frame_size
         if origin[0] + srgb.shape[0] > height or origin[1] + srgb.shape[1] > width:
             raise ValueError(
                 f"srgb={list(srgb.shape)}: exceeds the frame {[height, width]} of the lens shading at {list(origin)}; "

@@ -6,8 +6,8 @@ import functools
 import math
 from typing import Any
 
-from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.order import effects_of
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.slots import Patterns, SiteNoise, Slots
 
 NORMAL_STREAM = "heteroscedastic"
@@ -17,7 +17,7 @@ NORMAL_STREAM = "heteroscedastic"
 @functools.lru_cache(maxsize=1024)
 def slots_of(plan: Plan) -> Slots:
     """Return the slots of a plan; frames that share their patterns can be simulated in one pass."""
-    black_dn, physics = float(plan.sensor.black_level_dn), plan.noise.physics
+    black_dn, physics = float(plan.sensor.black_level_dn), plan.physics
     if physics is None:
         return _two_numbers(plan, black_dn)
     filled: dict[str, Any] = {}

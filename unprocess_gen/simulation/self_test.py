@@ -16,20 +16,31 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
-from unprocess_gen.core import types
+from unprocess_gen.core.arrays import FLOAT32, Float, Srgb
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.random_streams import philox4x32
-from unprocess_gen.core.types import Float, Plan, Srgb
-from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS, Physics
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS
 from unprocess_gen.simulation.kernels.jit import has_run, kernel, note_run
 from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.lookup_tables import normal_table
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import (
+    EXACT,
+    FAST,
+    REFERENCE,
+    CameraPlan,
+    IspPlan,
+    NoisePlan,
+    Physics,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+)
 from unprocess_gen.simulation.tone_curves import linear_table
 
 KNOWN_ANSWERS = (
@@ -46,20 +57,18 @@ KNOWN_ANSWERS = (
 GOLDEN_PLAN = Plan(
     seed=0,
     stream_key=0x0123456789ABCDEF,
-    source=types.SourcePlan(downscale=1, dequantize="off"),
-    scene=types.ScenePlan("daylight", exposure_ratio=1.0),
-    camera=types.CameraPlan(
-        "custom", weights=(0.0, 0.0, 0.0, 0.0), red_gain=2.15, blue_gain=1.7, inverse_rgb_gain=0.8,
+    camera=CameraPlan(
+        camera="custom", weights=(0.0, 0.0, 0.0, 0.0), red_gain=2.15, blue_gain=1.7, inverse_rgb_gain=0.8,
         rgb2cam=(0.5625, 0.3125, 0.125, 0.125, 0.75, 0.125, 0.03125, 0.21875, 0.75),
-        highlight="per_channel", highlight_threshold=0.9,
     ),
-    isp=types.IspPlan("smoothstep", gamma=2.2),
-    sensor=types.SensorPlan("GRBG", bits=10, black_level_dn=64, white_level_dn=1023),
-    noise=types.NoisePlan(
+    isp=IspPlan("smoothstep", 2.2, "per_channel", highlight_threshold=0.9),
+    source=SourcePlan(downscale=1, dequantize="off"),
+    sensor=SensorPlan("GRBG", bits=10, black_level_dn=64, white_level_dn=1023),
+    scene=ScenePlan("daylight", exposure_ratio=1.0),
+    noise=NoisePlan(
         "imx385_iso25600", "gaussian", a_dn=55.0, b_dn2=2500.0, effects=("heteroscedastic",), skipped=(),
-        sensor_clip="sensor", saturated="noisy",
     ),
-    accuracy=types.EXACT,
+    accuracy=EXACT,
 )  # fmt: skip
 GOLDEN_PHYSICS = Physics(
     iso=3200.0, exposure_s=0.1, temperature_c=30.0, frame_size=(4096, 4096), sensor_unit="0",
@@ -73,16 +82,16 @@ _PHYSICAL = _COUNTS.replace(effects=PHYSICAL_EFFECTS, exposure_ratio=1.5, level=
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,
     "gray_mean": GOLDEN_PLAN.replace(highlight="gray_mean"),
-    "float32": GOLDEN_PLAN.replace(accuracy=types.FAST, bits=16, black_level_dn=4096, white_level_dn=65535),
-    "reference": GOLDEN_PLAN.replace(accuracy=types.REFERENCE),
-    "poisson": GOLDEN_PLAN.replace(law="poisson"),
+    "float32": GOLDEN_PLAN.replace(accuracy=FAST, bits=16, black_level_dn=4096, white_level_dn=65535),
+    "reference": GOLDEN_PLAN.replace(accuracy=REFERENCE),
+    "poisson": GOLDEN_PLAN.replace(noise_law="poisson"),
     "plain": _COUNTS,
-    "gaussian_read": _COUNTS.replace(physics=replace(GOLDEN_PHYSICS, read_law="gaussian")),
+    "gaussian_read": _COUNTS.replace(physics=GOLDEN_PHYSICS.replace(read_law="gaussian")),
     "physical": _PHYSICAL,
-    "normalised": GOLDEN_PLAN.replace(dtype=types.FLOAT32, sensor_clip="none"),
-    "normalised_counts": _PHYSICAL.replace(dtype=types.FLOAT32, sensor_clip="none"),
-    "float_clean": GOLDEN_PLAN.replace(clean_dtype=types.FLOAT32),
-    "float_clean_counts": _PHYSICAL.replace(clean_dtype=types.FLOAT32),
+    "normalised": GOLDEN_PLAN.replace(dtype=FLOAT32, sensor_clip="none"),
+    "normalised_counts": _PHYSICAL.replace(dtype=FLOAT32, sensor_clip="none"),
+    "float_clean": GOLDEN_PLAN.replace(clean_dtype=FLOAT32),
+    "float_clean_counts": _PHYSICAL.replace(clean_dtype=FLOAT32),
 }
 GOLDEN = {
     # XXH3-128 of the clean and of the noisy frame
@@ -103,9 +112,9 @@ GOLDEN = {
 
 def kernels(plan: Plan) -> str:
     """Return the name of the set of kernels that simulates a plan; sets are compiled one by one, in seconds."""
-    if plan.accuracy == types.REFERENCE:
+    if plan.accuracy == REFERENCE:
         return "reference"
-    noise = "electrons" if plan.noise.counts_electrons else "gaussian"
+    noise = "electrons" if plan.counts_electrons else "gaussian"
     if plan.output.clean_normalised:
         return f"{'normalised' if plan.output.normalised else 'float_clean'}_{noise}"
     return "float32" if uses_scene32(plan) else noise

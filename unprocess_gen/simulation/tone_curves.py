@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.exact_distributions import DIGITS
-from unprocess_gen.core.types import Float, gamma_text
 from unprocess_gen.simulation.lookup_tables import freeze
 
 PUBLISHED_SHA256 = {
@@ -123,3 +123,22 @@ def store_curves(path: Path) -> None:
 
 if __name__ == "__main__":
     store_curves(STORED_CURVES)
+
+
+def gamma_text(gamma: float | str) -> str:
+    """Return the text of a gamma in the manifest.
+
+    Parameters
+    ----------
+    gamma : float or str
+        Exponent, or ``"srgb"``.
+
+    Returns
+    -------
+    str
+        ``"srgb"``, or the shortest decimal number, such as ``"1"`` or ``"2.2"``.
+    """
+    if gamma == "srgb":
+        return "srgb"
+    number = float(gamma)
+    return str(int(number)) if number.is_integer() else repr(number)

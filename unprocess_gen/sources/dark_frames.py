@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.interpretation import uses_dark_frames
 from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
+from unprocess_gen.core.arrays import Raw
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import SUFFIXES
-from unprocess_gen.core.types import DarkFrame, DarkFrames, Raw
+from unprocess_gen.simulation.facts import DarkFrame, DarkFrames
 from unprocess_gen.sources.raw.mosaics import Mosaic, checked_mosaic, even_sides, read_mosaic
 
 KEY = "noise.dark_frames"

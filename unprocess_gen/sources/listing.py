@@ -32,7 +32,7 @@ from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import absolute_text, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.names import encode_name
 from unprocess_gen.sources.reading import opened, read_bytes

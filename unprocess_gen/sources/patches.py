@@ -13,8 +13,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
+from unprocess_gen.config.interpretation import PatchRule
+from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb
 from unprocess_gen.core.random_streams import patch_words
-from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchRule, Srgb
+from unprocess_gen.simulation.frames import Patch
 
 
 def list_patches(

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import NO_SPACE, array_xxh3, machine_errors
 from unprocess_gen.core.sequences import Recent
-from unprocess_gen.core.types import Srgb
 
 MAPS = 256
 """Files that a process keeps mapped, each with a file descriptor; mapping takes longer than reading a patch."""

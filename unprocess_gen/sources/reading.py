@@ -14,7 +14,7 @@ from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import ObjectChangedError, ObjectPath
 from unprocess_gen.core.paths import LocalPath, NotAFileError, any_path
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.sources.names import encode_name
 
 ReadFile = Callable[[str, Source], bytes]

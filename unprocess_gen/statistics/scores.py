@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.arrays import Float
 
 FALSE_ALARM = 1e-6
 """Probability of any alarm for a dataset, or for captures, whose noise is as expected."""

@@ -9,10 +9,10 @@ import pytest
 from helpers.flats import dead, hot_pixel_means, plan_with, response
 
 from unprocess_gen.core.random_streams import BLOCK
-from unprocess_gen.simulation.effects import Physics
 from unprocess_gen.simulation.kernels import body
 from unprocess_gen.simulation.kernels.body import Body, body_of, forget_bodies
 from unprocess_gen.simulation.kernels.strips import SiteMap
+from unprocess_gen.simulation.plan import Physics
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.slots import NormalPattern, Patterns
 
@@ -36,8 +36,8 @@ def _forgotten() -> Iterator[None]:
 
 def patterns_of(*on: str, **numbers: float) -> tuple[Patterns, Physics]:
     plan = plan_with(*on, **NUMBERS | numbers)
-    assert plan.noise.physics is not None
-    return slots_of(plan).patterns, plan.noise.physics
+    assert plan.physics is not None
+    return slots_of(plan).patterns, plan.physics
 
 
 def means_of(found: Body, shape: tuple[int, int], first: int) -> np.ndarray:

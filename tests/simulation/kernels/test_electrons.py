@@ -16,11 +16,11 @@ from helpers.flats import (
     with_physics,
 )
 
-from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.render import _render
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import Plan
 
 TWO_NUMBERS = {
     "imx385_iso1600": (), "imx385_iso3200": (), "imx385_iso25600": (), "brooks2019": (), "none": (),
@@ -42,14 +42,14 @@ def test_kernels_equal_reference_for_every_profile_and_scene(settings: Settings,
         plan = planned(settings, picture(), *group, f"clean.includes_fixed_pattern={fixed}", forced=forced)
         assert set(EFFECTS) == set(plan.noise.effects) or not forced
         for saturated in ("noisy", "white"):
-            assert_same(picture(), plan.replace(saturated=saturated))
+            assert_same(picture(), plan.replace(saturated_as=saturated))
 
 
 @pytest.mark.parametrize("noise", TWO_NUMBERS)
 def test_kernels_equal_reference_for_poisson_form_of_every_profile(settings: Settings, noise: str) -> None:
     plan = planned(settings, picture(), f"noise={noise}", *TWO_NUMBERS[noise], "noise.law=poisson")
     for saturated, clip in itertools.product(["noisy", "white"], ["sensor", "black"]):
-        assert_same(picture(), plan.replace(saturated=saturated, sensor_clip=clip))
+        assert_same(picture(), plan.replace(saturated_as=saturated, sensor_clip=clip))
 
 
 @pytest.fixture(scope="module")
@@ -75,5 +75,5 @@ def test_pairs_equal_reference_with_and_without_every_effect(everything: Plan, e
     plan = everything.replace(level=3, draw=2, frame=1)
     for on in ([one for one in EFFECTS if one != effect], [effect] if effect else []):
         for saturated, clip in itertools.product(["noisy", "white"], ["sensor", "black"]):
-            one = plan.replace(effects=tuple(on), saturated=saturated, sensor_clip=clip)
+            one = plan.replace(effects=tuple(on), saturated_as=saturated, sensor_clip=clip)
             assert_same(picture(), one, (3, 7))

@@ -18,9 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import colour, unprocess
 from unprocess_gen.simulation.reference import isp as process
 from unprocess_gen.simulation.reference.cfa import PATTERNS, mosaic

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.core import exact_distributions
 from unprocess_gen.core.random_streams import words
-from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects.heteroscedastic import heteroscedastic, noise_variance
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
 
 LAST = 2**31 - 1

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import colour, unprocess
 
 EPS = 2.0**-52

@@ -15,8 +15,9 @@ from helpers.corpus import retagged
 import unprocess_gen as ug
 from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.core.types import Photograph, RawParts
+from unprocess_gen.simulation.facts import RawParts
 from unprocess_gen.simulation.reference.cfa import plane_sites
+from unprocess_gen.sources.photograph import Photograph
 from unprocess_gen.sources.raw.frames import read_raw_source
 
 BLACK = {"R": 500, "G": 509, "B": 523}
@@ -83,7 +84,7 @@ def test_mosaic_is_the_visible_part_with_its_phase(pattern: str) -> None:
 def test_colours_are_those_of_the_white_point() -> None:
     _, raw = read(framed()[1])
     assert (raw.camera.red_gain, raw.camera.blue_gain) == pytest.approx((1 / 0.354571, 1 / 0.703297))
-    assert raw.camera.name == "Test Camera"
+    assert raw.camera.camera == "Test Camera"
     cold = np.reshape((7662, -2686, -660, -5240, 12965, 2530, -796, 1508, 6167), (3, 3)) / 1e4  # white is above 6500 K
     to_xyz = [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
     native = cold @ np.array(to_xyz)

@@ -29,9 +29,10 @@ import numpy as np
 
 from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import Config, SourceConfig
+from unprocess_gen.core.arrays import MOSAIC, Float
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.files import machine_error
-from unprocess_gen.core.types import EXACT, MOSAIC, REFERENCE, TIERS, Float, Pair, Photograph, Plan, Source
+from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.pipeline.progress import Progress
@@ -40,12 +41,15 @@ from unprocess_gen.reports.formatting import counted
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
+from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.kernels.render import render_clean
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan
 from unprocess_gen.simulation.reference.sensor import in_dn
 from unprocess_gen.sources.listing import list_photographs
 from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.photograph import Photograph
 
 LOGGER = logging.getLogger("unprocess_gen")
 

@@ -11,12 +11,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen.core.types import EXACT, FAST, REFERENCE
 from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Measurement
 from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.formatting import percentage, short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE
 
 LINE_LENGTH = 120
 """Width of the printed sentence."""

@@ -11,8 +11,8 @@ from unprocess_gen.config.option_files import conf_dir, group_options, option_su
 from unprocess_gen.config.overrides import override_text
 from unprocess_gen.config.schema import Config, all_settings
 from unprocess_gen.config.settings import Setting
-from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects import EFFECTS
+from unprocess_gen.simulation.plan import Plan
 
 SECTIONS = {
     "Camera": ("body", "camera", "camera.weights"),

@@ -13,22 +13,28 @@ from numpy.typing import NDArray
 from unprocess_gen.config.composition import OptionFolders, composed_config
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config, SourceConfig
+from unprocess_gen.core.arrays import PACKED, Srgb
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.types import PACKED, DarkPixels, Pair, Photograph, Plan, Row, Source, Srgb
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.estimate import SourceEstimate
 from unprocess_gen.reports.plan_text import noise_lines
 from unprocess_gen.reports.sheets.panels import MosaicArray
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.sources.listing import list_photographs
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
+from unprocess_gen.sources.photograph import Photograph
 
 PAIR_FOLDER = "pair"
 """Folder of the dataset that the command of a page makes."""
@@ -142,7 +148,7 @@ def _plan_lines(
         source,
         0.0,
         levels=(plan,),
-        predictions=(levels[plan.noise.level][1],),
+        predictions=(levels[plan.place.level][1],),
     )
     return noise_lines(image.config, [estimate], settings.dark_frames)
 

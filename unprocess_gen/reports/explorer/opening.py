@@ -14,8 +14,9 @@ from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.core.types import NO_CLIP, Row, Source
+from unprocess_gen.core.source import NO_CLIP, Source
 from unprocess_gen.dataset.keys import image_key
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_root
 from unprocess_gen.reports.explorer.exploration import Exploration, listed_sources

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import PACKED, Float
+from unprocess_gen.core.arrays import PACKED, Float
 from unprocess_gen.reports.explorer.exploration import Shown
 from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.reports.sheets import panels
@@ -120,9 +120,9 @@ def raw_histogram(shown: Shown) -> Curves:
 
 def highlight_curves(shown: Shown) -> Curves:
     """Return the function that inverts the gains of each channel, of grey light (the article's Figure 4)."""
-    light, camera = np.linspace(0, 1, 201), shown.plan.camera
+    light, camera, isp = np.linspace(0, 1, 201), shown.plan.camera, shown.plan.isp
     grey = np.repeat(light[:, None], 3, axis=1)
-    inverted = unprocess.invert_gains(grey, camera.inverse_gains, camera.highlight, camera.highlight_threshold)
+    inverted = unprocess.invert_gains(grey, camera.inverse_gains, isp.highlight, isp.highlight_threshold)
     named = zip(("red", "green", "blue"), camera.inverse_gains, strict=True)
     return {f"{name}, {gain:.3g}": (light, inverted[:, channel]) for channel, (name, gain) in enumerate(named)}
 

@@ -14,11 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.types import DarkPixels, Frame, Plan, Row
+from unprocess_gen.core.arrays import Frame
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import Sample
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.reports.noise_check.repeat import measure_noise
 from unprocess_gen.reports.noise_check.scores import Residual, Scores, scores_of
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.statistics.scores import Score, alarm_limit
 
 LEAST_SITES = 64
@@ -137,7 +140,7 @@ class Checker:
     def add(self, clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> None:
         """Check the next pair; one with few usable sites, or whose dark frame is not available, counts as unchecked."""
         plan = plan_from_row(row)
-        is_available = not plan.noise.dark.sha256 or dark_pixels is not None
+        is_available = plan.dark is None or dark_pixels is not None
         noise = measure_noise(clean, noisy, row, dark_pixels) if is_available else None
         if noise is None or np.count_nonzero(noise.weight) < LEAST_SITES:
             self.unchecked += 1

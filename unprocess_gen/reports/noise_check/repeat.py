@@ -12,11 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import DarkPixels, Float, Frame, Patch, Plan, Row
+from unprocess_gen.core.arrays import Float, Frame
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
 from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.effects.hot_pixels import HotPixels
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.frames import Patch
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 from unprocess_gen.statistics.mosaics import TILE
 
@@ -88,7 +92,7 @@ def _hot_sites(plan: Plan, patch: Patch, weight: Float) -> NDArray[np.bool_]:
     if "hot_pixels" not in plan.noise.effects:
         return np.zeros(weight.shape, np.bool_)
     mean_e = HotPixels().mean_electrons(order.crop_of(plan, weight.shape, patch.origin))
-    return np.asarray(mean_e * plan.physics.dn_per_e * weight > 3 * FAR_Z)
+    return np.asarray(mean_e * plan.numbers.dn_per_e * weight > 3 * FAR_Z)
 
 
 def _usable_std(clean_dn: Float, plan: Plan) -> Float:
@@ -111,13 +115,13 @@ def _repetition(clean_dn: Float, plan: Plan, patch: Patch, dark_pixels: DarkPixe
     light_dn = clean_dn
     if not plan.output.clean_normalised:
         light_dn = clean_dn + np.random.default_rng(plan.stream_key).uniform(-0.5, 0.5, clean_dn.shape)
-    if plan.noise.averaged:  # the clean frame contains the fixed patterns
+    if plan.averaged:  # the clean frame contains the fixed patterns
         light_dn = light_dn - (order.average(np.full_like(clean_dn, black_dn), plan, origin) - black_dn)
     noisy_dn = order.noisy(np.clip(light_dn, black_dn, plan.brightest_dn), again, origin, dark_pixels)
-    if plan.noise.physics is not None:
+    if plan.physics is not None:
         line = 1, clean_dn.shape[1]
         own, other = (order.crop_of(of_plan, line, (0, patch.x), dark_pixels) for of_plan in (plan, again))
         for effect in order.effects_of(plan):
             noisy_dn += effect.column_offset_dn(own) - effect.column_offset_dn(other)
-    low_dn, high_dn = noisy_limits(plan.sensor.bits, black_dn, plan.noise.sensor_clip)
+    low_dn, high_dn = noisy_limits(plan.sensor.bits, black_dn, plan.sensor.sensor_clip)
     return np.clip(noisy_dn if plan.output.normalised else np.rint(noisy_dn), low_dn, high_dn)

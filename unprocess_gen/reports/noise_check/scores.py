@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.reports.noise_check.repeat import Noise, Single
 from unprocess_gen.statistics.mosaics import NEIGHBOURS, TILE, plane_names
 from unprocess_gen.statistics.scores import Score
@@ -100,7 +100,7 @@ def _by_row(values: Any) -> Float:
 
 def _row_correlation(noise: Noise) -> float:
     """Size of the correlation of the offsets of neighbouring rows."""
-    physics = noise.plan.noise.physics
+    physics = noise.plan.physics
     return 0.0 if physics is None else abs(physics.row_correlation)
 
 

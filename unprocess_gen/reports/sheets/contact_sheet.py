@@ -20,14 +20,16 @@ from typing import NamedTuple
 import numpy as np
 
 from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import CODE_RANGE, Float, Photograph, Plan, Row, Source, Srgb
+from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
+from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.replay import ADVICE, recorded_source, source_of, source_root
@@ -35,10 +37,12 @@ from unprocess_gen.reports.encoding import picture_png
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.panels import MosaicArray, Picture, SheetPanel, Window
+from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
+from unprocess_gen.sources.photograph import Photograph
 
 PAIRS_SHOWN = 8
 """Number of pairs shown if no keys are given."""
@@ -158,8 +162,8 @@ def _heading(pair: SheetPair, window: Window) -> list[str]:
     return [
         f"{pair.row['key']}   {pair.row['source']}   {width} x {height} {sensor.pattern}, {sensor.bits} bits, black "
         f"{sensor.black_level_dn}, white {sensor.white_level_dn} DN",
-        f"camera {pair.plan.camera.name}, scene {scene.name} (exposure ratio {scene.exposure_ratio:.4g}), noise "
-        f"{noise.name}: {' '.join(noise.effects) or 'no effect'}",
+        f"camera {pair.plan.camera.camera}, scene {scene.scene} (exposure ratio {scene.exposure_ratio:.4g}), noise "
+        f"{noise.noise}: {' '.join(noise.effects) or 'no effect'}",
         f"details: rows {rows.start} to {rows.stop - 1}, columns {columns.start} to {columns.stop - 1}",
     ]
 
@@ -256,7 +260,7 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
     values = unprocess.expand_gamma(values, isp.gamma)
     yield "gamma inverted", f"gamma {isp.gamma}", values
     values = unprocess.apply_ccm(values, camera.rgb2cam)
-    yield "colour matrix inverted", f"camera {camera.name}", values
+    yield "colour matrix inverted", f"camera {camera.camera}", values
     gains = ", ".join(f"{gain:.3g}" for gain in camera.inverse_gains)
-    values = unprocess.invert_gains(values, camera.inverse_gains, camera.highlight, camera.highlight_threshold)
-    yield "gains inverted", f"times {gains}; highlights {camera.highlight}", values
+    values = unprocess.invert_gains(values, camera.inverse_gains, isp.highlight, isp.highlight_threshold)
+    yield "gains inverted", f"times {gains}; highlights {isp.highlight}", values

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Float, Frame
+from unprocess_gen.core.arrays import Float, Frame
 from unprocess_gen.simulation.reference.cfa import MONO, tile
 from unprocess_gen.statistics.mosaics import planes_of
 

@@ -1,34 +1,35 @@
 """Effects of the sensor: a module for each, with everything that the program knows of it.
 
-To add an effect, write its module, name its class in `EFFECTS` and its numbers in `Physics`, and give its random stream
-a number in `random_streams.STREAMS`.
+To add an effect, write its module, name its class in `EFFECTS`, declare its numbers in `plan.Physics`, and give its
+random stream a number in `random_streams.STREAMS`.
 """
 
 from __future__ import annotations
 
 import math
 
-from unprocess_gen.core.types import Facts, Plan
-from unprocess_gen.simulation.effects.black_error import BlackError, BlackErrorNumbers
-from unprocess_gen.simulation.effects.column import ColumnNoise, ColumnNumbers
-from unprocess_gen.simulation.effects.column_temporal import ColumnTemporal, ColumnTemporalNumbers
-from unprocess_gen.simulation.effects.dark_current import DarkCurrent, DarkCurrentNumbers
+from unprocess_gen.simulation.effects.black_error import BlackError
+from unprocess_gen.simulation.effects.column import ColumnNoise
+from unprocess_gen.simulation.effects.column_temporal import ColumnTemporal
+from unprocess_gen.simulation.effects.dark_current import DarkCurrent
 from unprocess_gen.simulation.effects.dark_frame import DarkFrameNoise
-from unprocess_gen.simulation.effects.dead_pixels import DeadPixelNumbers, DeadPixels
-from unprocess_gen.simulation.effects.dsnu import Dsnu, DsnuNumbers
+from unprocess_gen.simulation.effects.dead_pixels import DeadPixels
+from unprocess_gen.simulation.effects.dsnu import Dsnu
 from unprocess_gen.simulation.effects.effect import Effect
-from unprocess_gen.simulation.effects.full_well import FullWell, FullWellNumbers
-from unprocess_gen.simulation.effects.gain_by_colour import GainByColour, GainByColourNumbers
+from unprocess_gen.simulation.effects.full_well import FullWell
+from unprocess_gen.simulation.effects.gain_by_colour import GainByColour
 from unprocess_gen.simulation.effects.heteroscedastic import Heteroscedastic
-from unprocess_gen.simulation.effects.hot_pixels import HotPixelNumbers, HotPixels
-from unprocess_gen.simulation.effects.lens_shading import LensShading, LensShadingNumbers
-from unprocess_gen.simulation.effects.numbers import Number
+from unprocess_gen.simulation.effects.hot_pixels import HotPixels
+from unprocess_gen.simulation.effects.lens_shading import LensShading
 from unprocess_gen.simulation.effects.prediction import FrameFacts
-from unprocess_gen.simulation.effects.prnu import Prnu, PrnuNumbers
+from unprocess_gen.simulation.effects.prnu import Prnu
 from unprocess_gen.simulation.effects.quantise import Quantise
-from unprocess_gen.simulation.effects.read import ReadNoise, ReadNumbers
-from unprocess_gen.simulation.effects.row import RowNoise, RowNumbers
-from unprocess_gen.simulation.effects.shot import Shot, ShotNumbers
+from unprocess_gen.simulation.effects.read import ReadNoise
+from unprocess_gen.simulation.effects.row import RowNoise
+from unprocess_gen.simulation.effects.shot import Shot
+from unprocess_gen.simulation.facts import Facts
+from unprocess_gen.simulation.numbers import Number
+from unprocess_gen.simulation.plan import Plan
 
 EFFECTS: tuple[Effect, ...] = (
     *(Heteroscedastic(), LensShading(), Prnu(), Shot(), DarkCurrent(), HotPixels(), FullWell()),  # in electrons
@@ -44,9 +45,6 @@ PHYSICAL_EFFECTS = tuple(effect.name for effect in EFFECTS if effect.name not in
 
 REPLACED = tuple(effect.name for effect in EFFECTS if effect.is_in_dark_frames)
 """Effects whose noise a dark frame contains."""
-
-NUMBERS: dict[str, Number] = {name: number for effect in EFFECTS for name, number in effect.declared.items()}
-"""Numbers of all effects by the names of their fields."""
 
 
 def profile_keys() -> dict[str, tuple[Effect, Number]]:
@@ -64,39 +62,6 @@ def profile_keys() -> dict[str, tuple[Effect, Number]]:
     }
 
 
-class Physics(
-    LensShadingNumbers, PrnuNumbers, ShotNumbers, DarkCurrentNumbers, HotPixelNumbers, FullWellNumbers,
-    GainByColourNumbers, ReadNumbers, RowNumbers, ColumnNumbers, ColumnTemporalNumbers, BlackErrorNumbers,
-    DsnuNumbers, DeadPixelNumbers,
-):  # fmt: skip
-    """Numbers of a physical noise profile for one scene and sensor: the numbers of its effects, and the following.
-
-    Attributes
-    ----------
-    iso, exposure_s, temperature_c : float
-        The scene: ISO, exposure time (s) and sensor temperature (°C).
-    dark_offset : str
-        ``"removed"`` if the camera subtracts the mean dark signal, else ``"kept"``.
-    sensor_unit : str
-        Name of the camera body.
-    body_key : int
-        Key of the body's fixed patterns (`random_streams.body_key`).
-    fixed_pattern_in_clean : bool
-        Whether the clean frame contains the fixed patterns too.
-    frame_size : (int, int)
-        Height and width of the full frame if its lens shading is known, else 0; pixels.
-    """
-
-    iso: float
-    exposure_s: float
-    temperature_c: float
-    dark_offset: str
-    sensor_unit: str
-    body_key: int
-    fixed_pattern_in_clean: bool
-    frame_size: tuple[int, int] = (0, 0)
-
-
 def dark_variance_dn2(plan: Plan) -> float:
     """Return the variance of the noise of a site at black, by all simulated effects except outliers and rounding.
 
@@ -111,14 +76,14 @@ def dark_variance_dn2(plan: Plan) -> float:
         DN²; b of a profile with two numbers. Hot and dead pixels are left out: few sites would decide the variance of
         all. So are fixed patterns that the clean frame contains.
     """
-    noise = plan.noise
-    if noise.physics is None:
+    noise, physics = plan.noise, plan.physics
+    if physics is None:
         return noise.b_dn2 if "heteroscedastic" in noise.effects else 0.0
-    frame = FrameFacts(noise.physics, Facts(width=1, height=1, codes=1, dark_code=0, bright_code=0), 0.0)
+    frame = FrameFacts(physics, Facts(width=1, height=1, codes=1, dark_code=0, bright_code=0), 0.0)
     in_the_dark = {"read", *(name for name, effect in BY_NAME.items() if effect.is_in_dark_frames)}
     variances = (
         BY_NAME[name].contribution(frame, 0.0, math.inf).variances[0]
         for name in ("read" if effect == "dark_frame" else effect for effect in noise.effects)
-        if name in in_the_dark and not BY_NAME[name].has_outliers and not (BY_NAME[name].is_fixed and noise.averaged)
+        if name in in_the_dark and not BY_NAME[name].has_outliers and not (BY_NAME[name].is_fixed and plan.averaged)
     )
     return sum(variances, 0.0)

@@ -2,29 +2,10 @@
 
 from __future__ import annotations
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import LARGEST, SITES, EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-
-
-class BlackErrorNumbers(EffectNumbers):
-    """Black-level errors of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the 2x2 tile, DN."""
-
-    black_error_dn: tuple[float, float, float, float] = number(
-        (0.0, 0.0, 0.0, 0.0),
-        "error of the black level",
-        unit="DN",
-        kind=SITES,
-        by_iso=True,
-        count=4,
-        columns={
-            f"black_error_dn_{i}{j}": f"black-level error of the 2x2 CFA pattern, row {i}, column {j}"
-            for i in range(2)
-            for j in range(2)
-        },
-        lowest=-LARGEST,
-    )
+from unprocess_gen.simulation.plan import Plan
 
 
 class BlackError(Effect):
@@ -32,7 +13,7 @@ class BlackError(Effect):
 
     name = "black_error"
     meaning = "difference between black and the black level, by CFA site; fixed pattern"
-    numbers = BlackErrorNumbers
+    numbers = ("black_error_dn",)
     is_fixed = is_in_dark_frames = True
 
     def plane_offset_dn(self, crop: Crop) -> Float:
@@ -45,4 +26,4 @@ class BlackError(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets by plane."""
-        return {"planes_dn": plan.physics.black_error_dn}
+        return {"planes_dn": plan.numbers.black_error_dn}

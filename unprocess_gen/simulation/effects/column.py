@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import LineOffsets, SlotWords
-
-
-class ColumnNumbers(EffectNumbers):
-    """Standard deviation of column offsets, DN."""
-
-    column_std_dn: float = number_in_dn("standard deviation of column offsets", by_iso=True, counter=3)
 
 
 class ColumnNoise(Effect):
@@ -23,7 +17,7 @@ class ColumnNoise(Effect):
 
     name = "column"
     meaning = "an offset of each column; fixed pattern"
-    numbers = ColumnNumbers
+    numbers = ("column_std_dn",)
     is_fixed = is_in_dark_frames = True
 
     def column_offset_dn(self, crop: Crop) -> Float:
@@ -37,5 +31,5 @@ class ColumnNoise(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the body."""
-        physics = plan.physics
+        physics = plan.numbers
         return {"fixed_columns": LineOffsets(SlotWords(physics.body_key, "column"), physics.column_std_dn)}

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import LineOffsets
-
-
-class ColumnTemporalNumbers(EffectNumbers):
-    """Standard deviation of the temporal column offsets, DN."""
-
-    column_temporal_std_dn: float = number_in_dn(
-        "standard deviation of the part of column offsets that is new in every frame",
-        by_iso=True,
-        counter=4,
-    )
 
 
 class ColumnTemporal(Effect):
@@ -27,7 +17,7 @@ class ColumnTemporal(Effect):
 
     name = "column_temporal"
     meaning = "an offset of each column, new in every frame"
-    numbers = ColumnTemporalNumbers
+    numbers = ("column_temporal_std_dn",)
     is_in_dark_frames = True
 
     def column_offset_dn(self, crop: Crop) -> Float:
@@ -41,5 +31,5 @@ class ColumnTemporal(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the frame."""
-        std_dn = plan.physics.column_temporal_std_dn
+        std_dn = plan.numbers.column_temporal_std_dn
         return {"columns": LineOffsets(slot_words(plan, "column_temporal"), std_dn)}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, Number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.numbers import Number
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import UniformCounts
 
@@ -30,22 +31,12 @@ HEAT = {
 """Keys of the profile from which the warmth of the sensor follows."""
 
 
-class DarkCurrentNumbers(EffectNumbers):
-    """Mean dark signal of the exposure, electrons."""
-
-    dark_e: float = rate(
-        "mean dark current of the exposure",
-        key="dark_e_per_s",
-        key_meaning="mean dark current at dark_reference_c",
-    )
-
-
 class DarkCurrent(Effect):
     """Dark signal; the camera subtracts its mean with optical-black pixels, unless ``dark_offset`` is ``"kept"``."""
 
     name = "dark_current"
     meaning = "Poisson counts of thermal electrons"
-    numbers = DarkCurrentNumbers
+    numbers = ("dark_e",)
     keys = HEAT
     heat = is_before_well = is_in_dark_frames = masks = True
 
@@ -71,6 +62,6 @@ class DarkCurrent(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the counts of one rate."""
-        physics = plan.physics
+        physics = plan.numbers
         removed_e = physics.dark_e if physics.dark_offset == "removed" else 0.0
         return {"uniform": UniformCounts("dark_current", physics.dark_e, removed_e)}

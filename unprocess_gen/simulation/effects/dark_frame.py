@@ -8,9 +8,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import DarkPixels, Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
+from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.lookup_tables import quantile_table
+from unprocess_gen.simulation.plan import DarkFramePlan, Plan
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 
@@ -18,9 +20,15 @@ DITHER_LAW, DITHER_SHAPE = "tukey_lambda", 1.0
 """Uniform distribution, as Tukey's lambda distribution of shape 1."""
 
 
+def dark_of(plan: Plan) -> DarkFramePlan:
+    """Return the dark frame of a plan, which must have one."""
+    assert plan.dark is not None
+    return plan.dark
+
+
 def dither_std_dn(plan: Plan) -> float:
     """Return the standard deviation of the dither of a dark frame, DN: uniform in ±½ DN of the dark frame."""
-    return plan.noise.dark.scale / math.sqrt(12)
+    return dark_of(plan).dark_scale / math.sqrt(12)
 
 
 def dark_frame_offsets(
@@ -57,11 +65,12 @@ def dark_frame_offsets(
     ValueError
         If ``dark_pixels`` is None.
     """
-    dark = plan.noise.dark
+    dark = dark_of(plan)
     if dark_pixels is None:
-        raise ValueError(f"dark_pixels=None: the plan needs the dark frame {dark.sha256}; expected access to it")
+        raise ValueError(f"dark_pixels=None: the plan needs the dark frame {dark.dark_frame}; expected access to it")
     out = np.empty((shape[0], shape[1]), dtype=np.float32) if out is None else out
-    frame, black, scale = dark_pixels.frame(dark.sha256), np.float32(dark.black_dn), np.float32(dark.scale)
+    frame = dark_pixels.frame(dark.dark_frame)
+    black, scale = np.float32(dark.dark_black_dn), np.float32(dark.dark_scale)
     for y, from_y, rows in _runs(origin[0] + dark.shift[0], shape[0], frame.shape[0]):
         for x, from_x, columns in _runs(origin[1] + dark.shift[1], shape[1], frame.shape[1]):
             part, source = out[y : y + rows, x : x + columns], np.s_[from_y : from_y + rows, from_x : from_x + columns]

@@ -6,28 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.slots import DeadSlot
 
 if TYPE_CHECKING:
-    from unprocess_gen.simulation.effects import Physics
-
-
-class DeadPixelNumbers(EffectNumbers):
-    """Fraction of dead pixels, and the value that they read."""
-
-    dead_pixel_share: float = number(0.0, "fraction of dead pixels", high=1.0, highest=1.0)
-    dead_pixel_level: float = number(
-        0.0,
-        "value of dead pixels as a fraction of the black level; part of the effect dead_pixels",
-        high=1.0,
-        optional="0 DN",
-        highest=1.0,
-    )
+    from unprocess_gen.simulation.plan import Physics
 
 
 class DeadPixels(Effect):
@@ -38,7 +25,7 @@ class DeadPixels(Effect):
 
     name = "dead_pixels"
     meaning = "few pixels that record no light; fixed pattern"
-    numbers = DeadPixelNumbers
+    numbers = ("dead_pixel_share", "dead_pixel_level")
     is_fixed = has_outliers = True
 
     def output_dn(self, noisy_dn: Float, crop: Crop) -> Float:
@@ -59,7 +46,7 @@ class DeadPixels(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the dead pixels."""
-        physics = plan.physics
+        physics = plan.numbers
         dead_dn = dead_pixel_dn(physics, plan.sensor.black_level_dn)
         return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share, dead_dn)}
 

@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import NormalPattern
-
-
-class DsnuNumbers(EffectNumbers):
-    """Standard deviation of the pixels' offsets, electrons."""
-
-    dsnu_std_e: float = number(
-        0.0,
-        "standard deviation of the dark-signal non-uniformity (DSNU), whose mean is 0",
-        unit="electrons",
-        high=1e6,
-        highest=1e9,
-    )
 
 
 class Dsnu(Effect):
@@ -29,7 +17,7 @@ class Dsnu(Effect):
 
     name = "dsnu"
     meaning = "unequal offsets of pixels; fixed pattern"
-    numbers = DsnuNumbers
+    numbers = ("dsnu_std_e",)
     is_fixed = is_in_dark_frames = True
 
     def site_offset_dn(self, crop: Crop) -> Float:
@@ -45,5 +33,5 @@ class Dsnu(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets by site of the body."""
-        physics = plan.physics
+        physics = plan.numbers
         return {"sites_dn": NormalPattern(physics.body_key, "dsnu", physics.dsnu_std_e * physics.dn_per_e)}

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import Words, words
-from unprocess_gen.core.types import DarkPixels, Float, Plan
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, Number, numbers_of
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.numbers import Number
+from unprocess_gen.simulation.plan import NUMBERS, Physics, Plan
 from unprocess_gen.simulation.slots import SlotWords
-
-if TYPE_CHECKING:
-    from unprocess_gen.simulation.effects import Physics
 
 Shape = tuple[int, int]
 SlotValues = dict[str, Any]
@@ -25,9 +24,9 @@ SlotValues = dict[str, Any]
 
 def frame_words(plan: Plan, stream: str, shape: tuple[int, ...], origin: Shape = (0, 0)) -> Words:
     """Return the random words of a plan's frame, level and draw, [H, W]."""
-    noise = plan.noise
-    place = {"frame": noise.frame_word, "level": noise.level, "draw": noise.draw}
-    return words(plan.stream_key, stream, (shape[0], shape[1]), origin=origin, **place)
+    place = plan.place
+    numbers = {"frame": place.frame_word, "level": place.level, "draw": place.draw}
+    return words(plan.stream_key, stream, (shape[0], shape[1]), origin=origin, **numbers)
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Crop:
 
 def slot_words(plan: Plan, stream: str) -> SlotWords:
     """Return the random words of a plan's frame, level and draw for a slot."""
-    return SlotWords(plan.stream_key, stream, plan.noise.level, plan.noise.draw, plan.noise.frame_word)
+    return SlotWords(plan.stream_key, stream, plan.place.level, plan.place.draw, plan.place.frame_word)
 
 
 class Effect:
@@ -85,8 +84,8 @@ class Effect:
         Name in settings and rows, and of its random stream in `random_streams.STREAMS`.
     meaning : str
         One phrase for users.
-    numbers : type
-        Dataclass of the numbers.
+    numbers : tuple of str
+        Fields of `plan.Physics` that hold its numbers.
     keys : mapping of str to Number
         Keys of the profile from which no field of `Physics` follows directly.
     heat : bool
@@ -110,7 +109,7 @@ class Effect:
 
     name: ClassVar[str]
     meaning: ClassVar[str]
-    numbers: ClassVar[type[EffectNumbers]] = EffectNumbers
+    numbers: ClassVar[tuple[str, ...]] = ()
     keys: ClassVar[Mapping[str, Number]] = {}
     heat: ClassVar[bool] = False
     has_switch: ClassVar[bool] = True
@@ -124,7 +123,7 @@ class Effect:
     @property
     def declared(self) -> dict[str, Number]:
         """Numbers by the names of their fields."""
-        return numbers_of(self.numbers)
+        return {name: NUMBERS[name] for name in self.numbers}
 
     def light_factor(self, crop: Crop) -> Float | None:
         """Return the factor on the light of the clean frame, [H, W] of float32 values; None if it is 1."""

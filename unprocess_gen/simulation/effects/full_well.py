@@ -6,19 +6,13 @@ import math
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.plan import Plan
 
 FARTHEST_NORMAL, FARTHEST_HOT = 6.4, 7.7
 """Largest normal deviate in standard deviations, and largest hot-pixel current in means, of a 32-bit uniform."""
-
-
-class FullWellNumbers(EffectNumbers):
-    """Saturation capacity, electrons."""
-
-    full_well_e: float = number(0.0, "saturation capacity", unit="electrons", low=1.0, high=1e9, highest=1e9)
 
 
 class FullWell(Effect):
@@ -26,7 +20,7 @@ class FullWell(Effect):
 
     name = "full_well"
     meaning = "saturation capacity, at which the clean and the noisy frame are clipped"
-    numbers = FullWellNumbers
+    numbers = ("full_well_e",)
 
     def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Limit the electrons."""
@@ -44,7 +38,7 @@ class FullWell(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the limit of the well."""
-        return {"full_well_e": plan.physics.full_well_e}
+        return {"full_well_e": plan.numbers.full_well_e}
 
 
 def _reach(mean_e: float) -> float:

@@ -4,28 +4,12 @@ from __future__ import annotations
 
 import math
 
-from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.effect import Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import tile
 
 COLOURS = ("red", "green", "blue")
-
-
-class GainByColourNumbers(EffectNumbers):
-    """System gain of red, green and blue, relative to ``dn_per_e``."""
-
-    gain_by_colour: tuple[float, float, float] = number(
-        (1.0, 1.0, 1.0),
-        "system gain of red, green and blue, relative to dn_per_e",
-        low=0.1,
-        high=10.0,
-        count=3,
-        columns={f"gain_{colour[0]}": f"system gain of {colour}, relative to dn_per_e" for colour in COLOURS},
-        lowest=0.1,
-        highest=10.0,
-    )
 
 
 class GainByColour(Effect):
@@ -33,11 +17,11 @@ class GainByColour(Effect):
 
     name = "gain_by_colour"
     meaning = "a system gain of its own for each colour"
-    numbers = GainByColourNumbers
+    numbers = ("gain_by_colour",)
 
     def plane_gains(self, plan: Plan) -> tuple[float, ...]:
         """Return the gain of the colour of each site of the tile; the gain of green for a sensor without filters."""
-        return tuple(plan.physics.gain_by_colour[channel] for row in tile(plan.sensor.pattern) for channel in row)
+        return tuple(plan.numbers.gain_by_colour[channel] for row in tile(plan.sensor.pattern) for channel in row)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict a change of the shot noise: its standard deviation differs by a factor √gain."""

@@ -8,25 +8,14 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.lookup_tables import exponential_levels
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import BrightPixels
-
-
-class HotPixelNumbers(EffectNumbers):
-    """Fraction of hot pixels, and the mean of their exponentially distributed excess, electrons per exposure."""
-
-    hot_pixel_share: float = number(0.0, "fraction of hot pixels", high=1.0, highest=1.0)
-    hot_pixel_e: float = rate(
-        "mean excess of a hot pixel in the exposure",
-        key="hot_pixel_e_per_s",
-        key_meaning="mean of the exponentially distributed current of hot pixels at dark_reference_c",
-    )
 
 
 class HotPixels(Effect):
@@ -34,7 +23,7 @@ class HotPixels(Effect):
 
     name = "hot_pixels"
     meaning = "few pixels with a far larger dark current; fixed pattern"
-    numbers = HotPixelNumbers
+    numbers = ("hot_pixel_share", "hot_pixel_e")
     heat = is_fixed = is_before_well = is_in_dark_frames = has_outliers = True
 
     def electrons(self, electrons: Float, crop: Crop) -> Float:
@@ -63,7 +52,7 @@ class HotPixels(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the bright defects."""
-        physics = plan.physics
+        physics = plan.numbers
         return {"bright": BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)}
 
 

@@ -9,34 +9,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.slots import RadialFactor
 
 PLACES = 64
 """Squares of the distance from the centre at which lens shading is predicted."""
 
 Coefficients = tuple[float, float, float]
-
-
-class LensShadingNumbers(EffectNumbers):
-    """Coefficients of r², r⁴ and r⁶ in the relative illumination; r is 1 in the corners."""
-
-    lens_shading: tuple[float, float, float] = number(
-        (0.0, 0.0, 0.0),
-        "relative illumination 1 + k1 r² + k2 r⁴ + k3 r⁶ as [k1, k2, k3]; r is the distance from the centre of the "
-        "full frame, 1 in the corners",
-        low=-10.0,
-        high=10.0,
-        count=3,
-        columns={
-            f"lens_shading_{power}": f"coefficient of r^{power} in the relative illumination" for power in (2, 4, 6)
-        },
-        lowest=-10.0,
-        highest=10.0,
-    )
 
 
 def illumination_at(square: Float, coefficients: Coefficients) -> Float:
@@ -92,7 +74,7 @@ class LensShading(Effect):
 
     name = "lens_shading"
     meaning = "less light towards the corners, in the clean and the noisy frame"
-    numbers = LensShadingNumbers
+    numbers = ("lens_shading",)
     in_both_frames = True
 
     def light_factor(self, crop: Crop) -> Float:
@@ -107,4 +89,4 @@ class LensShading(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the factor on the light."""
-        return {"light": RadialFactor(plan.physics.lens_shading, plan.physics.frame_size)}
+        return {"light": RadialFactor(plan.numbers.lens_shading, plan.numbers.frame_size)}

@@ -13,10 +13,12 @@ from operator import mul
 
 import numpy as np
 
-from unprocess_gen.core.types import DarkPixels, Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects import EFFECTS
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape
 from unprocess_gen.simulation.effects.heteroscedastic import heteroscedastic
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.plan import Plan
 
 
 def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: DarkPixels | None = None) -> Float:
@@ -38,7 +40,7 @@ def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: Dark
     ndarray of float64, [H, W]
         Noisy frame, DN, not clipped.
     """
-    if plan.noise.physics is None:
+    if plan.physics is None:
         return heteroscedastic(clean_dn, plan, origin) if "heteroscedastic" in plan.noise.effects else clean_dn
     crop = crop_of(plan, clean_dn.shape, origin, dark_pixels)
     effects, black_dn, gain = effects_of(plan), plan.sensor.black_level_dn, crop.physics.dn_per_e * crop.relative_gain
@@ -82,7 +84,7 @@ def crop_of(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0), dark_pix
     Crop
         With the gains of its sites.
     """
-    physics = plan.physics
+    physics = plan.numbers
     crop = Crop(plan, physics, (shape[0], shape[1]), origin, dark_pixels)
     for effect in effects_of(plan):
         if (gains := effect.plane_gains(plan)) is not None:
@@ -134,7 +136,7 @@ def light_factor(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0)) -> 
     ndarray of float64, [H, W], or None
         Values of float32; None if nothing changes the light.
     """
-    if plan.noise.physics is None:
+    if plan.physics is None:
         return None
     crop = crop_of(plan, shape, origin)
     factors = [factor for effect in effects_of(plan) if (factor := effect.light_factor(crop)) is not None]

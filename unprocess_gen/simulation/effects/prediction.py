@@ -11,10 +11,10 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from unprocess_gen.core.types import Facts
+from unprocess_gen.simulation.facts import Facts
 
 if TYPE_CHECKING:
-    from unprocess_gen.simulation.effects import Physics
+    from unprocess_gen.simulation.plan import Physics
 
 STATISTICS = (
     *("pixel", "row mean", "column mean", "plane mean"),

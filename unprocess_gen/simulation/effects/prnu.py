@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, independent
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import NormalPattern
-
-
-class PrnuNumbers(EffectNumbers):
-    """Standard deviation of the pixels' relative gain."""
-
-    prnu_std: float = number(
-        0.0, "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1", high=0.5, highest=1.0
-    )
 
 
 class Prnu(Effect):
@@ -25,7 +17,7 @@ class Prnu(Effect):
 
     name = "prnu"
     meaning = "unequal response of pixels; fixed pattern"
-    numbers = PrnuNumbers
+    numbers = ("prnu_std",)
     is_fixed = is_before_well = True
 
     def response(self, crop: Crop) -> Float:
@@ -56,5 +48,5 @@ class Prnu(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the factor on the electrons."""
-        physics = plan.physics
+        physics = plan.numbers
         return {"electrons": NormalPattern(physics.body_key, "prnu", physics.prnu_std, mean=1.0, least=0.0)}

@@ -2,39 +2,13 @@
 
 from __future__ import annotations
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
-from unprocess_gen.simulation.effects.numbers import SHAPE, EffectNumbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.lookup_tables import quantile_table
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
-
-
-class ReadNumbers(EffectNumbers):
-    """Distribution of the read noise, shape of Tukey's lambda, and standard deviation, DN."""
-
-    read_law: str = number(
-        "gaussian",
-        "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45",
-        words=("gaussian", "tukey_lambda"),
-        key_default="gaussian",
-    )
-    read_shape: float = number(
-        0.0,
-        "shape of Tukey's lambda distribution",
-        kind=SHAPE,
-        by_iso=True,
-        key_default=0.0,
-        lowest=-0.5,
-        highest=10.0,
-    )
-    read_std_dn: float = number_in_dn(
-        "standard deviation of the read noise",
-        by_iso=True,
-        required=True,
-        counter=1,
-    )
 
 
 class ReadNoise(Effect):
@@ -42,7 +16,7 @@ class ReadNoise(Effect):
 
     name = "read"
     meaning = "noise of the amplifier and the converter"
-    numbers = ReadNumbers
+    numbers = ("read_law", "read_shape", "read_std_dn")
     masks = True
 
     def noise_dn(self, crop: Crop) -> Float:
@@ -57,5 +31,5 @@ class ReadNoise(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site."""
-        physics = plan.physics
+        physics = plan.numbers
         return {"noise": SiteNoise("read", physics.read_std_dn, physics.read_law, physics.read_shape)}

@@ -4,27 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
-from unprocess_gen.simulation.effects.numbers import EffectNumbers, number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
 from unprocess_gen.simulation.slots import LineOffsets
-
-
-class RowNumbers(EffectNumbers):
-    """Standard deviation of row offsets, DN, and correlation of the offsets of neighbouring rows."""
-
-    row_std_dn: float = number_in_dn("standard deviation of row offsets", by_iso=True, counter=2)
-    row_correlation: float = number(
-        0.0,
-        "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the effect row",
-        low=-0.999,
-        high=0.999,
-        optional="independent rows",
-        lowest=-0.999,
-        highest=0.999,
-    )
 
 
 class RowNoise(Effect):
@@ -37,7 +22,7 @@ class RowNoise(Effect):
 
     name = "row"
     meaning = "an offset of each row, new in every frame"
-    numbers = RowNumbers
+    numbers = ("row_std_dn", "row_correlation")
     is_in_dark_frames = True
 
     def row_offset_dn(self, crop: Crop) -> Float:
@@ -60,5 +45,5 @@ class RowNoise(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of rows."""
-        physics = plan.physics
+        physics = plan.numbers
         return {"rows": LineOffsets(slot_words(plan, "row"), physics.row_std_dn, physics.row_correlation)}

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues, frame_words
-from unprocess_gen.simulation.effects.numbers import DN, EffectNumbers, number
 from unprocess_gen.simulation.effects.prediction import FrameFacts
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.poisson import poisson
-
-
-class ShotNumbers(EffectNumbers):
-    """System gain K, DN per electron."""
-
-    dn_per_e: float = number(
-        1.0, "system gain K", unit="DN per electron", kind=DN, by_iso=True, required=True, highest=1e20
-    )
 
 
 def counts(plan: Plan, electrons: Float, origin: Shape = (0, 0)) -> Float:
@@ -27,7 +19,7 @@ class Shot(Effect):
 
     name = "shot"
     meaning = "Poisson counts of electrons"
-    numbers = ShotNumbers
+    numbers = ("dn_per_e",)
     is_before_well = masks = True
 
     def electrons(self, electrons: Float, crop: Crop) -> Float:

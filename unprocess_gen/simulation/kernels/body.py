@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import BLOCK, purpose
-from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.effects.lens_shading import illumination
 from unprocess_gen.simulation.kernels import simd
 from unprocess_gen.simulation.kernels.jit import kernel

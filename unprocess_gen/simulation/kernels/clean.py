@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.kernels import simd, strips
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.jit import by_class, inner
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 from unprocess_gen.simulation.kernels.strips import Buffers, SiteMap, Strip, count_outside, strip_values
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import tile
 from unprocess_gen.simulation.tone_curves import linear_table
 
@@ -49,11 +49,11 @@ def is_steep(plan: Plan) -> bool:
     The light of a channel is i · (gain + headroom · m²) with m = (i - threshold) / (1 - threshold). Here i is the sum
     of table entries times one row of the matrix. The limits are `MAX_ERROR_GAIN` and `MAX_HIGHLIGHT_ERROR_GAIN`.
     """
-    camera, exposure = plan.camera, plan.scene.exposure
+    camera, isp, exposure = plan.camera, plan.isp, plan.scene.exposure
     if plan.source.is_raw:  # its light has no colours and gains
         return exposure > MAX_ERROR_GAIN
     rows = [sum(abs(entry) for entry in camera.rgb2cam[start : start + 3]) * exposure for start in (0, 3, 6)]
-    highlights = 0.0 if camera.highlight == "none" else 1 + 2 / (1 - camera.highlight_threshold)
+    highlights = 0.0 if isp.highlight == "none" else 1 + 2 / (1 - isp.highlight_threshold)
     return any(
         row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN
         for row, gain in zip(rows, camera.inverse_gains, strict=True)
@@ -114,7 +114,7 @@ def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -
     scale = tuple(gain * exposure * span_dn if in_float32 else 1.0 for gain in gains)
     numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
     limits, light_per_signal, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
-    divisor = 1 - camera.highlight_threshold
+    divisor = 1 - plan.isp.highlight_threshold
     products = _raw_products(plan, codes) if is_raw else _products(plan, codes)
     if in_float32 and not gray_mean:
         products *= np.array(scale)[:, None, None]
@@ -124,7 +124,7 @@ def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -
         site_channels=channels,
         inverse_gains=np.array(camera.inverse_gains, dtype=f),
         gray_mean=gray_mean,
-        highlight_threshold=f(camera.highlight_threshold),
+        highlight_threshold=f(plan.isp.highlight_threshold),
         divisor=f(1 if in_float32 else divisor),
         steepness=f(1 / divisor if in_float32 else 1),
         one=f(1),
@@ -178,12 +178,12 @@ def _site_gains(plan: Plan) -> tuple[float, ...]:
 
 
 def _uses_gray_mean(plan: Plan) -> bool:
-    return plan.camera.highlight == "gray_mean" and not plan.source.is_raw
+    return plan.isp.highlight == "gray_mean" and not plan.source.is_raw
 
 
 def _headroom(plan: Plan) -> list[float]:
     """Return the factor of the per-channel highlight term by channel; 0 without the term."""
-    has_term = plan.camera.highlight == "per_channel"
+    has_term = plan.isp.highlight == "per_channel"
     return [max(1 - gain, 0.0) if has_term else 0.0 for gain in _site_gains(plan)]
 
 
@@ -193,7 +193,7 @@ def _linear_limit(plan: Plan) -> float:
     if light < 0:  # black rounds to the DN of the full well, so all sites count as saturated
         return -np.inf
     unclipped = min(1.0, light / plan.scene.exposure) / max(_site_gains(plan)) * 0.999
-    return min(unclipped, plan.camera.highlight_threshold) if any(_headroom(plan)) else unclipped
+    return min(unclipped, plan.isp.highlight_threshold) if any(_headroom(plan)) else unclipped
 
 
 @functools.lru_cache(maxsize=16)

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import BLOCK, purpose, words
-from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects.dark_frame import dark_frame_offsets
+from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.kernels.body import NO_OFFSETS, WITHOUT_PATTERNS, Body
 from unprocess_gen.simulation.kernels.electrons import FLOAT32_ERROR_DN, MAX_STEPS, Electrons, FrameNumbers
 from unprocess_gen.simulation.kernels.normal import Quantiles, build_quantiles, normal_quantiles
@@ -23,6 +24,7 @@ from unprocess_gen.simulation.kernels.poisson import MAX_THRESHOLD_RATE, count_t
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH
 from unprocess_gen.simulation.kernels.strips import SiteMap, padded_width
 from unprocess_gen.simulation.lookup_tables import quantile_table
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
 from unprocess_gen.simulation.slots import LineOffsets, SiteNoise, Slots, SlotWords, UniformCounts
 

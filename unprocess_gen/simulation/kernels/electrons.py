@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.body import Body
 from unprocess_gen.simulation.kernels.jit import inner

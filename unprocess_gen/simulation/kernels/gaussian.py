@@ -15,13 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import purpose
-from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer
 from unprocess_gen.simulation.kernels.strips import SIZE, Buffers, Float32, Strip
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.plan_slots import NORMAL_STREAM
 
 NORMAL_PURPOSE = np.uint64(purpose(NORMAL_STREAM))

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.kernels import simd
 from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, LOW, MULTIPLIERS, ROUNDS
-from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.simd import Pointer
 from unprocess_gen.simulation.kernels.strips import Strip
+from unprocess_gen.simulation.plan import Plan
 
 LOW32, _32, _LANES = np.uint64(LOW), np.uint64(32), np.uint64(LANES)
 KEY_STEP0, KEY_STEP1 = (np.uint64(step) for step in KEY_STEPS)
@@ -35,7 +35,7 @@ def philox_key(key: int) -> PhiloxKey:
 def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
     """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
     rows = [
-        (plan.stream_key & LOW, plan.stream_key >> 32, plan.noise.level << 12 | plan.noise.draw, plan.noise.frame_word)
+        (plan.stream_key & LOW, plan.stream_key >> 32, plan.place.level << 12 | plan.place.draw, plan.place.frame_word)
         for plan in plans
     ]
     return np.array(rows, dtype=np.uint64)

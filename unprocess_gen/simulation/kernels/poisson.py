@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import BLOCK
-from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.rounding import ROUND32

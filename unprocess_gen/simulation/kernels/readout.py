@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import PACKED, Float, Plan
+from unprocess_gen.core.arrays import PACKED, Float
 from unprocess_gen.simulation.kernels import electrons, gaussian, simd, strips
 from unprocess_gen.simulation.kernels.clean import FLOAT32_MARGIN
 from unprocess_gen.simulation.kernels.electrons import Electrons
@@ -41,6 +41,7 @@ from unprocess_gen.simulation.kernels.jit import by_class, inner
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer_to
 from unprocess_gen.simulation.kernels.strips import Buffers, Strip, count_outside, list_lanes
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import plane_sites
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
@@ -95,7 +96,7 @@ def readout_of(
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
     limits_dn = [
-        noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
+        noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.sensor_clip)
         + _pinned_dn(plan, counts_from_black)
         for plan in plans
     ]
@@ -105,7 +106,7 @@ def readout_of(
     return kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
         variance_lines=gaussian.variance_lines(plans, np.float32 if counts_from_black else np.float64),
-        averaged=first.noise.averaged,
+        averaged=first.averaged,
         black_dn=np.float32(0) if counts_from_black else float(first.sensor.black_level_dn),
         span_dn=float(first.sensor.span_dn),
         white=first.saturated_value,

@@ -15,8 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import PACKED, Frame, Srgb
 from unprocess_gen.core.random_streams import frame_word
-from unprocess_gen.core.types import FAST, PACKED, Counts, DarkFramePlan, DarkPixels, Frame, Pair, Plan, Srgb
+from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.simulation.frames import Counts, Pair
 from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE, body_of, light_factor
 from unprocess_gen.simulation.kernels.clean import (
     KEPT_SCENES,
@@ -44,6 +46,7 @@ from unprocess_gen.simulation.kernels.readout import (
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
 from unprocess_gen.simulation.kernels.strips import COUNT_FIELDS, STRIP, Scratch, buffers_in, locate, scratch_of_thread
+from unprocess_gen.simulation.plan import FAST, Plan
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.slots import Slots
 
@@ -96,7 +99,7 @@ class CropRenderer:
         form = self._form
         scene, noise = _records(form, self._plans, self._shape, origin, epoch=epoch)
         keys = form.keys.copy()
-        keys[0, 3] = frame_word(self._plan.noise.frame, epoch)
+        keys[0, 3] = frame_word(self._plan.place.frame, epoch)
         clean, noisy, numbers = _fill_frames(srgb, form, scene, noise, keys, origin)
         return clean, noisy[0], lambda: _counts_of(numbers, self._plan)[0]
 
@@ -113,7 +116,7 @@ def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
 
 def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
     """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
-    return _frames_of(srgb, (plan.replace(dark=DarkFramePlan()),), 0, origin)[0]
+    return _frames_of(srgb, (plan.replace(dark=None),), 0, origin)[0]
 
 
 Noise = Gaussian | Gaussian32 | Electrons
@@ -136,7 +139,7 @@ def _form(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int, in
     """Return the form of frames of ``shape``, from ``codes`` codes, whose first site is ``corner`` of a tile."""
     first, in_float32 = plans[0], uses_scene32(plans[0])
     packed = first.output.layout == PACKED
-    noise = None if first.noise.counts_electrons else (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
+    noise = None if first.counts_electrons else (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
     return _Form(
         (4, shape[0] // 2, shape[1] // 2) if packed else shape,
         np.float32 if first.output.clean_normalised else np.uint16,
@@ -200,17 +203,17 @@ def _records(
     if epoch and any(slots.columns or (slots.rows and slots.rows.correlation) for slots in frames):
         frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in plans)  # offsets of lines have words of an epoch
     body = body_of(frames[0].patterns, shape, origin, is_live=epoch is not None)
-    factor = light_factor(frames[0].patterns, body, shape, origin, first.noise.averaged)
+    factor = light_factor(frames[0].patterns, body, shape, origin, first.averaged)
     if factor is not None:
         scene = with_response(scene, factor)
-    if first.noise.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
+    if first.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
         body = body._replace(response=EQUAL_RESPONSE)
     return scene, electron_noise(plans, frames, body, dark_pixels, shape, origin)
 
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
     """Key that the plans of one pass have in common: the kernels, and the fixed patterns of the body."""
-    return plan.noise.counts_electrons, slots_of(plan).patterns
+    return plan.counts_electrons, slots_of(plan).patterns
 
 
 def uses_scene32(plan: Plan) -> bool:

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float, Raw
 from unprocess_gen.core.random_streams import BLOCK
-from unprocess_gen.core.types import Float, Raw
 from unprocess_gen.simulation.kernels import simd
 from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Float, Frame, Srgb
+from unprocess_gen.core.arrays import Float, Frame, Srgb
 
 CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")

@@ -16,7 +16,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from unprocess_gen.core.types import Float, Frame, Plan
+from unprocess_gen.core.arrays import Float, Frame
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import MONO, mosaic, tile
 from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert
 
@@ -41,7 +42,7 @@ def process(camera_light: Float, plan: Plan) -> Float:
         Values in [0, 1]. Colours outside [0, 1] are clipped before the gamma, as cameras do.
     """
     return render(
-        apply_gains(camera_light, plan.camera.inverse_gains, plan.camera.highlight, plan.camera.highlight_threshold),
+        apply_gains(camera_light, plan.camera.inverse_gains, plan.isp.highlight, plan.isp.highlight_threshold),
         plan,
     )
 
@@ -103,12 +104,12 @@ def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) ->
 
 def white_balanced(light: Float, plan: Plan, origin: tuple[int, int] = (0, 0), method: str = "malvar") -> Float:
     """Apply the gains to a mosaic of light and interpolate it, in its own precision; returns camera RGB, [H, W, 3]."""
-    pattern, camera, k = plan.sensor.pattern, plan.camera, np.array(plan.camera.inverse_gains, light.dtype)
+    pattern, isp, k = plan.sensor.pattern, plan.isp, np.array(plan.camera.inverse_gains, light.dtype)
     site_k = mosaic(np.broadcast_to(k, (*light.shape, 3)), pattern, origin).astype(light.dtype)
-    if camera.highlight == "gray_mean":
+    if isp.highlight == "gray_mean":
         image = demosaic(light / site_k, pattern, origin, method) * k
-        return apply_gains_gray_mean(image, k, camera.highlight_threshold)
-    balanced = HIGHLIGHTS[camera.highlight](light, site_k, camera.highlight_threshold)
+        return apply_gains_gray_mean(image, k, isp.highlight_threshold)
+    balanced = HIGHLIGHTS[isp.highlight](light, site_k, isp.highlight_threshold)
     return demosaic(balanced, pattern, origin, method)
 
 

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import Words
-from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.lookup_tables import SEGMENTS, normal_table
 
 

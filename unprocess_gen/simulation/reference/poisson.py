@@ -26,10 +26,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_density
 from unprocess_gen.core.random_streams import Words
-from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.lookup_tables import sha256
 from unprocess_gen.simulation.reference.noise import normals
 

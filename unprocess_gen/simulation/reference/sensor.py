@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import FLOAT32, Float, Frame, Normalised, Raw
+from unprocess_gen.core.arrays import FLOAT32, Float, Frame, Normalised, Raw
 
 
 def to_dn(light: Float, black_level_dn: int, white_level_dn: int, brightest: float = 1.0) -> Float:

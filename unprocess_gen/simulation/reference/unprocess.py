@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.core.random_streams import words
-from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import mosaic, plane_sites
 
 
@@ -95,7 +96,7 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
         steps = np.where(srgb == 254, np.uint64(385), np.uint64(257))  # 254 · 257 + 256 is one less than white
     else:
         steps = np.broadcast_to(np.uint64(257), srgb.shape)
-        kept |= curve[srgb] > plan.camera.highlight_threshold
+        kept |= curve[srgb] > plan.isp.highlight_threshold
     offsets = (np.stack(channels, axis=-1).astype(np.uint64) * steps >> np.uint64(32)).astype(np.int32) - 128
     return (srgb.astype(np.int32) * 257 + np.where(kept, 0, offsets)).astype(np.uint16)
 
@@ -119,7 +120,7 @@ def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
     """
     image = linear_light(srgb, plan.isp.tone, plan.isp.gamma) if curve is None else curve[srgb]
     image = apply_ccm(image, plan.camera.rgb2cam)
-    return invert_gains(image, plan.camera.inverse_gains, plan.camera.highlight, plan.camera.highlight_threshold)
+    return invert_gains(image, plan.camera.inverse_gains, plan.isp.highlight, plan.isp.highlight_threshold)
 
 
 def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:

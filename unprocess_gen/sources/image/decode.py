@@ -32,10 +32,11 @@ from typing import cast
 import cv2
 import numpy as np
 
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.core.types import Photograph, Srgb
 from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
+from unprocess_gen.sources.photograph import Photograph
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -17,9 +17,11 @@ from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.core.types import CameraPlan, IspPlan, Levels, Photograph, RawParts, SensorPlan, SourcePlan
+from unprocess_gen.simulation.facts import RawParts
+from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Levels, SensorPlan, SourcePlan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites
+from unprocess_gen.sources.photograph import Photograph
 from unprocess_gen.sources.raw.decode import LOSSY_JPEG, RawFrame, RawMetadata, decode_raw
 from unprocess_gen.sources.raw.mosaics import mosaic_pixels
 
@@ -131,8 +133,14 @@ def _camera(facts: RawMetadata) -> CameraPlan:
     red, blue = gains or (1.0, 1.0)
     name = "".join(letter for letter in facts.model or "" if letter.isascii() and letter.isprintable())
     rgb2cam = colour.IDENTITY if matrix is None else colour.rgb2cam(matrix)
-    weights = (0.0, 0.0, 0.0, 0.0)
-    return CameraPlan(name[:LONGEST_CAMERA_NAME] or "unknown", weights, rgb2cam, red, blue, 1.0, "per_channel", 0.9)
+    return CameraPlan(
+        camera=name[:LONGEST_CAMERA_NAME] or "unknown",
+        weights=(0.0, 0.0, 0.0, 0.0),
+        rgb2cam=rgb2cam,
+        red_gain=red,
+        blue_gain=blue,
+        inverse_rgb_gain=1.0,
+    )
 
 
 def camera_colours(facts: RawMetadata) -> tuple[colour.Matrix | None, tuple[float, float] | None]:

@@ -1,19 +1,15 @@
 """Declare the numbers of physical noise profiles.
 
-A number is declared once, as a field of the record of its effect. Keys of the settings with their checks, the fields of
-`simulation.effects.Physics`, manifest columns and reference pages follow from it.
+A number is declared once, at its field of `plan.Physics`. Keys of the settings with their checks, manifest columns and
+reference pages follow from it.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, dataclass_transform
-
-METADATA = "number"
-"""Key of a field's metadata that holds its `Number`."""
+from typing import Any
 
 PLAIN, DN, RATE, SHAPE, SITES = "plain", "dn", "rate", "shape", "sites"
 """How a field follows from its key: unchanged, converted to DN of the sensor, times exposure and warmth, as a shape of
@@ -24,7 +20,7 @@ LARGEST = 1.7976931348623157e308
 
 @dataclass(frozen=True)
 class Number:
-    """Declare a number: a key of the profile, a field of `Physics`, and columns of the manifest.
+    """A number of a profile: its key, its field of `plan.Physics`, and its columns of the manifest.
 
     Attributes
     ----------
@@ -90,47 +86,13 @@ class Number:
         return self.by_iso or bool(self.words)
 
 
-@dataclass_transform(kw_only_default=True, frozen_default=True)
-@dataclass(frozen=True, kw_only=True)
-class EffectNumbers:
-    """Numbers of an effect; a class that derives from it is a frozen dataclass of keyword arguments."""
-
-    def __init_subclass__(cls) -> None:
-        dataclass(frozen=True, kw_only=True)(cls)
+def number_in_dn(meaning: str, **details: Any) -> Number:
+    """Number that is converted to DN of the sensor."""
+    return Number(meaning, unit="DN", kind=DN, **details)
 
 
-def number(default: Any, meaning: str, **details: Any) -> Any:
-    """Declare a field of `Physics`.
-
-    Parameters
-    ----------
-    default : Any
-        Value without the effect.
-    meaning : str
-        One phrase for users.
-    **details : Any
-        Other attributes of `Number`.
-
-    Returns
-    -------
-    dataclasses.Field
-        For the body of a dataclass.
-    """
-    return field(default=default, metadata={METADATA: Number(meaning, **details)})
-
-
-def number_in_dn(meaning: str, **details: Any) -> Any:
-    """Declare a field of `Physics` that is converted to DN of the sensor; arguments as for `number`."""
-    return number(0.0, meaning, unit="DN", kind=DN, **details)
-
-
-def rate(meaning: str, **details: Any) -> Any:
-    """Declare a field of `Physics` that is a current times the exposure; arguments as for `number`."""
-    return number(
-        0.0, meaning, unit="electrons", kind=RATE, key_unit="electrons per second", high=1e6, highest=1e9, **details
+def rate(meaning: str, **details: Any) -> Number:
+    """Number of electrons: a current times the exposure."""
+    return Number(
+        meaning, unit="electrons", kind=RATE, key_unit="electrons per second", high=1e6, highest=1e9, **details
     )
-
-
-def numbers_of(record: type[Any]) -> dict[str, Number]:
-    """Return the declared numbers of a dataclass by the names of its fields."""
-    return {field.name: field.metadata[METADATA] for field in dataclasses.fields(record) if METADATA in field.metadata}

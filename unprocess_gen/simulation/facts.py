@@ -1,0 +1,89 @@
+"""What planning knows of an image besides its config: facts of its pixels, raw files, dark frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from unprocess_gen.core.arrays import Raw
+from unprocess_gen.simulation.plan import CameraPlan, IspPlan, SensorPlan, SourcePlan
+
+
+class DarkPixels(Protocol):
+    """Give access to the pixels of dark frames."""
+
+    def frame(self, sha256: str) -> Raw:
+        """Return the mosaic of the dark frame whose file has this SHA-256, [H, W] with even sides."""
+
+
+@dataclass(frozen=True, slots=True)
+class DarkFrame:
+    """Dark frame of a camera: SHA-256 of its file, and even height and width in pixels."""
+
+    sha256: str
+    height: int
+    width: int
+
+
+@dataclass(frozen=True, slots=True)
+class DarkFrames:
+    """Dark frames from which a run samples noise.
+
+    Attributes
+    ----------
+    frames : tuple of DarkFrame
+        The frames, in the order of their SHA-256.
+    sha256 : str
+        SHA-256 of the list of all their SHA-256, which identifies the set.
+    black_dn : float
+        Black level of the frames, DN of the frames.
+    scale : float
+        DN of the sensor per DN of the frames.
+    variance_dn2 : float
+        Variance of their noise with dither, DN² of the sensor.
+    """
+
+    frames: tuple[DarkFrame, ...]
+    sha256: str
+    black_dn: float
+    scale: float
+    variance_dn2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Facts about an image's pixels that a plan may depend on: integers, identical on every machine.
+
+    ``dark_code`` and ``bright_code`` are the lowest and highest code in any channel, of ``codes`` possible codes.
+    ``frames`` is the number of frames in the clip, 1 for a photograph. ``raw`` is what the file of a raw source states.
+    """
+
+    width: int
+    height: int
+    codes: int
+    dark_code: int
+    bright_code: int
+    frames: int = 1
+    raw: RawParts | None = None
+
+
+class RawParts(NamedTuple):
+    """Parts of a plan that the file of a raw source gives, and its own noise.
+
+    Attributes
+    ----------
+    source : SourcePlan
+        Levels of the file, digest of its mosaic, ISO and exposure time.
+    camera, isp : CameraPlan, IspPlan
+        Colours and curves with which pictures are drawn; frames do not depend on them.
+    sensor : SensorPlan
+        Pattern, bits and levels of the file.
+    noise : (float, float) or None
+        S and O of the variance S·x + O of the source, with x = 0 at black and 1 at white; None if it is not known.
+    """
+
+    source: SourcePlan
+    camera: CameraPlan
+    isp: IspPlan
+    sensor: SensorPlan
+    noise: tuple[float, float] | None = None
