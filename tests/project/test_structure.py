@@ -1,4 +1,4 @@
-"""Limits of size: no module above 500 lines of code, no function above 45."""
+"""Limits of size and circles: no module above 500 lines of code, no function above 45, no import closes a circle."""
 
 from __future__ import annotations
 
@@ -34,6 +34,46 @@ def too_long(path: Path) -> list[str]:
     functions = [node for node in ast.walk(module) if isinstance(node, ast.FunctionDef)]
     long = [node.name for node in functions if len(lines & set(range(node.lineno, node.end_lineno + 1))) > FUNCTION]
     return [f"{path.relative_to(PACKAGE)}: {name}" for name in [*long, *["module"] * (len(lines) > MODULE)]]
+
+
+MODULE_OF = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in MODULES}
+NAMES = {name.removesuffix(".__init__") for name in MODULE_OF}
+
+
+def imports(path: Path) -> set[str]:
+    """Return the modules of the package that a module imports, for type checking and inside functions too."""
+    found: set[str] = set()
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {full if full in NAMES else node.module or "" for full in names.values()}
+    return found & NAMES
+
+
+GRAPH = {name.removesuffix(".__init__"): imports(path) for name, path in MODULE_OF.items()}
+
+
+def test_no_import_closes_a_circle() -> None:
+    """Modules that import none that is left, or that none imports, are removed until only circles are left."""
+    left = {name: modules - {name} for name, modules in GRAPH.items()}
+    while True:
+        imported = set[str]().union(*left.values())
+        kept = {name: modules & left.keys() for name, modules in left.items() if modules & left.keys()}
+        kept = {name: modules for name, modules in kept.items() if name in imported}
+        if kept == left:
+            break
+        left = kept
+    assert sorted(left) == []
+
+
+def test_core_contains_what_several_packages_use() -> None:
+    users: dict[str, set[str]] = {name: set() for name in GRAPH if name.startswith("unprocess_gen.core.")}
+    for name, modules in GRAPH.items():
+        for module in modules & users.keys():
+            users[module].add(".".join(name.split(".")[:2]))
+    assert {name: found for name, found in users.items() if len(found - {"unprocess_gen.core"}) < 2} == {}
 
 
 def test_no_module_and_no_function_is_too_long() -> None:
