@@ -30,7 +30,7 @@ MIDDLE = 0.5
 
 
 class DrawnSensor(NamedTuple):
-    """What is drawn of a sensor: the numbers of its effects follow from it."""
+    """Drawn state of a sensor, from which the numbers of its effects follow."""
 
     iso: float
     exposure_s: float

@@ -1,4 +1,4 @@
-"""What planning knows of an image besides its config: facts of its pixels, raw files, dark frames."""
+"""Records from which planning decides, next to a config: facts of pixels, raw files, dark frames."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from unprocess_gen.simulation.plan import CameraPlan, IspPlan, SensorPlan, Sourc
 
 
 class DarkPixels(Protocol):
-    """Give access to the pixels of dark frames."""
+    """Access to the pixels of dark frames."""
 
     def frame(self, sha256: str) -> Raw:
-        """Return the mosaic of the dark frame whose file has this SHA-256, [H, W] with even sides."""
+        """Mosaic of the dark frame whose file has this SHA-256, [H, W] with even sides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,20 +27,10 @@ class DarkFrame:
 
 @dataclass(frozen=True, slots=True)
 class DarkFrames:
-    """Dark frames from which a run samples noise.
+    """Dark frames from which a run samples noise, in the order of their SHA-256.
 
-    Attributes
-    ----------
-    frames : tuple of DarkFrame
-        The frames, in the order of their SHA-256.
-    sha256 : str
-        SHA-256 of the list of all their SHA-256, which identifies the set.
-    black_dn : float
-        Black level of the frames, DN of the frames.
-    scale : float
-        DN of the sensor per DN of the frames.
-    variance_dn2 : float
-        Variance of their noise with dither, DN² of the sensor.
+    ``sha256`` identifies the set. ``black_dn`` is in DN of the frames, ``scale`` converts them to DN of the sensor, and
+    ``variance_dn2`` is the variance of their noise with dither, DN² of the sensor.
     """
 
     frames: tuple[DarkFrame, ...]
@@ -68,18 +58,10 @@ class Facts:
 
 
 class RawParts(NamedTuple):
-    """Parts of a plan that the file of a raw source gives, and its own noise.
+    """Parts of a plan that the file of a raw source gives.
 
-    Attributes
-    ----------
-    source : SourcePlan
-        Levels of the file, digest of its mosaic, ISO and exposure time.
-    camera, isp : CameraPlan, IspPlan
-        Colours and curves with which pictures are drawn; frames do not depend on them.
-    sensor : SensorPlan
-        Pattern, bits and levels of the file.
-    noise : (float, float) or None
-        S and O of the variance S·x + O of the source, with x = 0 at black and 1 at white; None if it is not known.
+    Pictures are drawn with ``camera`` and ``isp``; frames do not depend on them. ``noise`` is S and O of the variance
+    S·x + O of the source, with x = 0 at black and 1 at white; None if it is not known.
     """
 
     source: SourcePlan
