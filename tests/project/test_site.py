@@ -26,29 +26,35 @@ WIDTHS = (1200, 390)
 
 
 class Page(HTMLParser):
-    """Collect the anchors of a page and the addresses that it refers to, with the element and its ``rel``."""
+    """Collect the anchors of a page, and the addresses that it refers to as links or loads."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.path = path
         self.anchors: set[str] = set()
-        self.addresses: list[tuple[str, str, str]] = []
+        self.links: list[str] = []
+        self.loaded: list[str] = []
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         values = {name: value or "" for name, value in attrs}
         self.anchors |= {values[name] for name in ("id", "name") if name in values}
-        for name in ("href", "src", "data", "poster"):
-            if name in values:
-                self.addresses.append((tag, values.get("rel", ""), values[name]))
+        is_link = tag == "a" or values.get("rel") in ("canonical", "author")
+        (self.links if is_link else self.loaded).extend(
+            values[name] for name in ("href", "src", "data", "poster") if name in values
+        )
 
     def local_targets(self) -> Iterator[tuple[Path, str]]:
         """Yield path and fragment of each address without a server."""
-        for _, _, address in self.addresses:
-            parts = urlsplit(address)
-            if not parts.scheme and not parts.netloc:
+        for address in self.links + self.loaded:
+            if not has_server(address):
+                parts = urlsplit(address)
                 path = (self.path.parent / unquote(parts.path)).resolve() if parts.path else self.path
                 yield path, unquote(parts.fragment)
+
+
+def has_server(address: str) -> bool:
+    return bool(urlsplit(address).scheme or urlsplit(address).netloc)
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +88,8 @@ def test_links_anchors_and_pictures_resolve(pages: dict[Path, Page], figure: Fig
 
 
 def test_pages_load_nothing_from_servers(site: Path, pages: dict[Path, Page]) -> None:
-    loaded = [
-        f"{page.path.name}: {address}"
-        for page in pages.values()
-        for tag, rel, address in page.addresses
-        if (tag != "a" and rel not in ("canonical", "author"))
-        and (urlsplit(address).scheme or urlsplit(address).netloc)
-    ]
-    assert [address for address in loaded if not address.partition(": ")[2].startswith("data:")] == []
+    loaded = {address for page in pages.values() for address in page.loaded if not address.startswith("data:")}
+    assert [address for address in loaded if has_server(address)] == []
     for style in site.rglob("*.css"):
         assert not re.search(r"(url\(|@import)\s*['\"]?(https?:)?//", style.read_text(encoding="utf-8")), style.name
 
@@ -127,14 +127,8 @@ def test_pages_fit_their_window_and_show_their_pictures(
         (tour / name).write_text(text.replace("</body>", MEASURE + "</body>"), encoding="utf-8")
     visits = [[name, width] for name in names for width in WIDTHS]
     (tour / "tour.html").write_text(TOUR % json.dumps(visits), encoding="utf-8")
-    dom = open_page(
-        tour / "tour.html",
-        (1200, 1000),
-        tmp_path / "profile",
-        "--virtual-time-budget=600000",
-        "--dump-dom",
-        timeout=300,
-    )
+    flags = ("--virtual-time-budget=600000", "--dump-dom")
+    dom = open_page(tour / "tour.html", (1200, 1000), tmp_path / "profile", *flags, timeout=300)
     (found,) = re.findall(r'data-measured="([^"]*)"', dom)
     measured: dict[str, dict[str, Any]] = json.loads(html.unescape(found))
     assert len(measured) == len(visits)
@@ -145,5 +139,5 @@ def test_pages_fit_their_window_and_show_their_pictures(
             faults[name].append(f"is {page['width']} pixels wide in a window of {width}")
         faults[name] += [f"does not show {picture}" for picture in page["missing"]]
     assert len(faults.pop("control.html")) == 4, "too wide pages or missing pictures are not detected"
-    assert {name: some for name, some in faults.items() if some} == {}
+    assert [fault for fault in faults.items() if fault[1]] == []
     figure("site", f"{len(measured) - len(WIDTHS)} views of pages at {' and '.join(map(str, WIDTHS))} pixels fit")

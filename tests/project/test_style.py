@@ -63,16 +63,16 @@ def prose(path: Path) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string.replace("_", " ")
 
 
-PATTERN = re.compile(
-    rf"(?<![\w.\-/`{{])(?:{'|'.join(f'(?P<w{i}>{word})' for i, word in enumerate(BANNED))})(?![\w`=])", re.I
-)
+PATTERN = re.compile(rf"(?<![\w.\-/`{{])({'|'.join(BANNED)})(?![\w`=])", re.IGNORECASE)
 
 
 def banned_words(path: Path) -> list[str]:
     return [
-        f"{path.relative_to(ROOT)}:{number}: {match[0]!r} ({list(BANNED.values())[int((match.lastgroup or 'w0')[1:])]})"
+        f"{path.relative_to(ROOT)}:{number}: {match[0]!r}; write {instead!r}"
         for number, line in prose(path)
         for match in PATTERN.finditer(line)
+        for word, instead in BANNED.items()
+        if re.fullmatch(word, match[0], re.IGNORECASE)
     ]
 
 
