@@ -52,7 +52,7 @@ PathLike = str | os.PathLike[str]
 
 
 class RawPair:
-    """Hold a clean and a noisy raw frame of one array of pixels.
+    """Clean and noisy raw frame of one array of pixels.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class RawPair:
 
     @cached_property
     def row(self) -> dict[str, Any]:
-        """Return the manifest row of the pair."""
+        """Manifest row of the pair."""
         pair = Pair(self.clean, self.noisy, self.counts)
         digests = array_xxh3(self.clean), array_xxh3(self.noisy)
         identity = self._source.sha256 or ""
@@ -85,24 +85,6 @@ class RawPair:
 
     def __repr__(self) -> str:
         return f"RawPair({self.clean.dtype} {list(self.clean.shape)}, noise={self.plan.noise.noise})"
-
-
-def array_identity(srgb: Srgb) -> str:
-    """Return the digest that identifies an array of pixels.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16
-        Pixels.
-
-    Returns
-    -------
-    str
-        SHA-256 of dtype, shape and little-endian bytes, 64 hexadecimal digits.
-    """
-    digest = hashlib.sha256(f"{srgb.dtype.name} {'x'.join(map(str, srgb.shape))}\n".encode())
-    digest.update(np.ascontiguousarray(srgb, dtype=srgb.dtype.newbyteorder("<")).data)
-    return digest.hexdigest()
 
 
 def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key: str | int | None = None) -> Plan:
@@ -146,8 +128,7 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     >>> darker.row["red_gain"] == plan.camera.red_gain
     True
     """
-    pixels = array_pixels(srgb)
-    return _planned(pixels, _identity(pixels, key), config, seed).plans[0]
+    return plan_array(array_pixels(srgb), array_settings(config, seed), key)[1].plans[0]
 
 
 def make_pair(
@@ -197,22 +178,21 @@ def make_pair(
     (240, 4095)
     """
     pixels = array_pixels(srgb)
-    identity = _identity(pixels, key)
     if not isinstance(config, Plan):
-        image = _planned(pixels, identity, config, seed)
+        source, image = plan_array(pixels, array_settings(config, seed), key)
     elif config.dark is not None:
         raise ConfigError("make_pair: the plan names a dark frame, whose folder it lacks; expected a config")
     elif config.source.is_raw:
         raise ConfigError("make_pair: the plan is of a raw frame; expected that of a photograph; use ug.LivePairs")
     elif seed is None and key is None:
-        recorded = _downscaled(pixels, config.source.downscale)
-        image = PlannedImage(recorded, (config,), _full_frame(recorded, config.output.layout))
+        recorded, patches = _recorded(pixels, config.source.downscale, config.output.layout)
+        source, image = _array_source(pixels, None), PlannedImage(recorded, (config,), patches)
     else:
         raise ConfigError("make_pair: a plan has its own seed and key; expected them with a config only")
     if isinstance(config, Plan) or config.self_test == "stop":
         self_test.check(self_test.kernels(image.plans[0]))
-    patch, plan, pair = next(dataclasses.replace(image, plans=image.plans[:1]).pairs())
-    return RawPair(pair, plan, array_source(pixels, identity), patch)
+    patch, plan, pair = next(image.pairs())
+    return RawPair(pair, plan, source, patch)
 
 
 def generate(config: Config) -> _generate.Summary:
@@ -406,7 +386,7 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
 
 
 def array_pixels(srgb: ArrayLike) -> Srgb:
-    """Return the pixels of an array in native byte order; ValueError for another dtype or shape, or no pixel."""
+    """Convert an array to pixels in native byte order; ValueError for another dtype or shape, or no pixel."""
     pixels = np.asarray(srgb)
     if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"srgb is {pixels.dtype} {list(pixels.shape)}, expected uint8 or uint16 [H, W, 3]")
@@ -415,16 +395,8 @@ def array_pixels(srgb: ArrayLike) -> Srgb:
     return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
 
 
-def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> PlannedImage:
-    """Plan the pair of an array."""
-    settings = array_settings(config, seed)
-    recorded = _downscaled(pixels, config.source.downscale)
-    _full_frame(recorded, config.output.layout)
-    return plan_pixels(settings, Photograph(recorded, 1), array_source(pixels, identity), identity)
-
-
 def array_settings(config: Config, seed: int | None = None) -> PairSettings:
-    """Return the settings of pairs of arrays; ConfigError if an array would have several pairs."""
+    """Validate the settings of pairs of arrays; ConfigError if an array would have several pairs."""
     settings = PairSettings.read(_config_for_arrays(config, seed))
     for key, pairs in (("levels", len(noise_levels(config.noise))), ("draws", config.noise.draws)):
         if pairs > 1:
@@ -435,25 +407,28 @@ def array_settings(config: Config, seed: int | None = None) -> PairSettings:
     return settings
 
 
-def array_source(pixels: Srgb, identity: str) -> Source:
-    """Return the source of an array: its size, and the digest that identifies it."""
-    return Source(0, ARRAY_NAME, ARRAY_NAME, pixels.nbytes, sha256=identity)
+def plan_array(pixels: Srgb, settings: PairSettings, key: str | int | None) -> tuple[Source, PlannedImage]:
+    """Plan the pair of an array; its identity is the digest of ``key``, or of the array itself."""
+    config, source = settings.config, _array_source(pixels, key)
+    recorded, _ = _recorded(pixels, config.source.downscale, config.output.layout)
+    return source, plan_pixels(settings, Photograph(recorded, 1), source, source.sha256 or "")
 
 
-def _identity(pixels: Srgb, key: str | int | None) -> str:
-    """Return the digest of the pixels, or of a key."""
-    return array_identity(pixels) if key is None else key_identity(key)
-
-
-def key_identity(key: str | int) -> str:
-    """Return the digest of a key that is not a digest itself."""
-    text = str(key)
-    is_digest = len(text) == 64 and set(text) <= set("0123456789abcdef")
-    return text if is_digest else hashlib.sha256(text.encode()).hexdigest()
+def _array_source(pixels: Srgb, key: str | int | None) -> Source:
+    """Describe an array as a source: its SHA-256 is that of ``key`` if it is one, else of dtype, shape and bytes."""
+    if key is None:
+        digest = hashlib.sha256(f"{pixels.dtype.name} {'x'.join(map(str, pixels.shape))}\n".encode())
+        digest.update(np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<")).data)
+        sha256 = digest.hexdigest()
+    elif len(text := str(key)) == 64 and set(text) <= set("0123456789abcdef"):
+        sha256 = text
+    else:
+        sha256 = hashlib.sha256(text.encode()).hexdigest()
+    return Source(0, ARRAY_NAME, ARRAY_NAME, pixels.nbytes, sha256=sha256)
 
 
 def _config_for_arrays(config: Config, seed: int | None) -> Config:
-    """Return a validated copy of a config without the keys that choose files; ConfigError for patches."""
+    """Validated copy of a config without the keys that choose files; ConfigError for patches."""
     _check_complete(config)
     require_photographs(config.source, "make_pair, as plan_image and CameraNoise,")
     if config.source.patch is not None:
@@ -481,16 +456,13 @@ def _check_complete(config: Config) -> None:
         )
 
 
-def _downscaled(pixels: Srgb, downscale: int) -> Srgb:
+def _recorded(pixels: Srgb, downscale: int, layout: str) -> tuple[Srgb, tuple[Patch, ...]]:
+    """Downscale an array, and list the one patch that its pair shows: all but an odd row or column of packed planes."""
     if min(pixels.shape[:2]) < downscale:
         problem = f"srgb is {list(pixels.shape)}; expected at least {downscale} x {downscale}"
         raise refusal("source.downscale", downscale, problem)
-    return pixels if downscale == 1 else downscaled(pixels, downscale)
-
-
-def _full_frame(recorded: Srgb, layout: str) -> tuple[Patch, ...]:
-    """Cut what a pair shows: all pixels, except the last row or column of odd packed planes."""
+    recorded = pixels if downscale == 1 else downscaled(pixels, downscale)
     height, width = recorded.shape[:2]
     if layout == PACKED and min(height, width) < 2:
         raise ConfigError(f"output.layout=packed: srgb is {list(recorded.shape)}; expected at least 2 x 2 sites")
-    return list_patches(None, 0, height, width, layout)
+    return recorded, list_patches(None, 0, height, width, layout)

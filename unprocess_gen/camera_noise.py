@@ -16,18 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from unprocess_gen.api import array_pixels, array_settings, array_source, key_identity
+from unprocess_gen.api import array_pixels, array_settings, plan_array
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import refusal
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.pipeline.pairs import plan_pixels
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
-from unprocess_gen.sources.photograph import Photograph
 
 Float32 = NDArray[np.float32]
 
@@ -132,24 +129,19 @@ class CameraNoise:
             raise ValueError(f"picture is {pixels.dtype}; expected uint8 with jpeg={self._jpeg}, or jpeg=None")
         if index is None:
             index, self._calls = self._calls, self._calls + 1
-        plan, pair = self._raw_pair(pixels, operator.index(index))
+        _, image = plan_array(pixels, self._settings, operator.index(index))
+        if self._settings.config.self_test == "stop":
+            self_test.check(self_test.kernels(image.plans[0]))
+        _, plan, pair = next(image.pairs())
         has_noise = set(plan.noise.effects) != {"quantise"}
         codes = int(np.iinfo(pixels.dtype).max) + 1
         noisy = _develop(pair.noisy if has_noise else pair.clean, plan, self._demosaic, codes)
         clean = pixels.copy() if self._clean == "source" else _develop(pair.clean, plan, self._demosaic, codes)
         return clean, noisy if self._jpeg is None else _compressed(noisy, self._jpeg)
 
-    def _raw_pair(self, pixels: Srgb, index: int) -> tuple[Plan, Pair]:
-        identity = key_identity(index)
-        image = plan_pixels(self._settings, Photograph(pixels, 1), array_source(pixels, identity), identity)
-        if self._settings.config.self_test == "stop":
-            self_test.check(self_test.kernels(image.plans[0]))
-        _, plan, pair = next(image.pairs())
-        return plan, pair
-
 
 def _config_of_pictures(config: Config, seed: int) -> Config:
-    """Return a config whose pairs have the geometry of pictures and unrounded clean frames."""
+    """Config whose pairs have the geometry of pictures and unrounded clean frames; ConfigError if none has."""
     if config.seed not in (0, seed):
         problem = f"differs from seed={seed} of CameraNoise; expected one seed; pass seed={config.seed} to CameraNoise"
         raise refusal("seed", config.seed, problem)
@@ -184,7 +176,7 @@ ROOTS_PER_CODE = {256: 64, 65536: 4}
 
 @functools.lru_cache(maxsize=8)
 def _codes_of_roots(tone: str, gamma: float | str, codes: int) -> Any:
-    """Return the codes of the squares of equally spaced values from 0 to 1, in place of powers of each pixel."""
+    """Codes of the squares of equally spaced values from 0 to 1, in place of powers of each pixel."""
     light = np.linspace(0, 1, codes * ROOTS_PER_CODE[codes]) ** 2
     rounded = isp.to_codes(isp.TONES[tone](isp.compress_gamma(light, gamma)), codes)
     return np.asarray(rounded, dtype=np.uint8 if codes == 256 else np.uint16)
