@@ -35,7 +35,7 @@ SHA = hashlib.sha256(b"a photograph").hexdigest()
 FIRST, LAST = 2.0**-53, 1 - 2.0**-53
 """Smallest and largest uniform of a stream."""
 
-UNIFORMS = [FIRST, 1e-9, 0.25, 0.5, LAST, *parameter_uniforms(12345, 200)]
+UNIFORMS = [FIRST, 1e-9, 0.25, 0.5, LAST, *parameter_uniforms(12345, range(200))]
 uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) / 2**52)
 
 
@@ -195,7 +195,7 @@ def test_counters_of_draws_never_change() -> None:
 
 def test_each_parameter_uses_the_uniform_of_its_name(settings: Settings) -> None:
     plan = plan_of(settings, "noise=brooks2019")
-    u = parameter_uniforms(plan.stream_key, DRAW_COUNT)
+    u = parameter_uniforms(plan.stream_key, range(DRAW_COUNT))
     assert plan.camera.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u[Draw.RED])
     assert plan.camera.blue_gain == draw(Distribution("uniform", (1.5, 1.9)), u[Draw.BLUE])
     assert plan.camera.inverse_rgb_gain == draw(GAIN, u[Draw.INVERSE_RGB])

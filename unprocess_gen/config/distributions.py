@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, spelled
 from unprocess_gen.config.limits import Drawn
@@ -106,12 +106,22 @@ def _nearest_log_uniform(u: float, a: float, low: float, high: float) -> float |
     return fixed_point.nearest_exp(exponent, bottom_error + top_error + 1 + fixed_point.DECIMAL_ERROR)
 
 
+class _Truncated(NamedTuple):
+    """Truncated normal distribution, fixed-point: CDF at the lower limit and its increase to the upper one, numbers."""
+
+    bottom: int
+    increase: int
+    mean: int
+    low: int
+    high: int
+
+
 @functools.lru_cache(maxsize=256)
-def _truncated_cdf(mean: float, std: float, low: float, high: float) -> tuple[int, int]:
-    """Return the CDF at the lower limit of a truncated normal distribution, and its increase to the upper limit."""
+def _fixed_truncated(mean: float, std: float, low: float, high: float) -> _Truncated:
     with localcontext(prec=DIGITS):
         bottom, top = (normal_cdf((Decimal(limit) - Decimal(mean)) / Decimal(std)) for limit in (low, high))
-        return fixed_point.fixed(bottom), fixed_point.fixed(top - bottom)
+        numbers = (fixed_point.times(fixed_point.ONE, number) for number in (mean, low, high))
+        return _Truncated(fixed_point.fixed(bottom), fixed_point.fixed(top - bottom), *numbers)
 
 
 def _nearest_truncated(
@@ -122,14 +132,13 @@ def _nearest_truncated(
     Roundings to 40 digits, to units, and of the product with ``u`` move the probability by less than 4 units. Returns
     None next to a limit, where `_truncated` clips.
     """
-    bottom, increase = _truncated_cdf(mean, std, low, high)
-    normal = fixed_point.normal_quantile(bottom + fixed_point.times(increase, u), 4)
+    known = _fixed_truncated(mean, std, low, high)
+    normal = fixed_point.normal_quantile(known.bottom + fixed_point.times(known.increase, u), 4)
     if normal is None:
         return None
-    one = fixed_point.ONE
-    value = fixed_point.times(one, mean) + fixed_point.times(normal[0], std)
+    value = known.mean + fixed_point.times(normal[0], std)
     error = fixed_point.times(normal[1], std) + 3
-    within = fixed_point.times(one, low) < value - 2 * error and value + 2 * error < fixed_point.times(one, high)
+    within = known.low < value - 2 * error and value + 2 * error < known.high
     return finish(value, error) if within else None
 
 

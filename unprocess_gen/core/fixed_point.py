@@ -45,8 +45,8 @@ def fixed(value: Decimal) -> int:
 
 def times(number: int, factor: float) -> int:
     """Multiply a fixed-point number by a float; the error grows by this factor, and then by one unit."""
-    top, bottom = factor.as_integer_ratio()
-    return number * top // bottom
+    top, bottom = factor.as_integer_ratio()  # the bottom is a power of two
+    return number * top >> bottom.bit_length() - 1
 
 
 def nearest(number: int, error: int) -> float | None:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,8 +151,8 @@ def patch_words(key: int, count: int, epoch: int = 0) -> list[tuple[int, int]]:
 
     Patch n uses counter (0, n) of the stream ``patch``, so that a larger ``count`` does not move the first patches.
     """
-    first, second = _outputs(key, count, purpose("patch"), frame_word(0, epoch))[:2]
-    return list(zip(first.tolist(), second.tolist(), strict=True))
+    first, second, _, _ = _outputs(key, range(count), purpose("patch"), frame_word(0, epoch))
+    return list(zip(_split(first, count), _split(second, count), strict=True))
 
 
 def crop_words(key: int, patch: int, level: int, draw: int, word_3: int, crop: int = 0) -> tuple[int, int]:
@@ -165,45 +166,47 @@ def crop_words(key: int, patch: int, level: int, draw: int, word_3: int, crop: i
 
 def shuffled(length: int, seed: int, epoch: int) -> NDArray[np.int64]:
     """Draw a permutation of 0 to ``length`` - 1, the same on every machine: the order of 64-bit words."""
-    high, low, _, _ = _outputs(_hash64(f"unprocess_gen order 1\0{seed}"), length, 0, epoch)
+    counter = (0, np.arange(length, dtype=np.uint64), 0, epoch)
+    key = _hash64(f"unprocess_gen order 1\0{seed}")
+    high, low, _, _ = philox4x32(tuple(np.asarray(word, dtype=np.uint64) for word in counter), key)
     return np.argsort(high.astype(np.uint64) << np.uint64(32) | low, kind="stable")
 
 
 def dark_frame_words(key: int) -> tuple[int, int, int]:
     """Draw three 32-bit words, which choose a dark frame, its row and its column."""
-    chosen, row, column, _ = _outputs(key, 1, purpose("dark_frame"), 0)
-    return int(chosen[0]), int(row[0]), int(column[0])
+    return _outputs(key, range(1), purpose("dark_frame"), 0)[:3]
 
 
-def parameter_uniforms(key: int, count: int, level: int = 0, epoch: int = 0) -> list[float]:
-    """Draw uniform deviates (k + ½)·2**-52 with a 52-bit integer k, for the parameters of an image.
+def parameter_uniforms(key: int, counters: Sequence[int], level: int = 0, epoch: int = 0) -> list[float]:
+    """Draw uniform deviates (k + ½)·2**-52 with a 52-bit integer k, for some parameters of an image.
 
     Parameter n uses counter (0, n) of the stream ``parameters``: add new parameters at the end, never renumber.
     """
-    return _uniforms(key, count, purpose("parameters", level), frame_word(0, epoch))
+    return _uniforms(key, counters, purpose("parameters", level), frame_word(0, epoch))
 
 
 def scatter_uniforms(key: int, count: int) -> list[float]:
-    """Draw uniform deviates as `parameter_uniforms` for the numbers of a sensor unit, from its `body_key`.
+    """Draw uniform deviates as `parameter_uniforms`, for the numbers of a sensor unit with `body_key` ``key``.
 
     Number n uses counter n of the stream ``scatter``: add new numbers at the end, never renumber.
     """
-    return _uniforms(key, count, purpose("scatter"), 0)
+    return _uniforms(key, range(count), purpose("scatter"), 0)
 
 
-def _outputs(key: int, count: int, word_2: int, word_3: int) -> tuple[Words, Words, Words, Words]:
-    """Output words of the counters with word 0 of 0, word 1 from 0 to ``count`` - 1, and the other words given."""
-    counter = (0, np.arange(count, dtype=np.uint64), word_2, word_3)
-    return philox4x32(tuple(np.asarray(word, dtype=np.uint64) for word in counter), key)
+def _uniforms(key: int, counters: Sequence[int], word_2: int, word_3: int) -> list[float]:
+    """Uniform deviates (k + ½)·2**-52 from the first 52 bits k of the output of each counter."""
+    first, second, _, _ = _outputs(key, counters, word_2, word_3)
+    bits = first << 20 | (second >> 12 & (LOW >> 12) * _packed(counters)[0])
+    return [(k + 0.5) * 2.0**-52 for k in _split(bits, len(counters))]
 
 
-def _uniforms(key: int, count: int, word_2: int, word_3: int) -> list[float]:
-    """Uniform deviates (k + ½)·2**-52 from the first 52 bits k of the counters (0, 0 to ``count`` - 1, …).
+def _outputs(key: int, counters: Sequence[int], word_2: int, word_3: int) -> tuple[int, int, int, int]:
+    """Output words of Philox for counters (0, n, word_2, word_3) with n in ``counters``.
 
-    An integer holds one word of all counters, at intervals of 64 bits, so that no product reaches the next word. With
-    `philox4x32` the planning of an image would take twice as long: 60 µs for the few counters of an image instead of 5.
+    An integer holds one word of all counters, at intervals of 64 bits, so that no product reaches the next word. NumPy
+    takes ten times as long for the few counters of an image, as long as all other planning.
     """
-    ones, numbers = _packed(count)
+    ones, numbers = _packed(counters)
     low = LOW * ones
     c0, c1, c2, c3 = 0, numbers, word_2 * ones, word_3 * ones
     k0, k1 = key & LOW, key >> 32
@@ -212,11 +215,15 @@ def _uniforms(key: int, count: int, word_2: int, word_3: int) -> list[float]:
         c0, c1 = (p1 >> 32 & low) ^ c1 ^ k0 * ones, p1 & low
         c2, c3 = (p0 >> 32 & low) ^ c3 ^ k1 * ones, p0 & low
         k0, k1 = (k0 + KEY_STEPS[0]) & LOW, (k1 + KEY_STEPS[1]) & LOW
-    bits = c0 << 20 | (c1 >> 12 & (LOW >> 12) * ones)
-    return [(k + 0.5) * 2.0**-52 for k in struct.unpack(f"<{count}Q", bits.to_bytes(8 * count, "little"))]
+    return c0, c1, c2, c3
 
 
 @functools.cache
-def _packed(count: int) -> tuple[int, int]:
-    """``count`` ones, and the numbers below ``count``, at intervals of 64 bits."""
-    return sum(1 << 64 * n for n in range(count)), sum(n << 64 * n for n in range(count))
+def _packed(counters: Sequence[int]) -> tuple[int, int]:
+    """A one for each counter, and the counters, at intervals of 64 bits."""
+    return sum(1 << 64 * n for n in range(len(counters))), sum(number << 64 * n for n, number in enumerate(counters))
+
+
+def _split(words: int, count: int) -> tuple[int, ...]:
+    """Words at intervals of 64 bits."""
+    return struct.unpack(f"<{count}Q", words.to_bytes(8 * count, "little"))

@@ -47,9 +47,11 @@ class PhysicalNoise:
         assert noise.white_level_dn is not None and noise.black_level_dn is not None
         self.noise, self.sensor = noise, sensor
         self.fixed_pattern_in_clean = config.clean.includes_fixed_pattern
-        self.iso = parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, ISO)
-        self.exposure_s = parse_drawn("exposure_s", scene.exposure_s, EXPOSURE_S)
-        self.temperature_c = parse_drawn("temperature_c", scene.temperature_c, TEMPERATURE_C)
+        self.distributions = {
+            Draw.ISO: parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, ISO),
+            Draw.EXPOSURE_S: parse_drawn("exposure_s", scene.exposure_s, EXPOSURE_S),
+            Draw.TEMPERATURE_C: parse_drawn("temperature_c", scene.temperature_c, TEMPERATURE_C),
+        }
         self.scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
         self.has_lens_shading = any(noise.lens_shading or ())
         self._numbers = [self._numbers_of(branch) for branch in noise.branches]
@@ -64,14 +66,10 @@ class PhysicalNoise:
 
     def draw(self, uniforms: Sequence[float], stream_key: int, seed: int) -> DrawnSensor:
         """Draw ISO, exposure, temperature and sensor unit; ``stream_key`` identifies it with ``sensor.units=image``."""
-        units = self.sensor.units
-        return DrawnSensor(
-            draw_parameter(self.iso, uniforms[Draw.ISO]),
-            draw_parameter(self.exposure_s, uniforms[Draw.EXPOSURE_S]),
-            draw_parameter(self.temperature_c, uniforms[Draw.TEMPERATURE_C]),
-            f"{stream_key:016x}" if units == "image" else str(int(uniforms[Draw.SENSOR_UNIT] * units)),
-            seed,
-        )
+        units, drawn = self.sensor.units, self.distributions.items()
+        unit = f"{stream_key:016x}" if units == "image" else str(int(uniforms[Draw.SENSOR_UNIT] * units))
+        iso, seconds, celsius = (draw_parameter(distribution, uniforms[draw]) for draw, distribution in drawn)
+        return DrawnSensor(iso, seconds, celsius, unit, seed)
 
     def physics(self, drawn: DrawnSensor) -> Physics:
         """Convert the numbers of the profile to DN of the sensor, with the scatter of the unit.

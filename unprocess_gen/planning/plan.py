@@ -196,6 +196,18 @@ class Planner:
             config.output.dtype, config.output.layout, FLOAT32 if interpretation.has_float_clean(config) else ""
         )
 
+        distributions = {
+            Draw.RED: self._red, Draw.BLUE: self._blue, Draw.INVERSE_RGB: self._inverse_rgb,
+            Draw.EXPOSURE_RATIO: self._exposure_ratio, **self._levels[0].distributions,
+        }  # fmt: skip
+        drawn = {draw for draw, distribution in distributions.items() if distribution.kind != "constant"}
+        if config.camera.law == "convex" and config.camera.weights is None:
+            drawn |= {Draw.WEIGHT_0, Draw.WEIGHT_1, Draw.WEIGHT_2, Draw.WEIGHT_3}
+        drawn |= {Draw.CHOICE} if config.camera.law == "choice" else set()
+        drawn |= {Draw.LIGHT, Draw.CCT, Draw.LIGHT_DISTANCE} if self._lights else set()
+        drawn |= {Draw.SENSOR_UNIT} if self._is_physical and sensor.units != "image" else set()
+        self._drawn = tuple(sorted(drawn))
+
     def levels(
         self,
         seed: int,
@@ -216,7 +228,8 @@ class Planner:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
-        uniforms = parameter_uniforms(key, DRAW_COUNT, epoch=epoch)
+        uniforms = [math.nan] * DRAW_COUNT  # of parameters that are not drawn
+        _draw(uniforms, self._drawn, key, 0, epoch)
         scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
         source, isp = self._source, self._isp
@@ -233,9 +246,7 @@ class Planner:
         image = Image(seed, key, facts, signals, dark_frames, source)
         for number, level in enumerate(self._levels):
             if number:
-                drawn_again = parameter_uniforms(key, DRAW_COUNT, number, epoch)
-                for counter in NOISE_COUNTERS:
-                    uniforms[counter] = drawn_again[counter]
+                _draw(uniforms, NOISE_COUNTERS, key, number, epoch)
             noise, physics, selection = level.draw(image, uniforms)
             plan = Plan(
                 seed=seed,
@@ -280,6 +291,12 @@ class Planner:
             inverse_rgb_gain=inverse_rgb,
         )
         return without_filters(camera) if self._sensor.pattern == MONO else camera
+
+
+def _draw(uniforms: list[float], counters: tuple[int, ...], key: int, level: int, epoch: int) -> None:
+    """Fill in the uniforms of some parameters."""
+    for counter, uniform in zip(counters, parameter_uniforms(key, counters, level, epoch), strict=True):
+        uniforms[counter] = uniform
 
 
 def without_filters(camera: CameraPlan) -> CameraPlan:
@@ -333,7 +350,8 @@ class TwoNumberLevel:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._distributions = interpretation.noise_distributions(config.noise)
+        a, b = interpretation.noise_distributions(config.noise)
+        self.distributions = {Draw.A: a, Draw.B: b}
         self._span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:
@@ -348,8 +366,8 @@ class TwoNumberLevel:
     def two_numbers(self, uniforms: Sequence[float]) -> tuple[float, float]:
         """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
         noise, sensor = self._config.noise, self._config.sensor
-        a = draw_parameter(self._distributions[0], uniforms[Draw.A])
-        b = draw_parameter(self._distributions[1], uniforms[Draw.B], a)
+        a = draw_parameter(self.distributions[Draw.A], uniforms[Draw.A])
+        b = draw_parameter(self.distributions[Draw.B], uniforms[Draw.B], a)
         return noise_in_dn(
             a,
             b,
@@ -371,6 +389,7 @@ class PhysicalLevel:
 
     def __init__(self, config: Config) -> None:
         self._noise, self._rules = PhysicalNoise(config), EffectRules(config)
+        self.distributions = self._noise.distributions
         self._sensors: Recent[tuple[Any, ...], tuple[Physics, BodySelection | None]] = Recent(64)
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:

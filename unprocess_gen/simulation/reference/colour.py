@@ -80,12 +80,12 @@ def multiply(left: Matrix, right: Matrix) -> Matrix:
     Matrix
         The product.
     """
-    return matrix(
-        [
-            left[3 * i] * right[j] + left[3 * i + 1] * right[3 + j] + left[3 * i + 2] * right[6 + j]
-            for i in range(3)
-            for j in range(3)
-        ]
+    a, b, c, d, e, f, g, h, i = left
+    r, s, t, u, v, w, x, y, z = right
+    return (
+        *(a * r + b * u + c * x, a * s + b * v + c * y, a * t + b * w + c * z),
+        *(d * r + e * u + f * x, d * s + e * v + f * y, d * t + e * w + f * z),
+        *(g * r + h * u + i * x, g * s + h * v + i * y, g * t + h * w + i * z),
     )
 
 
@@ -169,29 +169,30 @@ def normalise_rows(entries: Matrix) -> Matrix:
     ValueError
         As `rgb2cam`.
     """
-    if not all(map(math.isfinite, entries)):
-        raise ValueError("a camera matrix has finite entries")
-    if not _is_well_conditioned(entries) and not condition(entries) <= MAX_CONDITION:
-        raise ValueError(f"the camera matrix is not invertible (condition number above {MAX_CONDITION:g})")
-    return matrix([entry for row in (entries[0:3], entries[3:6], entries[6:9]) for entry in _unit_row(row)])
+    if not _is_well_conditioned(entries):
+        if not all(map(math.isfinite, entries)):
+            raise ValueError("a camera matrix has finite entries")
+        if not condition(entries) <= MAX_CONDITION:
+            raise ValueError(f"the camera matrix is not invertible (condition number above {MAX_CONDITION:g})")
+    a, b, c, d, e, f, g, h, i = entries
+    return *_unit_row(a, b, c), *_unit_row(d, e, f), *_unit_row(g, h, i)
 
 
-def _unit_row(row: tuple[float, float, float]) -> list[float]:
-    """Return one row divided by its sum, on the grid of `normalise_rows`."""
-    a, b, c = row
+def _unit_row(a: float, b: float, c: float) -> tuple[float, float, float]:
+    """Return one row divided by its sum, on the grid of `normalise_rows`; the largest entry is 1 minus the others."""
     total = a + b + c
     if abs(total) <= 1e-9 * max(abs(a), abs(b), abs(c)):
         raise ValueError("a row of the camera matrix sums to zero, so white cannot be kept")
     a, b, c = a / total, b / total, c / total
-    sizes = [abs(a), abs(b), abs(c)]
+    sizes = abs(a), abs(b), abs(c)
     # The sum of two entries is 1 minus the third entry; the grid must represent these sums, too.
     reach = max(*sizes, abs(1 - a), abs(1 - b), abs(1 - c))
     grid = math.ldexp(1.0, max(math.frexp(reach)[1], 1) - 53)
-    unit = [math.floor(entry / grid + 0.5) * grid for entry in (a, b, c)]
+    a, b, c = math.floor(a / grid + 0.5) * grid, math.floor(b / grid + 0.5) * grid, math.floor(c / grid + 0.5) * grid
     largest = sizes.index(max(sizes))
-    unit[largest] = 0.0
-    unit[largest] = 1.0 - (unit[0] + unit[1] + unit[2])
-    return unit
+    if largest == 0:
+        return 1.0 - (b + c), b, c
+    return (a, 1.0 - (a + c), c) if largest == 1 else (a, b, 1.0 - (a + b))
 
 
 def invert(entries: Matrix) -> Matrix:
@@ -241,7 +242,7 @@ def _is_well_conditioned(entries: Matrix) -> bool:
     in `condition`, take 0.1 ms longer, as long as the rest of a plan.
     """
     a, b, c, d, e, f, g, h, i = entries
-    largest = max(map(abs, entries))
+    largest = max(max(entries), -min(entries))
     determinant = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
     return 1e-50 < largest < 1e50 and abs(determinant) > 1e-8 * largest * largest * largest
 
