@@ -194,7 +194,7 @@ def test_cfg_job_prints_settings_and_writes_nothing(run_main: RunMain, tmp_path:
 def test_default_settings_write_ds_only(run_main: RunMain, tmp_path: Path) -> None:
     done = run_main("n_jobs=1")
     assert done.code == 0, done.err
-    after = "next: gen-dataset preview ds --to sheets"
+    after = "next: gen-dataset preview ds --to ds_sheets"
     assert re.fullmatch(rf"ds: 10 pairs, [\d.]+ MB, [\d.]+ s, 0 failed; {after}\n", done.out)
     files = ["ds", "ds/config.yaml", "ds/dataset.json", "ds/manifest.csv", "ds/shards"]
     files += [f"ds/shards/shard-0000{number}.tar" for number in range(2)]

@@ -119,7 +119,8 @@ class Summary:
             failures += f", {self.filtered} filtered (source.min_side)"
         if not self.made:
             return f"{self.out} is complete: {size}, {failures}; nothing to do"
-        after = f"gen-dataset preview {self.out} --to sheets" if self.has_frames else f'ug.LivePairs("{self.out}")'
+        look = f"gen-dataset preview {self.out} --to {self.out.name}_sheets"
+        after = look if self.has_frames else f'ug.LivePairs("{self.out}")'
         part = f" ({self.made} in this run)" if self.made < self.rows else ""
         return f"{self.out}: {size}{part}, {self.seconds:.1f} s, {failures}; next: {after}"
 
