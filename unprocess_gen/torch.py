@@ -37,7 +37,7 @@ LEAST_LIGHT = 1e-8
 
 
 class DevelopmentParameters(NamedTuple):
-    """Hold what `develop` needs of a row, as arrays that PyTorch's default ``collate_fn`` stacks.
+    """Numbers of a row that `develop` needs, as arrays that PyTorch's default ``collate_fn`` stacks.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ def develop(
 
 
 class _Kind(NamedTuple):
-    """Hold the choices that frames developed together share: positions as in `DevelopmentParameters`, and gamma."""
+    """Choices that frames developed together share: positions as in `DevelopmentParameters`, and gamma."""
 
     pattern: int
     highlight: int
@@ -177,7 +177,7 @@ class _Kind(NamedTuple):
 
 
 def _stacked(rows: Any, count: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Return the parameters of all frames, those of `_Kind` first; ValueError unless there are as many as frames."""
+    """Parameters of all frames, those of `_Kind` first; ValueError unless there are as many as frames."""
     if isinstance(rows, Mapping | Plan):
         rows = development_parameters(rows)
     elif not isinstance(rows, DevelopmentParameters):
@@ -239,7 +239,7 @@ def _demosaic(values: Tensor, pattern: str) -> Tensor:
 
 
 def _mirrored(count: int) -> list[int]:
-    """Return the positions from -2 to count + 1, mirrored about the first and the last site."""
+    """Positions from -2 to count + 1, mirrored about the first and the last site."""
     period = 2 * (count - 1)
     return [min(position % period, -position % period) for position in range(-2, count + 2)]
 
@@ -306,7 +306,7 @@ def _solve_gray_mean(y: Tensor, k: Tensor, threshold: Tensor) -> Tensor:
 
 
 def _gray_gains(gray: Tensor, k: Tensor, threshold: Tensor) -> Tensor:
-    """Return the inverse gains for a channel mean, as `isp._gray_gains` does."""
+    """Inverse gains for a channel mean, as `isp._gray_gains`."""
     m = (gray - threshold).clamp(min=0) / (1 - threshold)
     return k + m * m * (1 - k).clamp(min=0)
 

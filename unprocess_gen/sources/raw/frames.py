@@ -7,6 +7,7 @@ pixel of a pair; pictures are drawn with them.
 
 from __future__ import annotations
 
+import operator
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -45,13 +46,13 @@ def read_raw_source(config: SourceConfig, content: bytes, name: str) -> Photogra
 
 
 def _photograph(config: SourceConfig, frame: RawFrame) -> Photograph:
-    facts, pattern = frame.metadata, file_pattern(frame, config.raw)
-    black, white = file_levels(facts, pattern, config.raw)
+    facts, (sensor, black, white) = frame.metadata, file_sensor(frame, config.raw)
     digest, stated = array_xxh3(frame.pixels), (facts.iso or 0.0, facts.exposure_s or 0.0)
-    source = SourcePlan(1, "off", config.shrink, pattern, black, white, digest, *stated)
-    codes = np.repeat(frame.pixels[..., None], 3, axis=2) if config.shrink == 1 else _cell_means(frame.pixels, source)
-    noise = _own_noise(facts, config.raw, (black[1], white[1])) if config.shrink == 1 else None
-    sensor = file_sensor(pattern, black, white)
+    source = SourcePlan(1, "off", config.shrink, sensor.pattern, black, white, digest, *stated)
+    if config.shrink == 1:
+        codes, noise = np.repeat(frame.pixels[..., None], 3, axis=2), _own_noise(facts, config.raw, white[1] - black[1])
+    else:
+        codes, noise = _cell_means(frame.pixels, source), None
     note = "is compressed with lossy JPEG, which removes noise and detail" if facts.compression == LOSSY_JPEG else ""
     return Photograph(codes, 1, RawParts(source, _camera(facts), IspPlan("none", "srgb"), sensor, noise), note)
 
@@ -71,18 +72,16 @@ def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
     return RawFrame(pixels, RawMetadata(pattern=raw.pattern))
 
 
-def file_pattern(frame: RawFrame, raw: RawConfig) -> str:
-    """Return the CFA pattern of the visible part; SourceError if it is another one than the given, or none."""
-    pattern, expected = frame.metadata.pattern or "", PATTERNS if raw.pattern is None else (raw.pattern,)
+def file_sensor(frame: RawFrame, raw: RawConfig) -> tuple[SensorPlan, Levels, Levels]:
+    """Sensor of a file with one black and one white level, and the levels of each plane; given ones take precedence.
+
+    Raises SourceError for another pattern than the given one, and for missing or impossible levels.
+    """
+    facts = frame.metadata
+    pattern, expected = facts.pattern or "", PATTERNS if raw.pattern is None else (raw.pattern,)
     if pattern not in expected:
-        raise SourceError(
-            "unsupported", f"has the CFA pattern {pattern or 'of no tile'}; expected {', '.join(expected)}"
-        )
-    return pattern
-
-
-def file_levels(facts: RawMetadata, pattern: str, raw: RawConfig) -> tuple[Levels, Levels]:
-    """Return the levels of each plane: given levels, else the levels of the file."""
+        text = f"has the CFA pattern {pattern or 'of no tile'}; expected {', '.join(expected)}"
+        raise SourceError("unsupported", text)
     by_site = facts.black_dn if raw.black_dn is None else (raw.black_dn,) * 4
     level = facts.white_dn if raw.white_dn is None else raw.white_dn
     if by_site is None or level is None:
@@ -92,17 +91,11 @@ def file_levels(facts: RawMetadata, pattern: str, raw: RawConfig) -> tuple[Level
     if not 0 <= min(black) <= max(black) < white[0] <= 65535:
         text = f"states the black levels {black} and the white level {level:g}; expected black below white"
         raise SourceError("corrupt", f"{text}; give source.raw.black_dn and source.raw.white_dn")
-    return black, white
-
-
-def file_sensor(pattern: str, black: Levels, white: Levels) -> SensorPlan:
-    """Return one black and one white level for all planes, the bits that hold them, and the pattern."""
-    levels = round(sum(black) / 4), round(min(white))
-    return SensorPlan(pattern, levels[1].bit_length(), *levels)
+    return SensorPlan(pattern, round(level).bit_length(), round(sum(black) / 4), round(level)), black, white
 
 
 def _cell_means(pixels: NDArray[np.uint16], source: SourcePlan) -> NDArray[np.uint16]:
-    """Return the means of the sites of each colour in each Bayer cell, as codes [H, W, 3]."""
+    """Means of the sites of each colour in each Bayer cell, as codes [H, W, 3]."""
     height, width = (side // 2 * 2 for side in pixels.shape)
     if not min(height, width):
         raise SourceError("too_small", "has less than one cell of 2 x 2 sites (source.shrink)")
@@ -113,22 +106,20 @@ def _cell_means(pixels: NDArray[np.uint16], source: SourcePlan) -> NDArray[np.ui
     return np.clip(codes, 0, 65535).astype(np.uint16)
 
 
-def _own_noise(facts: RawMetadata, raw: RawConfig, levels: tuple[float, float]) -> tuple[float, float] | None:
-    """Return S and O of the file's own noise, given or from the tag NoiseProfile; planes are averaged."""
-    span, stated = levels[1] - levels[0], facts.noise_profile or ()
+def _own_noise(facts: RawMetadata, raw: RawConfig, span_dn: float) -> tuple[float, float] | None:
+    """S and O of the file's own noise, given or from the tag NoiseProfile; planes are averaged."""
+    stated = facts.noise_profile or ()
     if raw.a_dn is not None and raw.b_dn2 is not None:
-        return raw.a_dn / span, raw.b_dn2 / (span * span)
+        return raw.a_dn / span_dn, raw.b_dn2 / (span_dn * span_dn)
     shares = {2: (1.0,), 6: (0.25, 0.5, 0.25), 8: (0.25,) * 4}.get(len(stated))
     if shares is None:
         return None
-    scale, offset = (
-        sum(share * number for share, number in zip(shares, stated[first::2], strict=True)) for first in (0, 1)
-    )
+    scale, offset = (sum(map(operator.mul, shares, stated[first::2])) for first in (0, 1))
     return (scale, offset) if scale >= 0 and offset >= 0 else None
 
 
 def _camera(facts: RawMetadata) -> CameraPlan:
-    """Return the colours of a file: the matrix at its white point and its gains; neutral ones if it states none."""
+    """Colours of a file: the matrix at its white point and its gains; neutral ones if it states none."""
     matrix, gains = camera_colours(facts)
     red, blue = gains or (1.0, 1.0)
     name = "".join(letter for letter in facts.model or "" if letter.isascii() and letter.isprintable())
@@ -144,7 +135,7 @@ def _camera(facts: RawMetadata) -> CameraPlan:
 
 
 def camera_colours(facts: RawMetadata) -> tuple[colour.Matrix | None, tuple[float, float] | None]:
-    """Return the matrix from XYZ to the camera at the white point of a file, and its gains of red and blue.
+    """Matrix from XYZ to the camera at the white point of a file, and its gains of red and blue.
 
     Raises SourceError if its tags contradict each other.
     """

@@ -13,7 +13,7 @@ from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.sources.raw.colour import temperature
 from unprocess_gen.sources.raw.decode import RawMetadata, decode_raw, tags_of
-from unprocess_gen.sources.raw.frames import camera_colours, file_levels, file_pattern, file_sensor
+from unprocess_gen.sources.raw.frames import camera_colours, file_sensor
 
 MARK = "Written by gen-dataset camera"
 """Text in the first line of each file, by which an earlier one is known."""
@@ -32,9 +32,9 @@ def check_options(to: Path, sensor: Path | None) -> None:
 
 
 def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return the text of the option of each group, and the source of each fact; ``name`` names the camera.
+    """Text of the option of each group, and the source of each fact; raises ConfigError or MachineError.
 
-    Raises ConfigError or MachineError.
+    ``name`` names the camera.
     """
     if file.suffix.lower() not in RAW_FILES:
         raise ConfigError(f"camera {file}: is no raw file; expected a file as {', '.join(RAW_FILES)}")
@@ -43,19 +43,18 @@ def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ..
     try:
         frame, tags = decode_raw(content), tags_of(content)
         matrix, gains = camera_colours(frame.metadata)
-        pattern = file_pattern(frame, RawConfig())
-        black, white = file_levels(frame.metadata, pattern, RawConfig())
+        sensor, black, _ = file_sensor(frame, RawConfig())
     except SourceError as error:
         raise ConfigError(f"camera {file}: {error.text}") from error
     if matrix is None:
         raise ConfigError(f"camera {file}: has no ColorMatrix, and LibRaw knows no matrix of its camera; expected one")
-    sensor, levels = file_sensor(pattern, black, white), ", ".join(f"{level:g}" for level in dict.fromkeys(black))
+    levels = ", ".join(f"{level:g}" for level in dict.fromkeys(black))
     black_tag, white_tag = ("LibRaw" if fact is None else "tag" for fact in (tags.black_dn, tags.white_dn))
     sources = {
         "matrix": _matrix_source(tags),
         "gains": _gains_source(tags, gains),
         "levels": f"black {levels} ({black_tag}), white {sensor.white_level_dn} ({white_tag}); mean of black",
-        "pattern": f"{pattern} at the corner of the visible part",
+        "pattern": f"{sensor.pattern} at the corner of the visible part",
     }
     model = " ".join((frame.metadata.model or "a camera without a name").split())
     facts = tuple(f"{fact}: {source}" for fact, source in sources.items())
@@ -66,7 +65,7 @@ def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ..
     levels = f"black_level_dn: {sensor.black_level_dn}\nwhite_level_dn: {sensor.white_level_dn}\n"
     options = {
         "camera": f"{head}name: {name}\nlaw: custom\nxyz2cam: [{entries}]\n",
-        "sensor": f"{head}bits: {sensor.bits}\n{levels}pattern: {pattern}\nsaturated: auto\n",
+        "sensor": f"{head}bits: {sensor.bits}\n{levels}pattern: {sensor.pattern}\nsaturated: auto\n",
     }
     return options, facts
 
