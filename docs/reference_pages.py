@@ -8,7 +8,7 @@ from effect_page import effects_page
 from noise_profile_page import profiles_page
 from scene_page import scenes_page
 
-from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
+from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Flag, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.cli.help import synopsis
 from unprocess_gen.cli.verbs import VERBS
@@ -238,13 +238,13 @@ def command_line_page() -> str:
     for verb in VERBS.values():
         blocks += [f"## {verb.name}", f"    {synopsis(verb)}", _summary(verb)]
         arguments = [[code(verb.place.metavar), verb.place.expected]] if verb.place else []
-        arguments += [[code(verb.extra.metavar), verb.extra.help]] if verb.extra else []
-        arguments += [_argument(argument) for argument in verb.arguments]
+        arguments += [_argument(flag) for flag in verb.flags]
+        arguments += [[code(key), text] for key, text in verb.keys.items()]
         if arguments:
             blocks.append(table(["argument", "meaning"], arguments))
-    flags = [_argument(argument) for argument in STANDARD]
+    flags = [_argument(flag) for flag in STANDARD]
     flags += [["`-h, --help`", "print the help of the verb"], ["`--version`", "print the version"]]
-    hydra = [_argument(argument) for argument in HYDRA_FLAGS]
+    hydra = [_argument(flag) for flag in HYDRA_FLAGS]
     codes = [[code, meaning] for code, meaning in EXIT_CODES.items()]
     blocks += ["## Flags of every verb", table(["flag", "meaning"], flags)]
     blocks += [HYDRA_INTRODUCTION, table(["flag", "meaning"], hydra)]
@@ -257,8 +257,8 @@ def _summary(verb: Verb) -> str:
     return f"{verb.summary[0].upper()}{verb.summary[1:]}."
 
 
-def _argument(argument: Argument) -> list[str]:
-    return [code(argument.spelled), argument.help + (" (required)" if argument.required else "")]
+def _argument(flag: Flag) -> list[str]:
+    return [code(flag.spelled), flag.summary]
 
 
 PAGES = {

@@ -33,7 +33,6 @@ from unprocess_gen.core.errors import SourceError, UnprocessGenError
 REFUSED = [
     (["camera=nope"], r"camera=nope: no such option; expected one of canon_5d4, canon_700d, "),
     (["~camera"], r"~camera: a setting cannot be removed"),
-    (["+camera=convex"], r".*camera.*more than once"),
     (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
     (["word"], r"word: no such verb; expected generate, .*build, calibrate, camera or settings key=value"),
     (["camera=convex", "word"], r"generate: word: expected a setting key=value"),
@@ -45,7 +44,7 @@ REFUSED = [
     (["--multrun", "seed=1,2"], r"generate: --multrun: no such flag; .*; did you mean --multirun\?"),
     (["verify", "ds", "--regenrate", "2"], r"verify: --regenrate: no such flag; .*; did you mean --regenerate\?"),
     (["verify", "ds", "--regenerate"], r"verify: --regenerate: expected one argument"),
-    (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate -2: expected an integer of 0 or more"),
+    (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate: -2: expected an integer of 0 or more"),
     (["replay", "ds", "--keys="], r"replay: --keys: a value is missing"),
     (["verify"], r"verify: expected the folder of a dataset or of a sweep"),
     (["--config-dir", "/no/such"], r"--config-dir /no/such: no such folder"),
@@ -53,12 +52,11 @@ REFUSED = [
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
     (["out="], r"out='': expected the name of a folder"),
     (["out=ftp://x/y"], r"out=ftp://x/y: expected the name of a folder or a URL s3://, gs:// or az://"),
-    (["preview", "ds", "--to", "s3://x/y"], r"preview: --to s3://x/y: expected a local folder"),
+    (["preview", "ds", "--to", "s3://x/y"], r"preview: --to: s3://x/y: expected a local path"),
     (["-m", "camera=nope"], r"camera=nope: no such option"),
     (["hydra.run.dir=there"], r"hydra.run.dir=there: Hydra's own settings are fixed"),
     (["--cfg"], r"generate: -c/--cfg: expected one argument; see gen-dataset generate --help"),
-    (["--cfg", "x"], r"generate: --cfg x: expected job or hydra or all"),
-    (["again", "ds", "out=x", "output.frames=no"], r"again: output.frames=no: expected true"),
+    (["--cfg", "x"], r"generate: -c/--cfg: .*'x' .*job"),
     (["-m", "hydra.sweeper.params.seed=1,2"], r"hydra.sweeper.params.seed=1,2: Hydra's own settings are fixed"),
     (["again", "/no/such", "out=x"], r"again: /no/such: no such folder; expected the folder of a dataset"),
 ]  # fmt: skip
@@ -111,7 +109,7 @@ def test_out_below_a_file_is_refused(run_main: RunMain, tmp_path: Path, photos: 
 # Help and printed settings --------------------------------------------------------------------------------------------
 
 
-HELP = global_help(VERBS, conf_dir())
+HELP = global_help(VERBS)
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("-h",), ("camera=nope", "--help"), ("nope", "-h")])
@@ -123,9 +121,8 @@ def test_help_lists_verbs_whatever_else_is_given(arguments: tuple[str, ...], run
 def test_every_verb_answers_help_with_its_own_arguments(verb: Verb, run_main: RunMain, tmp_path: Path) -> None:
     done = run_main(verb.name, "--help", "word", "--flag")
     assert (done.code, done.err) == (0, "")
-    for argument in (*verb.arguments, *STANDARD):
-        for name in argument.names:
-            assert re.search(rf"(?<!\S){re.escape(name)}\b", done.out), name
+    for name in [*verb.keys, *(name for flag in (*verb.flags, *STANDARD) for name in flag.names)]:
+        assert re.search(rf"(?<!\S){re.escape(name)}\b", done.out), name
     assert ("--multirun" in done.out) == verb.composes
     assert max(map(len, done.out.splitlines())) <= 100
     assert list(tmp_path.iterdir()) == []
@@ -134,7 +131,7 @@ def test_every_verb_answers_help_with_its_own_arguments(verb: Verb, run_main: Ru
 def test_help_names_every_group_and_top_level_setting() -> None:
     listed = [re.match(r"  (\w+)(?: |=)", line) for line in HELP.splitlines()]
     names = [match[1] for match in listed if match]
-    assert sorted(name for name in names if hasattr(Config(), name)) == sorted([*GROUPS, *settings_of(Config)])
+    assert {name for name in names if hasattr(Config(), name)} == {*GROUPS, *settings_of(Config)}
 
 
 @pytest.mark.parametrize("group", [*GROUPS, *ADDED_GROUPS])
@@ -281,8 +278,9 @@ def test_again_reports_a_different_dataset(run_main: RunMain, make: Make, tmp_pa
 
 AGAIN_REFUSED = [
     ([], r"again: out is missing"),
-    (["out=new", "source.root=p", "seed=1"], r"again: seed=1: unknown argument; expected source.root, "),
-    (["out=new", "source.root=p", "n_jobs=two"], r"again: n_jobs=two: expected an integer"),
+    (["out=new", "source.root=p", "seed=1"], r"again: seed=1: unknown argument; expected out, source.root, "),
+    (["out=new", "source.root=p", "output.frames=no"], r"again: output.frames=no: expected true"),
+    (["out=new", "source.root=p", "n_jobs=two"], r"n_jobs=two: expected 1 to 1024 or -1"),
     (["out=new", "source.root=p", "source.root=p"], r"again: source.root=p: source.root is given twice"),
     (["out=new", "--source", "p"], r"again: --source: no such flag"),
 ]  # fmt: skip

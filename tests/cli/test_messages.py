@@ -18,7 +18,6 @@ from helpers.datasets import Make
 from helpers.photographs import fill
 from helpers.processes import WAIT_S, wait_for
 
-from unprocess_gen.cli import runs
 from unprocess_gen.cli.messages import report
 from unprocess_gen.sources.image.codec_messages import captured
 
@@ -126,7 +125,7 @@ def test_signal_hidden_by_a_library_error_ends_a_sweep(
         except BaseException as error:
             raise ValueError("internal error") from error
 
-    monkeypatch.setattr(runs, "generate_dataset", interrupted)
+    monkeypatch.setattr("unprocess_gen.pipeline.generate.generate", interrupted)
     fill(tmp_path / "p", 1)
     done = run_main("-m", "seed=1,2", "source.root=p", "out=sweep")
     assert (done.code, started) == (128 + sent, ["1/2 seed=1"])

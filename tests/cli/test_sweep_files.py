@@ -14,9 +14,9 @@ from helpers.commands import RunMain
 from helpers.datasets import TreeHash, sweep_rows
 from helpers.photographs import fill
 
-from unprocess_gen.config.composition import OptionFolders
-from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.sweep_expansion import expand
+from unprocess_gen.cli.sweep import named_overrides
+from unprocess_gen.config.composition import compose_jobs
+from unprocess_gen.config.option_files import OptionFolders, conf_dir
 
 PARAMS = {"camera": "sony_a7r,nexus_6p", "gains.red": "2,2.2"}
 SWEEP = {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": PARAMS}}}
@@ -40,9 +40,9 @@ def write(path: Path, content: dict[str, Any], header: str = "# @package _global
 
 def jobs(*overrides: str, own: Path | None = None, multirun: bool = False) -> list[str]:
     """Return the names of the folders that overrides expand to."""
-    node, jobs = expand(overrides, OptionFolders(own=own), multirun)
-    assert node is None
-    return [",".join(sorted(job.named)) for job in jobs]
+    jobs = list(compose_jobs(overrides, OptionFolders(own=own), multirun))
+    assert all(job.swept is not None for job in jobs)
+    return [",".join(named_overrides(job.overrides)) for job in jobs]
 
 
 WAYS = {
@@ -143,7 +143,7 @@ REFUSED = {
     ),
     "broken values": ({"mode": "MULTIRUN", "sweeper": {"params": {"seed": "choice(1"}}}, r".*choice\(1"),
     "settings of Hydra": (
-        {"mode": "MULTIRUN", "sweeper": {"params": {"hydra.verbose": "true,false"}}}, r".*over settings of Hydra is",
+        {"mode": "MULTIRUN", "sweeper": {"params": {"hydra.verbose": "true,false"}}}, r"hydra.verbose=true,false: ",
     ),
     "removed key": ({"mode": "MULTIRUN", "sweeper": {"params": {"~seed": "1"}}}, r"~seed=1: a setting cannot be"),
 }  # fmt: skip

@@ -17,8 +17,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 
 from unprocess_gen.config import composition
-from unprocess_gen.config.composition import OptionFolders, compose_node, load_config
-from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.composition import compose_node, load_config
+from unprocess_gen.config.option_files import OptionFolders, conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
 
@@ -96,19 +96,21 @@ REFUSED = [
     ("accuracy=quick", r"accuracy=quick: expected one of reference, exact, fast$"),
     ("source.include={a: 1}", r"source.include=\{a: 1\}: expected a list of at least one pattern such as "),
     ("noise.branches=[1]", r"noise.branches\[0\]: expected a list of mappings with the keys of a branch$"),
-    ("noise.provenance=[{sauce: x}]", r"noise.provenance: sauce: no such key; an item has numbers, .* mean source\?"),
+    ("noise.provenance=[{sauce: x}]", r"noise.provenance: sauce: no such key; noise.provenance has .* mean source\?"),
     ("noise.branches=[{iso: x}]", r"noise.branches: iso: expected the lowest and the highest ISO, \[100, 6400\]$"),
     ("source.include=*.jpg", r"source.include=\*.jpg: expected a list, such as \[\*.jpg\]"),
-    ("camera=sony_a7r,leica", "camera=sony_a7r,leica: several values; expected one$"),
+    ("camera=sony_a7r,leica", "camera=sony_a7r,leica: several values; expected one; "),
     (
         "gains.red.x=1",
-        "gains.red.x=1: gains.red has no key x; expected gains.red=…: a gain above 0, from 0.001 to 1000",
+        "gains.red.x=1: no such key; expected a gain above 0, from 0.001 to 1000",
     ),
     ("seed=[1", r"seed=\[1: not a valid override"),
     ("~seed", r"~seed: a setting cannot be removed"),
     ("out=${no.such}", r"out=\$\{no.such\}: Interpolation key 'no.such' not found"),
     ("out=${oc.env:UG_NOT_SET}", r"out=\$\{oc.env:UG_NOT_SET\}: Environment variable 'UG_NOT_SET' not found$"),
-    ("hydra.mode=MULTIRUN", r"hydra.mode=MULTIRUN: settings of Hydra belong to the command line"),
+    ("hydra.mode=MULTIRUN", r"describe a sweep; expected one config"),
+    ("hydra.run.dir=here", r"hydra.run.dir=here: Hydra's own settings are fixed"),
+    ("++sed=1", "sed=1: no such key; .*; did you mean seed"),
 ]
 
 
@@ -126,7 +128,7 @@ def test_options_that_a_built_in_option_hides_are_refused(own: Path) -> None:
     assert load_config(["noise=own", "noise.bits=null"], own).noise.name == "own"
 
 
-@pytest.mark.parametrize("place", ["typed_config", "validate_config", "source_overrides", "_check_own_options"])
+@pytest.mark.parametrize("place", ["typed_config", "validate_config", "check_raw_overrides", "_check_own_files"])
 def test_bugs_are_neither_hidden_nor_tried_twice(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
@@ -141,14 +143,14 @@ def test_bugs_are_neither_hidden_nor_tried_twice(place: str, monkeypatch: pytest
 
 
 def test_long_keys_are_refused_in_one_sentence() -> None:
-    with pytest.raises(ConfigError, match="no such key; see gen-dataset --help"):
+    with pytest.raises(ConfigError, match="expected a setting key=value"):
         load_config([f"{'a' * 300}=1"])
 
 
 def test_sweeps_are_refused() -> None:
     with pytest.raises(ConfigError, match="the overrides describe a sweep; expected one config"):
         load_config(["+sweep=cameras"])
-    with pytest.raises(ConfigError, match=r"seed=1,2: several values; expected one; for a list, write seed=\[1,2\]"):
+    with pytest.raises(ConfigError, match=r"seed=1,2: several values; expected one; .*write seed=\[1,2\]"):
         load_config(["seed=1,2"])
 
 
@@ -226,7 +228,7 @@ def test_nested_overrides_are_refused_quickly(depth: int) -> None:
 SLOW = """
 import os, sys, time
 from unprocess_gen.cli import main
-from unprocess_gen.config import yaml_files, composition
+from unprocess_gen.config import composition
 def slowly(path):
     os.close(os.open("started", os.O_CREAT))
     time.sleep(60)

@@ -54,6 +54,7 @@ NEEDS = {
     "camera/custom.yaml": [f"camera.xyz2cam={MATRIX}"],
     "noise/heteroscedastic.yaml": ["noise.a=3.5", "noise.b=12"],
     "body/imx385.yaml": ["noise.iso=3200"],
+    "source/raw.yaml": [f"source.root={conf_dir()}"],
     "sensor/source.yaml": ["source.kind=raw", f"source.root={conf_dir()}", "source.include=[x.dng]"],
     "noise/imx385.yaml": ["noise.iso=3200"],  # the ISO of scene=daylight is not calibrated
 }
@@ -262,7 +263,7 @@ def test_config_yaml_round_trip_keeps_the_text(settings: Settings, tmp_path: Pat
         text = dataset_yaml(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
         (tmp_path / "config.yaml").write_text(text, encoding="utf-8")
         again, kind = read_dataset_yaml(tmp_path / "config.yaml")
-        assert kind == ("raw" if file.stem == "source" else "synthetic"), file
+        assert kind == ("raw" if file.stem in ("source", "raw") else "synthetic"), file
         assert dataset_yaml(again) == text, file
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -75,9 +76,9 @@ def _choices(*options: str) -> DictConfig:
 
 @functools.cache
 def _option(group: str, name: str) -> Any:
-    """Return a group of the config with one of its options; None if the option refers to values of other groups."""
+    """Return a group of the config with one of its options; None if the option refers to other groups."""
     file = conf_dir() / group / f"{name}.yaml"
-    if "${" in file.read_text(encoding="utf-8"):
+    if re.search(r"^defaults:|\$\{", file.read_text(encoding="utf-8"), re.MULTILINE):
         return None
     top = OmegaConf.load(conf_dir() / "config.yaml").get(group, {})
     return _object(OmegaConf.merge(writable_node(type(getattr(Config(), group))), OmegaConf.load(file), top))

@@ -106,7 +106,7 @@ def test_difference_is_named_by_file_key_and_column(run_main: RunMain, tmp_path:
         (("--to", "a"), 2, "build: NAME is missing"),
         ((SMALL,), 2, "build: --to is missing"),
         (("--list", SMALL), 2, "--list: lists all builds"),
-        ((SMALL, "--to", "s3://bucket"), 2, "expected a local folder"),
+        ((SMALL, "--to", "s3://bucket"), 2, "expected a local path"),
         (
             (SMALL, "--to", "full"),
             2,

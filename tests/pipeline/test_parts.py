@@ -268,8 +268,6 @@ def test_ranges_are_written_as_batch_systems_read_them(numbers: list[int], text:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("prepare", ROOT, ONE, "out=ds"), "prepare: parts is missing; give parts=N: number of parts"),
-        (("prepare", "parts=0", ROOT, ONE, "out=ds"), "prepare: parts=0: expected an integer of 1 or more"),
         (("prepare", "parts=5", ROOT, ONE, "n_jobs=1", "out=ds"),
          "parts=5: ds was prepared with parts=6; expected that number; choose another out"),
         (("prepare", "parts=13", ROOT, ONE, "n_jobs=1", "out=ds"),
@@ -281,7 +279,7 @@ def test_ranges_are_written_as_batch_systems_read_them(numbers: list[int], text:
         (("part", "ds", "0", "n_jobs=0"), "n_jobs=0: expected 1 to 1024 or -1 for one per core"),
         (("part", "ds", "0", "source.root=none"), "source.root=none: no such folder or file; expected an "
          "existing folder of photographs"),
-        (("part", "ds", "x"), "part: x: expected an integer of 0 or more"),
+        (("part", "ds", "x"), "part: part=x: expected an integer"),
         (("part", "ds"), "part: its number is missing; expected it after ds, or in one of SLURM_ARRAY_TASK_ID, "
          "PBS_ARRAY_INDEX, JOB_COMPLETION_INDEX"),
         (("part", "p", "0"), "out=p: contains no plan of a run in parts; expected one; run gen-dataset prepare first"),

@@ -19,13 +19,13 @@ from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.limits import Choice
-from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir, group_options, option_summary
+from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.dataset.columns import COLUMNS
 
-HELP = global_help(VERBS, conf_dir())
+HELP = global_help(VERBS)
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 README = PAGES[0].read_text(encoding="utf-8")
@@ -154,13 +154,13 @@ def test_every_verb_and_flag_is_explained() -> None:
     page = generated("command_line")
     for verb in VERBS.values():
         assert verb.summary and f"    {synopsis(verb)}\n" in page, verb.name
-        assert f"gen-dataset {verb.name}" in HELP
+        assert f"  {verb.name} " in HELP
         text = page.split(f"\n## {verb.name}\n")[1].split("\n## ")[0]
-        for argument in verb.arguments:
-            assert argument.help and f"| `{argument.spelled}` | {argument.help}" in text, argument.spelled
+        for spelled, summary in [*((flag.spelled, flag.summary) for flag in verb.flags), *verb.keys.items()]:
+            assert summary and f"| `{spelled}` | {summary} |" in text, spelled
         assert verb.place is None or f"| `{verb.place.metavar}` | {verb.place.expected} |" in text
     for argument in (*STANDARD, *HYDRA_FLAGS):
-        assert argument.help and f"| `{argument.spelled}` | {argument.help} |" in page
+        assert f"| `{argument.spelled}` | {argument.summary} |" in page
 
 
 def test_columns_allow_every_value_that_settings_allow() -> None:

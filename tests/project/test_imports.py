@@ -12,17 +12,14 @@ from helpers.modules import MODULES, PACKAGE, tree
 
 ONLY_IN = {
     "hydra": {
-        *("config.composition", "config.composition_errors", "config.sweep_expansion"),
+        *("config.composition", "config.composition_errors"),
     },
     "omegaconf": {
         *(
-            "cli.hydra_app",
             "config.composition",
             "config.composition_errors",
-            "config.raw_composition",
             "config.serialization",
         ),
-        *("config.overrides", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},

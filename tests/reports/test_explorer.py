@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import unprocess_gen as ug
-from unprocess_gen.config.composition import OptionFolders
+from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.config.overrides import overrides_of
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.dataset.manifest import read_rows

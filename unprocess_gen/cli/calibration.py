@@ -18,13 +18,13 @@ def calibrate(call: Call) -> int:
     """Write a noise profile and the list of its estimates, from captures or from what DNG files state."""
     from unprocess_gen.calibration.calibrate import check_outputs
 
-    assert call.path is not None
-    folder = local_path(call.path, f"calibrate: {call.path} is in an object store; expected a local folder")
-    to, page = Path(call.values["to"]), call.values.get("report")
-    if "from" in call.values and page is not None:
+    assert call.place is not None
+    folder = local_path(call.place, f"calibrate: {call.place} is in an object store; expected a local folder")
+    to, page = call.to, call.report
+    if call.origin and page is not None:
         raise ConfigError(f"calibrate: --report {page}: draws measured frames, not tags; leave it out")
     check_outputs(to)
-    isos = _state(folder, to) if "from" in call.values else _measure(folder, to, page)
+    isos = _state(folder, to) if call.origin else _measure(folder, to, page)
     print_results(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with {_usage(to)} scene.iso={isos[0]:g}")
     return 0
 
@@ -42,7 +42,7 @@ def _state(folder: Path, to: Path) -> Sequence[float]:
     return [result.iso for result in stated.isos]
 
 
-def _measure(folder: Path, to: Path, page: str | None) -> Sequence[float]:
+def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:
     """Write the profile of flats and darks, and a page about them; return its ISOs."""
     from unprocess_gen.calibration.calibrate import calibrate, write_files
     from unprocess_gen.calibration.profile import estimates, estimates_json, measured_yaml
@@ -51,7 +51,7 @@ def _measure(folder: Path, to: Path, page: str | None) -> Sequence[float]:
     if page is not None:
         from unprocess_gen.reports.calibration_page import check_page, write_page
 
-        check_page(Path(page))
+        check_page(page)
     calibration = calibrate(folder, partial(with_bar, unit="frame"))
     _report_notes(calibration.notes)
     write_files(to, measured_yaml(calibration, to.stem), estimates_json(estimates(calibration)))
@@ -63,7 +63,7 @@ def _measure(folder: Path, to: Path, page: str | None) -> Sequence[float]:
             f"read noise {short_number(read.value, 4)} DN, row noise {short_number(row.value, 3)} DN"
         )
     if page is not None:
-        write_page(calibration, to.stem, f"gen-dataset calibrate {folder} --to {to}", Path(page))
+        write_page(calibration, to.stem, f"gen-dataset calibrate {folder} --to {to}", page)
         print_results(f"drawn in {page}")
     return calibration.captures.isos
 

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import LocalPath, local_path
 
 
 def camera(call: Call) -> int:
     """Write the options, and print what was read from which tag."""
+    from unprocess_gen.core.files import machine_errors
     from unprocess_gen.sources.raw.options import camera_options, check_options
 
-    assert call.path is not None
-    file = local_path(call.path, f"camera: {call.path} is in an object store; expected a local file")
+    assert call.place is not None
+    file = local_path(call.place, f"camera: {call.place} is in an object store; expected a local file")
     if not file.is_file():
         raise ConfigError(f"camera {file}: no such file; expected a raw file")
-    to, sensor = Path(call.values["to"]), Path(call.values["sensor"]) if "sensor" in call.values else None
+    to, sensor = call.to, call.sensor
     check_options(to, sensor)
     options, sources = camera_options(file, to.stem)
     paths = {"camera": to} | ({"sensor": sensor} if sensor else {})

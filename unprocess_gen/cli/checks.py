@@ -6,35 +6,32 @@ import shlex
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results, report, report_error
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import worst
-from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 from unprocess_gen.core.paths import AnyPath, local_path
-from unprocess_gen.dataset.reader import RawPairs
-from unprocess_gen.dataset.row import Row
-from unprocess_gen.dataset.selection import select_rows
-from unprocess_gen.pipeline.progress import with_bar
-from unprocess_gen.pipeline.repair import repair
-from unprocess_gen.pipeline.replay import ReplayResult, evenly_spaced_rows, source_root
-from unprocess_gen.pipeline.replay import replay as replay_rows
-from unprocess_gen.pipeline.verify import Damage, is_sweep, verify_sweep
-from unprocess_gen.pipeline.verify import verify as verify_dataset
 from unprocess_gen.reports.formatting import counted
+
+if TYPE_CHECKING:
+    from unprocess_gen.dataset.row import Row
+    from unprocess_gen.pipeline.replay import ReplayResult
 
 
 def verify(call: Call) -> int:
     """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
+    from unprocess_gen.pipeline.verify import is_sweep, verify, verify_sweep
+
     folder = dataset_folder(call, sweeps=True)
     given_root(call)
-    if {"noise", "against"} <= call.values.keys():
+    if call.noise and call.against:
         raise ConfigError("verify: --noise and --against exclude each other; expected one of them")
     if not is_sweep(folder):
-        return _finish(folder, verify_dataset(folder), call)
-    if "against" in call.values:
+        return _finish(folder, verify(folder), call)
+    if call.against:
         raise ConfigError(f"verify: --against: {folder} is a sweep; expected one of its datasets")
     codes = []
     for result in verify_sweep(folder):
@@ -46,26 +43,26 @@ def verify(call: Call) -> int:
     return worst(codes)
 
 
-def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
+def _finish(folder: AnyPath, damages: Iterable[object], call: Call) -> int:
     """Report the damage of a dataset; repair, regenerate and check the noise as the flags ask; return the exit code."""
+    from unprocess_gen.pipeline.verify import verify
+
     texts, codes, done = _reported(folder, damages), [], ""
     is_finished = any((folder / name).exists() for name in ("dataset.json", "manifest.csv"))  # not so in a sweep
-    if texts and is_finished and "repair" in call.values:
+    if texts and is_finished and call.repair:
         codes = _repair(folder, call)
-        texts = _reported(folder, verify_dataset(folder))
+        texts = _reported(folder, verify(folder))
     elif texts and is_finished and isinstance(folder, Path):
         report(f"{folder}: to restore damaged files, run gen-dataset verify {shlex.quote(str(folder))} --repair")
-    if not texts and call.values.get("regenerate"):
+    if not texts and call.regenerate:
         results = _regenerated(folder, call)
-        codes, done = (
-            [result.exit_code for result in results],
-            f"; {counted(len(results), 'pair')} regenerated, bit for bit",
-        )
+        codes = [result.exit_code for result in results]
+        done = f"; {counted(len(results), 'pair')} regenerated, bit for bit"
         texts = _reported(folder, (_complaint(result) for result in results if result.complaint))
-    if not texts and "noise" in call.values:
+    if not texts and call.noise:
         texts = _check_noise(folder, call)
-    if not texts and "against" in call.values:
-        texts = _compare_frames(folder, Path(call.values["against"]))
+    if not texts and call.against:
+        texts = _compare_frames(folder, call.against)
     if texts:
         return worst(codes) or DamageError.exit_code
     print_results(f"{folder} is intact{done}")
@@ -73,25 +70,27 @@ def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
 
 
 def _repair(folder: AnyPath, call: Call) -> list[int]:
-    """Restore damaged files, report each step, and return the exit codes of the steps."""
+    """Restore damaged files and report each step; the exit codes of the steps."""
+    from unprocess_gen.pipeline.repair import repair
+    from unprocess_gen.pipeline.replay import source_root
+
     refusal = f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset"
     manifest, codes = folder / "manifest.csv", []
-    root, dark = source_root(manifest, call.values.get("source.root")), dark_frames_of(manifest, call)
+    root, dark = source_root(manifest, call.settings.get("source.root")), dark_frames_of(manifest, call)
     for step in repair(local_path(folder, refusal), root, dark):
-        if step.exit_code:
-            report(step.text)
-        else:
-            print_results(step.text)
+        (report if step.exit_code else print_results)(step.text)
         codes.append(step.exit_code)
     return codes
 
 
 def _regenerated(folder: AnyPath, call: Call) -> list[ReplayResult]:
     """Regenerate rows that are spread evenly over the dataset, and compare them."""
+    from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay, source_root
+
     manifest = folder / "manifest.csv"
-    rows = evenly_spaced_rows(manifest, call.values["regenerate"])
-    root = source_root(manifest, call.values.get("source.root"))
-    return list(replay_rows(rows, root, dark_frames=dark_frames_of(manifest, call)))
+    rows = evenly_spaced_rows(manifest, call.regenerate)
+    root = source_root(manifest, call.settings.get("source.root"))
+    return list(replay(rows, root, dark_frames=dark_frames_of(manifest, call)))
 
 
 def _complaint(result: ReplayResult) -> str:
@@ -99,7 +98,9 @@ def _complaint(result: ReplayResult) -> str:
 
 
 def _check_noise(folder: AnyPath, call: Call) -> list[str]:
-    """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
+    """Compare the noise in the arrays with the manifest's numbers; what does not fit."""
+    from unprocess_gen.dataset.reader import RawPairs
+    from unprocess_gen.pipeline.progress import with_bar
     from unprocess_gen.reports.noise_check.checks import check_pairs
     from unprocess_gen.sources.dark_frames import dark_folder
 
@@ -107,29 +108,26 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     try:
         access = None if dark_frames is None else dark_folder(dark_frames)
     except ConfigError:  # without the recorded files, the pairs are counted as not checked
-        if "noise.dark_frames" in call.values:
+        if "noise.dark_frames" in call.settings:
             raise
         access = None
     pairs = RawPairs(folder)
     checks = check_pairs(with_bar(pairs, "pair checked", len(pairs)), len(pairs), access)
+    reasons = "too few usable sites, or a dark frame that is not available"
     if not checks.count:
-        print_results(
-            f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
-            "noise.dark_frames=FOLDER names their folder"
-        )
+        print_results(f"{folder}: no pair can be checked: {reasons}; noise.dark_frames=FOLDER names their folder")
         return []
-    unchecked = f"; {checks.unchecked} not checked: too few usable sites, or a dark frame that is not available"
-    print_results(
-        f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong"
-        + (unchecked if checks.unchecked else "")
-    )
+    unchecked = f"; {checks.unchecked} not checked: {reasons}" if checks.unchecked else ""
+    print_results(f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong{unchecked}")
     unlisted = checks.wrong_pairs - sum(bool(alarm.key) for alarm in checks.alarms)
     more = [f"noise of {counted(unlisted, 'other pair')}: wrong too"] if unlisted else []
-    return _reported(folder, [*map(str, checks.alarms), *more])
+    return _reported(folder, [*checks.alarms, *more])
 
 
 def _compare_frames(folder: AnyPath, frames: Path) -> list[str]:
-    """Compare raw frames of a camera with the profile of a dataset; return what differs."""
+    """Compare raw frames of a camera with the profile of a dataset; what differs."""
+    from unprocess_gen.config.serialization import read_dataset_yaml
+    from unprocess_gen.pipeline.progress import with_bar
     from unprocess_gen.reports import against
 
     config, _ = read_dataset_yaml(folder / "config.yaml")
@@ -137,11 +135,9 @@ def _compare_frames(folder: AnyPath, frames: Path) -> list[str]:
     for note in comparisons.notes:
         report(note)
     compared = [comparison for comparison in comparisons.numbers if comparison.verdict != against.NOT_COMPARED]
-    print_results(
-        f"{frames}: {counted(len(compared), 'number')} compared with the profile {config.noise.name}, "
-        f"{len(comparisons.differences)} wrong"
-    )
-    return _reported(folder, map(str, comparisons.differences))
+    numbers = f"{counted(len(compared), 'number')} compared with the profile {config.noise.name}"
+    print_results(f"{frames}: {numbers}, {len(comparisons.differences)} wrong")
+    return _reported(folder, comparisons.differences)
 
 
 def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
@@ -154,13 +150,15 @@ def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
 
 def replay(call: Call) -> int:
     """Regenerate rows of a manifest, and compare or write their arrays."""
+    from unprocess_gen.dataset.selection import select_rows
+    from unprocess_gen.pipeline.replay import replay, source_root
+
     manifest = dataset_folder(call, files=True)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
-    to = Path(call.values["to"]) if "to" in call.values else None
     failed: list[Row] = []
-    rows = _ok_rows(select_rows(manifest, call.values.get("keys"), failed), failed)
+    rows = _ok_rows(select_rows(manifest, call.keys, failed), failed)
     codes, written, unknown = [], False, 0
-    for result in replay_rows(rows, source_root(manifest, given_root(call)), to, dark_frames_of(manifest, call)):
+    for result in replay(rows, source_root(manifest, given_root(call)), call.to, dark_frames_of(manifest, call)):
         codes.append(result.exit_code)
         written |= result.written
         unknown += not result.compared
@@ -171,7 +169,7 @@ def replay(call: Call) -> int:
     print_results(
         f"{counted(same, 'pair')} {_are(same)} the same, bit for bit; {others} {_are(others)} not"
         + (f"; {counted(unknown, 'row')} without digests" if unknown else "")
-        + (f"; arrays in {to}" if written else "")
+        + (f"; arrays in {call.to}" if written else "")
         + (f"; {counted(len(failed), 'failed row')} skipped" if failed else "")
     )
     return worst(codes)

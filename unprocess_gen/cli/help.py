@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import textwrap
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
-from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.values import value_text
+from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir, group_options, option_summary
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.suggestions import did_you_mean
 
 WIDTH = 100
-INDENT = 11
 COLUMN = 34
 
 INTRODUCTION = """\
@@ -24,133 +24,135 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset -m camera=sony_a7r,nexus_6p noise=imx385_iso1600,imx385_iso3200 out=sweep
                                        a sweep: one dataset folder each, and sweep/sweep.csv
   gen-dataset VERB --help              the arguments of a verb
-
-Verbs:
 """
 
-SETTINGS_HELP = """
+SETTINGS_HELP = """\
 Settings are key=value, in any order. group=option selects an option, group.key=value changes one
-value. gen-dataset --help GROUP explains the options and keys of a group:
-"""
+value. gen-dataset --help GROUP explains the options and keys of a group:"""
 
-SHOWN_HYDRA_FLAGS = ("multirun", "cfg", "config_dir")
-"""Flags of Hydra that the help of the program names; the help of a verb names all."""
+OTHER_FLAGS = (
+    ("-h, --help [VERB or GROUP]", "show this help, or that of a verb or group"),
+    ("--version", "show the version"),
+    ("--", "everything after it is a file or folder, even with a leading hyphen"),
+)
 
 
-def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
-    """Return the help of ``gen-dataset``."""
-    lines = [f"  gen-dataset {verb.name:<11} {verb.summary}" for verb in verbs.values()]
-    groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(conf)]
-    keys = key_help("", conf)
-    blocks = [INTRODUCTION + "\n".join(lines), SETTINGS_HELP + "\n".join(groups), "\nKeys at the top level:", *keys]
-    shown = [*(flag for flag in HYDRA_FLAGS if flag.key in SHOWN_HYDRA_FLAGS), *STANDARD]
-    flags = [
-        *((argument.spelled, argument.help) for argument in shown),
-        ("-h, --help [VERB or GROUP]", "show this help, or that of a verb or group"),
-        ("--version", "show the version"),
-        ("--", "everything after it is a file or folder, even with a leading hyphen"),
+def asked_help(verbs: Mapping[str, Verb], verb: Verb | None, flags: Sequence[str]) -> str:
+    """Help of a verb; without one, of the verb, group or key that follows ``--help``, else of the program.
+
+    A group may be named by one of its settings, such as ``noise.iso``.
+    """
+    word = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "-")
+    if verb is not None:
+        return verb_help(verb)
+    if word.startswith("-"):
+        return global_help(verbs)
+    from unprocess_gen.config.schema import GROUPS  # imports NumPy, too slow for the other kinds of help
+
+    name = re.split("[.=]", word)[0]
+    parts = [verb_help(verbs[name])] if name in verbs else []
+    parts += [group_help(name)] if name in GROUPS or name in ADDED_GROUPS else []
+    parts += key_help(name)
+    if not parts:
+        names = list(dict.fromkeys([*verbs, *GROUPS, *ADDED_GROUPS]))
+        expected = f"expected one of {', '.join(names)}{did_you_mean(name, names)}"
+        raise ConfigError(f"--help {word}: no such verb or group; {expected}")
+    return "\n".join(parts)
+
+
+def global_help(verbs: Mapping[str, Verb]) -> str:
+    """Help of ``gen-dataset``: verbs, groups with their options, top-level keys, flags and exit codes."""
+    flags = [(flag.spelled, flag.summary) for flag in (*HYDRA_FLAGS, *STANDARD)]
+    blocks = [
+        INTRODUCTION,
+        _section("Verbs", ((verb.name, verb.summary) for verb in verbs.values()), 16),
+        "\n".join([SETTINGS_HELP, *(_columns(*line, 16) for line in _group_lines())]) + "\n",
+        "Keys at the top level:\n" + "".join(key_help("")),
+        _section("Flags", (*flags, *OTHER_FLAGS)),
+        _section("Exit codes", EXIT_CODES.items(), 16),
     ]
-    blocks += ["\nFlags:", *(_two_columns(*flag) for flag in flags)]
-    return "\n".join(blocks) + "\n\n" + exit_code_lines() + "\n"
+    return "\n".join(blocks)
 
 
-def key_help(name: str, conf: Path) -> list[str]:
-    """Return the help of the key at the top level with this name, or of all without a name.
+def key_help(name: str) -> list[str]:
+    """Help of the key at the top level with this name, or of all without a name.
 
     The comments of ``config.yaml`` explain them; `config.schema` imports NumPy, which is too slow for ``--help``.
     """
-    lines = re.findall(r"^(\w+): (\S+) +# (.*)", (conf / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
-    return [_hanging(f"  {f'{key}={value}':<{INDENT + 6}}", text) for key, value, text in lines if name in ("", key)]
+    lines = re.findall(r"^(\w+): (\S+) +# (.*)", _primary_config(), re.MULTILINE)
+    return [_columns(f"{key}={value}", summary, 20) + "\n" for key, value, summary in lines if name in ("", key)]
 
 
-def group_lines(conf: Path) -> list[tuple[str, str]]:
-    """Return each group with its options, in the order of the defaults list; without any, with what its keys are."""
-    lines = []
-    for group in re.findall(r"^  - (\w+): ", (conf / "config.yaml").read_text(encoding="utf-8"), re.MULTILINE):
-        options = [name for name in group_options(group, conf) if name != "default"]
-        lines.append((group, " ".join(options) or option_summary(group, "default", conf)))
+def _primary_config() -> str:
+    return (conf_dir() / "config.yaml").read_text(encoding="utf-8")
+
+
+def _group_lines() -> Iterable[tuple[str, str]]:
+    """Each group with its options, in the order of the defaults list; without any, with what its keys are."""
+    for group in re.findall(r"^  - (\w+): ", _primary_config(), re.MULTILINE):
+        options = [name for name in group_options(group) if name != "default"]
+        yield group, " ".join(options) or option_summary(group, "default")
     for group, contents in ADDED_GROUPS.items():
-        options = group_options(group, conf)
-        if options:
-            lines.append((group, f"{' '.join(options)} ({contents}; added with a plus: +{group}={options[0]})"))
-    return lines
+        options = group_options(group)
+        yield group, f"{' '.join(options)} ({contents}; added with a plus: +{group}={options[0]})"
 
 
-def exit_code_lines() -> str:
-    """Return the exit codes with their meaning."""
-    return "\n".join(["Exit codes:", *(_hanging(f"  {code:<{INDENT + 3}}", text) for code, text in EXIT_CODES.items())])
-
-
-def group_help(group: str, conf: Path) -> str:
-    """Return the help of one group of settings: its options and its keys."""
+def group_help(group: str) -> str:
+    """Help of one group of settings: its options and its keys."""
+    from unprocess_gen.config.defaults import default_options, default_values
     from unprocess_gen.config.schema import GROUPS, group_settings
+    from unprocess_gen.config.values import value_text
 
     parts = []
-    options = [option for option in group_options(group, conf) if option != "default"]
-    if options:
+    if options := [option for option in group_options(group) if option != "default"]:
         plus = "+" if group in ADDED_GROUPS else ""
-        lines = [_two_columns(option, option_summary(group, option, conf)) for option in options]
-        parts.append("\n".join([f"Options of {group} ({plus}{group}=OPTION):", *lines]))
+        lines = ((option, option_summary(group, option)) for option in options)
+        parts.append(_section(f"Options of {group} ({plus}{group}=OPTION)", lines))
     if group in GROUPS:
-        from unprocess_gen.config.defaults import default_options, default_values
-
         settings = group_settings(group)
         nested = {name.rpartition(".")[0] for name in settings if "." in name}
         inside = {f"{key}.{name}": value for key in nested for name, value in default_values(f"{group}.{key}").items()}
         values, option = default_values(group) | inside, default_options().get(group) or "default"
         chosen = f" with {group}={option}" if option != "default" else ""
-        title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"
-        lines = [
-            _two_columns(f"{name}={value_text(values[name])}"[: WIDTH - 2], setting.description)
-            for name, setting in settings.items()
-        ]
-        parts.append("\n".join([title, *lines]))
-    return "\n\n".join(parts) + "\n"
-
-
-def _hanging(start: str, text: str) -> str:
-    """Return text that begins with ``start`` and continues below the text."""
-    lines = textwrap.wrap(text, WIDTH - len(start), break_long_words=False, break_on_hyphens=False)
-    return start + f"\n{' ' * len(start)}".join(lines)
+        spelled = ((f"{name}={value_text(values[name])}"[: WIDTH - 2], settings[name].description) for name in settings)
+        parts.append(_section(f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}", spelled))
+    return "\n".join(parts)
 
 
 def verb_help(verb: Verb) -> str:
-    """Return the help of one verb."""
-    sections = {
-        "Arguments": [
-            *([(verb.place.metavar, verb.place.expected)] if verb.place else []),
-            *([(verb.extra.metavar, verb.extra.help)] if verb.extra else []),
-        ],
-        "Flags and settings": [
-            (argument.spelled, argument.help + (" (required)" if argument.required else ""))
-            for argument in (*verb.arguments, *STANDARD)
-        ]
-        + [("-h, --help", "show this help")],
-        "Hydra's flags": [(flag.spelled, flag.help) for flag in HYDRA_FLAGS if verb.composes],
-    }
-    parts = [f"usage: {synopsis(verb)}", textwrap.fill(_sentence(verb), WIDTH)]
-    for title, lines in sections.items():
-        if lines:
-            parts.append("\n".join([f"{title}:", *(_two_columns(*line) for line in lines)]))
+    """Help of one verb."""
+    flags = [(flag.spelled, flag.summary) for flag in (*verb.flags, *STANDARD)]
+    blocks = [
+        f"usage: {synopsis(verb)}\n",
+        textwrap.fill(f"{verb.summary[0].upper()}{verb.summary[1:]}.", WIDTH) + "\n",
+        _section("Arguments", [verb.place[:2]] if verb.place else []),
+        _section("Flags and settings", [*flags, *verb.keys.items(), ("-h, --help", "show this help")]),
+    ]
     if verb.composes:
-        parts.append("Settings are listed by gen-dataset --help, and explained by gen-dataset --help GROUP.")
-    return "\n\n".join(parts) + "\n"
+        blocks += [
+            _section("Hydra's flags", ((flag.spelled, flag.summary) for flag in HYDRA_FLAGS)),
+            "Settings are listed by gen-dataset --help, and explained by gen-dataset --help GROUP.\n",
+        ]
+    return "\n".join(filter(None, blocks))
 
 
 def synopsis(verb: Verb) -> str:
-    """Return the command line of a verb with its required arguments."""
+    """Command line of a verb with its required arguments."""
     words = [f"[{verb.place.metavar}]" if verb.place.optional else verb.place.metavar] if verb.place else []
-    words += [f"[{verb.extra.metavar}]"] if verb.extra else []
-    words += [argument.spelled for argument in verb.arguments if argument.required]
+    words += [flag.spelled for flag in verb.flags if flag.options.get("required")]
     words += ["[key=value ...]"] if verb.composes else []
     return " ".join(["gen-dataset", verb.name, *words, "[flags]"])
 
 
-def _sentence(verb: Verb) -> str:
-    return f"{verb.summary[0].upper()}{verb.summary[1:]}."
+def _section(title: str, lines: Iterable[tuple[str, str]], column: int = COLUMN) -> str:
+    """Lines of two columns below a title; empty without lines."""
+    texts = [_columns(*line, column) for line in lines]
+    return "\n".join([f"{title}:", *texts]) + "\n" if texts else ""
 
 
-def _two_columns(left: str, right: str) -> str:
-    if len(left) + 4 > COLUMN:
-        return f"  {left}\n{_hanging(' ' * COLUMN, right)}"
-    return _hanging(f"  {left}".ljust(COLUMN), right)
+def _columns(left: str, right: str, column: int = COLUMN) -> str:
+    """Two columns; the right one begins in a line of its own if the left one is long."""
+    start = f"  {left}".ljust(column)
+    indent, break_after = " " * column, len(left) + 4 > column
+    lines = textwrap.fill(right, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    return f"  {left}\n{lines}" if break_after else start + lines[column:]

@@ -7,23 +7,20 @@ Design: ``docs/design/command_line.md``.
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from importlib import import_module
+from collections.abc import Sequence
 
 from unprocess_gen import __version__
 from unprocess_gen.cli.arguments import Verb, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
-from unprocess_gen.cli.help import global_help, group_help, key_help, verb_help
+from unprocess_gen.cli.help import asked_help
 from unprocess_gen.cli.messages import checked_streams, logging_to_stderr, report, report_error
 from unprocess_gen.cli.process_limits import prepare_libraries
 from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.verbs import VERBS
-from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.core.errors import RESUME, ConfigError, UnprocessGenError
 from unprocess_gen.core.suggestions import did_you_mean
 
@@ -37,8 +34,12 @@ def main() -> int:
         os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and for the workers
     arguments = sys.argv[1:]
     with checked_streams(), SIGNALS:
-        code = _exit_code(lambda: run(arguments), arguments)
-        return _exit_code(sys.stdout.flush, arguments) or code
+        try:
+            code = run(arguments)
+            sys.stdout.flush()
+        except (KeyboardInterrupt, Exception) as error:
+            code = _report_end(error, arguments)
+    return code
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -46,43 +47,19 @@ def run(arguments: Sequence[str]) -> int:
     verb, rest = find_verb(arguments)
     flags = rest[: rest.index("--")] if "--" in rest else rest
     if {"-h", "--help"} & set(flags):
-        print(_help(verb_help(verb) if len(rest) < len(arguments) else "", flags), end="")
+        print(asked_help(VERBS, verb if len(rest) < len(arguments) else None, flags), end="")
         return 0
     if "--version" in flags:
         print(f"unprocess_gen {__version__}")
         return 0
     prepare_libraries()
     call = parse(verb, rest)
-    module, function = verb.run.split(".")
-    with logging_to_stderr("quiet" in call.values):
-        return int(getattr(import_module(f"unprocess_gen.cli.{module}"), function)(call))
-
-
-def _help(verb: str, flags: Sequence[str]) -> str:
-    """Return the help of the verb; without one, of the verb, group or key after ``--help``; else the program's help.
-
-    The group may be named by one of its settings, such as ``noise.iso``.
-    """
-    word = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "-")
-    if verb or word.startswith("-"):
-        return verb or global_help(VERBS, conf_dir())
-    prepare_libraries()
-    from unprocess_gen.config.schema import GROUPS  # imports NumPy, too slow for the other kinds of help
-
-    name = re.split("[.=]", word)[0]
-    parts = [verb_help(VERBS[name])] if name in VERBS else []
-    parts += [group_help(name, conf_dir())] if name in GROUPS or name in ADDED_GROUPS else []
-    parts += key_help(name, conf_dir())
-    if not parts:
-        names = list(dict.fromkeys([*VERBS, *GROUPS, *ADDED_GROUPS]))
-        raise ConfigError(
-            f"--help {word}: no such verb or group; expected one of {', '.join(names)}{did_you_mean(name, names)}"
-        )
-    return "\n".join(parts)
+    with logging_to_stderr(call.quiet):
+        return verb.run(call)
 
 
 def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:
-    """Return the verb of a command line, ``generate`` if the first word is none, and the arguments behind it.
+    """Find the verb of a command line, ``generate`` if the first word is none, and the arguments behind it.
 
     A first word of small letters is always a verb, even if a folder has that name.
     """
@@ -97,27 +74,20 @@ def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:
     return VERBS[name], rest
 
 
-def _exit_code(step: Callable[[], int | None], arguments: Sequence[str]) -> int:
-    """Run a step, report what ends it in one line, and return its exit code. Bugs rise."""
-    try:
-        return step() or 0
-    except BrokenPipeError:
+def _report_end(error: BaseException, arguments: Sequence[str]) -> int:
+    """Report in one line what ended the command; return its exit code. Bugs are raised."""
+    if isinstance(error, BrokenPipeError):
         return BROKEN_PIPE
-    except (KeyboardInterrupt, Exception) as error:
+    if isinstance(error, KeyboardInterrupt) or SIGNALS.received is not None:
         # OmegaConf and LLVM may fail in their own way when they are interrupted
-        if isinstance(error, KeyboardInterrupt) or SIGNALS.received is not None:
-            return _report_signal(SIGNALS.received or signal.SIGINT, arguments)
-        if isinstance(error, UnprocessGenError | PermissionError):
-            return report_error(error)
-        raise
-
-
-def _report_signal(number: int, arguments: Sequence[str]) -> int:
-    """Report in one line that a signal ended the command; return its exit code."""
-    try:
-        resumes = find_verb(arguments)[0].resumes
-    except ConfigError:
-        resumes = False
-    what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-    report(f"{what}; {RESUME}" if resumes else what)
-    return 128 + number
+        number = SIGNALS.received or signal.SIGINT
+        try:
+            resumes = find_verb(arguments)[0].resumes
+        except ConfigError:
+            resumes = False
+        what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+        report(f"{what}; {RESUME}" if resumes else what)
+        return 128 + number
+    if isinstance(error, UnprocessGenError | PermissionError):
+        return report_error(error)
+    raise error

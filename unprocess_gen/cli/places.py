@@ -9,11 +9,11 @@ from unprocess_gen.core.paths import AnyPath, any_path
 
 
 def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
-    """Return the verb's dataset; refuse anything else, and for a sweep name one of its datasets.
+    """Check and return the verb's dataset; refuse anything else, and for a sweep name one of its datasets.
 
     ``files`` accepts the file of a manifest too, ``sweeps`` the folder of a sweep.
     """
-    verb, path, place = call.verb.name, call.path, call.verb.place
+    verb, path, place = call.verb.name, call.place, call.verb.place
     assert path is not None and place is not None
     if not any_path(path).is_listed():
         kind = "file or folder" if files else "folder"
@@ -35,10 +35,10 @@ def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> 
 
 
 def given_root(call: Call) -> str | None:
-    """Return the root that the user gives; ConfigError if it is no folder or photograph, None if none is given."""
+    """Root that the user gives, None if none is given; ConfigError if it is no folder or photograph."""
     from unprocess_gen.sources.listing import single_file
 
-    root: str | None = call.values.get("source.root")
+    root = call.settings.get("source.root")
     if root is not None:
         single_file(root)
     return root
@@ -48,4 +48,4 @@ def dark_frames_of(manifest: AnyPath, call: Call) -> str | None:
     """Folder of the dark frames of a dataset, by the call or by ``dataset.json``; None without one."""
     from unprocess_gen.pipeline.replay import dark_frames_root
 
-    return dark_frames_root(manifest, call.values.get("noise.dark_frames"))
+    return dark_frames_root(manifest, call.settings.get("noise.dark_frames"))

@@ -1,4 +1,4 @@
-"""Record a sweep: the folder of each job, ``sweep.csv`` and the exit code."""
+"""Name the folders of a sweep's jobs, and write ``sweep.csv``."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ import io
 import os
 from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from unprocess_gen.core.errors import RESUME
-from unprocess_gen.core.files import machine_errors
-from unprocess_gen.core.locks import LockFile
-from unprocess_gen.core.output_paths import enclosing_dataset
-from unprocess_gen.core.paths import LocalPath, local_path
-from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -24,8 +19,8 @@ if TYPE_CHECKING:
 SEVERITY = (0, 3, 11, 4, 2, 5, 1)
 """Exit codes from good to bad; a sweep exits with the worst code of its jobs."""
 
-NOT_IN_NAMES = ("out", "n_jobs", "source.root", "source.list", "executor", "self_test", "check_disk")
-"""Settings that do not decide a dataset's bytes, and so are not in the names of folders."""
+NOT_IN_NAMES = ("out", "n_jobs", "source.root", "source.list", "executor", "self_test", "check_disk", "sweep", "hydra")
+"""Settings that are not in the names of folders: they do not decide a dataset's bytes, or describe the sweep."""
 
 LONGEST_FOLDER_NAME = 200
 """Longest name of a folder, bytes; file systems allow 255."""
@@ -38,45 +33,17 @@ LAST_COLUMNS = ("rows", "failed", "filtered", *(f"{name}_share" for name in SHAR
 """Columns of ``sweep.csv`` before and after the columns of the swept keys."""
 
 
-def sweep_out(out: str) -> Path:
-    """Return the folder of a sweep; raise ConfigError for the URL of an object store."""
-    return local_path(
-        out,
-        f"out={out}: a sweep cannot write to an object store; expected a local folder; run its jobs one by one, or "
-        "copy its datasets afterwards",
-    )
+def named_overrides(overrides: Iterable[str], swept: Container[str] = ()) -> list[str]:
+    """Choose the overrides that name a job's folder, sorted as in Hydra's ``override_dirname``.
 
-
-def job_row(folder: str, overrides: str, swept: Mapping[str, str], code: int, summary: Summary | Any) -> dict[str, str]:
-    """Return the row of a job in ``sweep.csv``; ``summary`` is None if it has no dataset.
-
-    ``seconds`` is left out if the job found its dataset complete.
+    Swept places of the sources are among them, because their datasets differ.
     """
-    row = {"folder": folder, "overrides": overrides, **swept, "exit": str(code)}
-    sites = getattr(summary, "sites", None)
-    if sites is None:
-        return row | {"seconds": ""}
-    row |= {
-        "rows": str(summary.rows),
-        "failed": str(sum(summary.failed.values())),
-        "filtered": str(summary.filtered),
-        "bytes": str(summary.bytes),
-    }
-    if summary.made:
-        row["seconds"] = f"{summary.seconds:.3f}"
-    if sites["all"]:
-        row |= {f"{name}_share": repr(sites[name] / sites["all"]) for name in SHARES}
-    return row
 
+    def is_named(key: str) -> bool:
+        differs = key in swept and key.startswith("source.")
+        return differs or not any(key == name or key.startswith(f"{name}.") for name in NOT_IN_NAMES)
 
-def named_overrides(overrides: Iterable[str]) -> list[str]:
-    """Return the overrides that name a job's folder, sorted as in Hydra's ``override_dirname``."""
-
-    def decides_data(override: str) -> bool:
-        key = _key(override)
-        return not any(key == name or key.startswith(f"{name}.") for name in NOT_IN_NAMES)
-
-    return sorted(filter(decides_data, overrides))
+    return sorted(override for override in overrides if is_named(_key(override)))
 
 
 def _key(override: str) -> str:
@@ -84,7 +51,7 @@ def _key(override: str) -> str:
 
 
 def job_folder(overrides: Sequence[str], swept: Container[str] = ()) -> str:
-    """Return the name of a job's folder: its overrides, with slashes encoded.
+    """Name a job's folder by its overrides, with slashes encoded.
 
     A name longer than `LONGEST_FOLDER_NAME` begins with the overrides of swept keys, is cut, and ends with a digest.
     """
@@ -101,8 +68,23 @@ def _encoded(overrides: Sequence[str]) -> str:
 
 
 def worst(exit_codes: Iterable[int]) -> int:
-    """Return the exit code of a sweep: the worst of its jobs' (`SEVERITY`), 0 without any."""
+    """Exit code of a sweep: the worst of its jobs' (`SEVERITY`), 0 without any."""
     return max(exit_codes, key=SEVERITY.index, default=0)
+
+
+def result_cells(summary: Summary) -> dict[str, str]:
+    """Cells of a dataset in ``sweep.csv``; ``seconds`` is left out if the job found it complete."""
+    sites = summary.sites
+    shares = {f"{name}_share": repr(sites[name] / sites["all"]) for name in SHARES} if sites["all"] else {}
+    seconds = {"seconds": f"{summary.seconds:.3f}"} if summary.made else {}
+    return {
+        "rows": str(summary.rows),
+        "failed": str(sum(summary.failed.values())),
+        "filtered": str(summary.filtered),
+        "bytes": str(summary.bytes),
+        **shares,
+        **seconds,
+    }
 
 
 def write_row(out: Path, row: Mapping[str, str]) -> None:
@@ -111,6 +93,12 @@ def write_row(out: Path, row: Mapping[str, str]) -> None:
     A row of the same folder is replaced and keeps its place, so that the indices of `RawPairs` do not change. A job
     that found its dataset complete has no time; the earlier one remains.
     """
+    from unprocess_gen.core.files import machine_errors
+    from unprocess_gen.core.locks import LockFile
+    from unprocess_gen.core.output_paths import enclosing_dataset
+    from unprocess_gen.core.paths import LocalPath
+    from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
+
     if not out.is_dir() or enclosing_dataset(out) is not None:  # the job was refused
         return
     path = out / SWEEP_TABLE
@@ -131,12 +119,12 @@ def write_row(out: Path, row: Mapping[str, str]) -> None:
 
 
 def swept_keys(rows: Iterable[Mapping[str, str]]) -> list[str]:
-    """Return the keys that a sweep varies: the columns of its table between the columns of every sweep."""
+    """Keys that a sweep varies: the columns of its table between the columns of every sweep."""
     return list(dict.fromkeys(key for row in rows for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS}))
 
 
 def plan_totals(estimates: Sequence[RunEstimate]) -> str:
-    """Return the totals of a planned sweep, whose jobs run one after the other, in one line."""
+    """Totals of a planned sweep, whose jobs run one after the other, in one line."""
     pairs = sum(job.pairs for job in estimates)
     about = "" if all(job.exact for job in estimates) else "about "
     seconds = sum(job.seconds for job in estimates)

@@ -1,214 +1,183 @@
-"""Define the verbs of ``gen-dataset``: `VERBS` describes them and names the functions that run them."""
+"""Define the verbs of ``gen-dataset``, in the order of the help."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from unprocess_gen.cli import builds, calibration, camera, checks, explore, parts, reports, runs
+from unprocess_gen.cli.arguments import Place, Verb, count, flag, local, switch
 
-from unprocess_gen.cli.arguments import Argument, PlaceArgument, Verb, choice
-
-
-def _integer(name: str, text: str, low: int | None = None, metavar: str = "N", *, required: bool = False) -> Argument:
-    """Return an argument that is an integer, of ``low`` or more."""
-
-    def read(written: str) -> int:
-        number = int(written)
-        if low is not None and number < low:
-            raise ValueError
-        return number
-
-    expected = "an integer" if low is None else f"an integer of {low} or more"
-    return Argument((name,), text, metavar, read, expected, required=required)
-
-
-def _local_path(text: str) -> str:
-    if "://" in text:  # it would become a folder named after the scheme
-        raise ValueError
-    return text
-
-
-def _file(flag: str, text: str, metavar: str = "FILE", *, required: bool = False) -> Argument:
-    return Argument((flag,), text, metavar, _local_path, "a local file", required)
-
-
-def _folder(flag: str, text: str, metavar: str = "FOLDER", *, required: bool = False) -> Argument:
-    return Argument((flag,), text, metavar, _local_path, "a local folder", required)
-
-
-def _composing(name: str, summary: str, run: str, *arguments: Argument, resumes: bool = False) -> Verb:
-    """Return a verb that takes the settings of a run."""
-    return Verb(name, summary, run, arguments, composes=True, resumes=resumes)
-
-
-PARTS = _integer("parts", "number of parts", 1, required=True)
-PREPARED = PlaceArgument("OUT", "the folder of a prepared run")
-PART = _integer("part", "number of the part, from 0", 0, "K")
-DATASET = PlaceArgument("DIR", "the folder of a dataset")
-KEYS = Argument(
-    ("--keys",), "rows by source index, range or key, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
-)
-REGENERATE = _integer("--regenerate", "regenerate N pairs and compare them", 0)
-OUT = Argument(("out",), "folder of the new dataset", "FOLDER", required=True)
-SOURCE = Argument(("source.root",), "folder of the photographs; by default the one recorded in dataset.json", "ROOT")
-INPUTS = (
-    SOURCE,
-    Argument(("noise.dark_frames",), "folder of the dark frames, if it is not the recorded one", "FOLDER"),
-)
+DATASET = Place("DIR", "the folder of a dataset")
+ANY_DATASET = Place("DIR", "the folder of a dataset or of a sweep")
+PREPARED = Place("OUT", "the folder of a prepared run")
+N_JOBS = {"n_jobs=N": "number of worker processes; -1: all cores"}
+SOURCE = {"source.root=ROOT": "folder of the photographs; by default the one recorded in dataset.json"}
+INPUTS = SOURCE | {"noise.dark_frames=FOLDER": "folder of the dark frames, if it is not the recorded one"}
 """Where the files are that pairs are regenerated from."""
 
+ROWS = "rows by source index, range or key, such as 3,7-9,00000012-p0007"
+KEYS = flag("--keys", "KEYS", ROWS)
+
 _VERBS = (
-    _composing("generate", "generate a dataset; the default verb", "runs.generate", resumes=True),
-    _composing(
+    Verb("generate", "generate a dataset; the default verb", runs.generate, composes=True, resumes=True),
+    Verb(
         "manifest",
         "write the manifest of a dataset without its frames, for ug.LivePairs",
-        "runs.manifest",
+        runs.manifest,
+        composes=True,
         resumes=True,
     ),
-    _composing(
-        "prepare", "list the sources of a run and split it into parts, for separate jobs", "parts.prepare", PARTS
+    Verb(
+        "prepare",
+        "list the sources of a run and split it into parts, for separate jobs",
+        parts.prepare,
+        keys={"parts=N": "number of parts"},
+        composes=True,
     ),
     Verb(
         "part",
         "generate part K (from 0) of a prepared run; default: that of the array job",
-        "parts.part",
-        (
-            _integer("n_jobs", "number of worker processes; -1: all cores; default: as prepared"),
-            replace(SOURCE, help="folder of the photographs on this host"),
-        ),
+        parts.part,
         PREPARED,
-        extra=PART,
+        keys=N_JOBS | SOURCE | {"part=K": "number of the part, from 0"},
         resumes=True,
+        extra="part",
     ),
     Verb(
         "status",
         "show which parts of a prepared run are left",
-        "parts.status",
-        (Argument(("--left",), "print only the numbers of the parts that are left: 3,7-9"),),
+        parts.status,
         PREPARED,
+        (switch("--left", "print only the numbers of the parts that are left: 3,7-9"),),
     ),
-    Verb("merge", "write manifest.csv and dataset.json when all parts are finished", "parts.merge", place=PREPARED),
-    _composing(
+    Verb("merge", "write manifest.csv and dataset.json when all parts are finished", parts.merge, PREPARED),
+    Verb(
         "plan",
         "estimate pairs, bytes and time, and explain the effects; write nothing",
-        "reports.plan",
-        Argument(("--all",), "read every photograph, and name those that fail"),
-        Argument(("--numbers",), "state the source of each number of the noise profile"),
+        reports.plan,
+        flags=(
+            switch("--all", "read every photograph, and name those that fail"),
+            switch("--numbers", "state the source of each number of the noise profile"),
+        ),
+        composes=True,
     ),
-    _composing(
-        "accuracy", "measure time and error of each tier, stage by stage; default out: accuracy", "reports.accuracy"
+    Verb(
+        "accuracy",
+        "measure time and error of each tier, stage by stage; default out: accuracy",
+        reports.accuracy,
+        composes=True,
     ),
     Verb(
         "verify",
         "check every byte of a dataset or sweep; repair, regenerate, check noise",
-        "checks.verify",
+        checks.verify,
+        ANY_DATASET,
         (
-            *INPUTS,
-            REGENERATE,
-            Argument(("--repair",), "restore damaged files to the same bytes"),
-            Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
-            _folder("--against", "compare raw darks and flats of a camera with the noise profile", "FRAMES"),
+            flag("--regenerate", "N", "regenerate N pairs and compare them", count),
+            switch("--repair", "restore damaged files to the same bytes"),
+            switch("--noise", "check whether the noise in the arrays is that of the manifest"),
+            flag("--against", "FRAMES", "compare raw darks and flats of a camera with the noise profile", local),
         ),
-        PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
+        INPUTS,
     ),
     Verb(
         "replay",
         "regenerate rows and compare them, or write their arrays",
-        "checks.replay",
-        (*INPUTS, KEYS, _folder("--to", "write the arrays to FOLDER")),
-        PlaceArgument("MANIFEST", "a manifest.csv, or the folder of a dataset"),
+        checks.replay,
+        Place("MANIFEST", "a manifest.csv, or the folder of a dataset"),
+        (KEYS, flag("--to", "FOLDER", "write the arrays to FOLDER", local)),
+        INPUTS,
     ),
     Verb(
         "report",
         "write an HTML page about a dataset or a sweep",
-        "reports.report",
-        (_file("--to", "write FILE instead of DIR/report.html"), *INPUTS),
-        PlaceArgument("DIR", "the folder of a dataset or of a sweep"),
+        reports.report,
+        ANY_DATASET,
+        (flag("--to", "FILE", "write FILE instead of DIR/report.html", local),),
+        INPUTS,
     ),
     Verb(
         "explore",
         "try settings on a photograph or a row, in a page of the browser on this machine",
-        "explore.explore",
+        explore.explore,
+        Place("PHOTO", "a photograph, a folder of photographs, or a dataset", optional=True),
         (
             KEYS,
-            _integer("--port", "number of the port on 127.0.0.1; default: a free one", 0),
-            Argument(("--no-browser",), "print the address, and open no browser"),
+            flag("--port", "N", "number of the port on 127.0.0.1; default: a free one", count, default=0),
+            switch("--no-browser", "print the address, and open no browser"),
         ),
-        PlaceArgument("PHOTO", "a photograph, a folder of photographs, or a dataset", optional=True),
         composes=True,
     ),
     Verb(
         "preview",
         "draw contact sheets of pairs, and of each processing step",
-        "reports.preview",
+        reports.preview,
+        DATASET,
         (
             KEYS,
-            _folder("--to", "write the pictures to FOLDER", required=True),
-            SOURCE,
-            Argument(("--stages",), "draw each processing step too"),
+            flag("--to", "FOLDER", "write the pictures to FOLDER", local, required=True),
+            switch("--stages", "draw each processing step too"),
         ),
-        DATASET,
+        SOURCE,
     ),
     Verb(
         "dng",
         "write frames as DNG files, for raw converters",
-        "reports.dng",
-        (
-            replace(KEYS, required=True),
-            _folder("--to", "write the files to FOLDER", required=True),
-            Argument(("--noisy",), "only noisy frames"),
-            Argument(("--clean",), "only clean frames"),
-        ),
+        reports.dng,
         DATASET,
+        (
+            flag("--keys", "KEYS", ROWS, required=True),
+            flag("--to", "FOLDER", "write the files to FOLDER", local, required=True),
+            switch("--noisy", "only noisy frames"),
+            switch("--clean", "only clean frames"),
+        ),
     ),
     Verb(
         "again",
         "regenerate a dataset from its config.yaml in another folder, and compare",
-        "runs.again",
-        (
-            *INPUTS,
-            OUT,
-            _integer("n_jobs", "number of worker processes; -1: all cores"),
-            Argument(("executor",), "what runs the workers: local or dask", "NAME"),
-            choice(("output.frames",), "make the frames of a manifest without frames", "true"),
-            Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
-            _integer("source.max_failed", "largest number of failed sources with exit code 0"),
-        ),
+        runs.again,
         DATASET,
+        keys={
+            "out=FOLDER": "folder of the new dataset (required)",
+            **INPUTS,
+            **N_JOBS,
+            "executor=NAME": "what runs the workers: local or dask",
+            "executor.address=ADDRESS": "address of a Dask scheduler",
+            "executor.no_workers_s=SECONDS": "time without any worker after which the run ends",
+            "output.frames=true": "make the frames of a manifest without frames",
+            "source.max_failed=N": "largest number of failed sources with exit code 0",
+        },
         resumes=True,
     ),
     Verb(
         "build",
         "make a benchmark build and compare every byte with its recorded digests",
-        "builds.build",
-        (
-            _folder("--to", "write the build to DIR", "DIR"),
-            Argument(("--list",), "list all builds"),
-            _integer("n_jobs", "number of worker processes; -1: all cores"),
-        ),
-        extra=Argument(("name",), "name of the build", "NAME"),
+        builds.build,
+        Place("NAME", "the name of a build", optional=True),
+        (flag("--to", "DIR", "write the build to DIR", local), switch("--list", "list all builds")),
+        N_JOBS,
         resumes=True,
     ),
     Verb(
         "calibrate",
         "measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile",
-        "calibration.calibrate",
+        calibration.calibrate,
+        Place("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
         (
-            _file("--to", "write the profile to FILE.yaml, and all estimates to FILE.json", required=True),
-            _file("--report", "draw curves, histograms and maps in PAGE (HTML)", "PAGE"),
-            choice(("--from",), "make the profile from NoiseProfile tags of DNG files", "noise_profile"),
+            flag("--to", "FILE", "write the profile to FILE.yaml, and estimates to FILE.json", local, required=True),
+            flag("--report", "PAGE", "draw curves, histograms and maps in PAGE (HTML)", local),
+            flag("--from", "noise_profile", "read tags of DNG files", dest="origin", choices=("noise_profile",)),
         ),
-        PlaceArgument("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
     ),
     Verb(
         "camera",
         "write a camera option, and a sensor option, from one raw file",
-        "camera.camera",
+        camera.camera,
+        Place("FILE", "the raw file: a DNG, or another one that LibRaw reads"),
         (
-            _file("--to", "write the matrix of the camera to CAMERA.yaml", "CAMERA", required=True),
-            _file("--sensor", "write pattern, bits and levels to SENSOR.yaml", "SENSOR"),
+            flag("--to", "CAMERA", "write the matrix of the camera to CAMERA.yaml", local, required=True),
+            flag("--sensor", "SENSOR", "write pattern, bits and levels to SENSOR.yaml", local),
         ),
-        PlaceArgument("FILE", "the raw file: a DNG, or another one that LibRaw reads"),
     ),
 )
 
 VERBS: dict[str, Verb] = {verb.name: verb for verb in _VERBS}
-"""The verbs by name, in the order of the help."""
+"""The verbs by name."""

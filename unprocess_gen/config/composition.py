@@ -1,4 +1,4 @@
-"""Compose a validated `Config` from option files and overrides, with Hydra's Compose API.
+"""Compose a validated config from option files and overrides with Hydra's Compose API, or the configs of a sweep.
 
 Importing this module registers the schema in Hydra's ConfigStore, so that Hydra's own ``compose`` works on ``conf/``
 too. Composing leaves the state of a running Hydra application unchanged.
@@ -8,31 +8,44 @@ Design: ``docs/design/composition_and_sweeps.md``.
 
 from __future__ import annotations
 
+import functools
+import itertools
+import math
 import os
 import re
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from unprocess_gen.config.composition_errors import explain, unknown_key
-from unprocess_gen.config.option_files import OPTIONAL_GROUPS, check_override, conf_dir
-from unprocess_gen.config.raw_composition import source_overrides
+from unprocess_gen.config.composition_errors import explain
+from unprocess_gen.config.option_files import (
+    ADDED_GROUPS,
+    OPTIONAL_GROUPS,
+    OptionFolders,
+    check_override,
+    group_options,
+)
+from unprocess_gen.config.raw_validation import check_raw_overrides
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.config.values import value_text
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
 
@@ -50,17 +63,21 @@ PLAIN_ERRORS = (ValueError, TypeError, AttributeError, AssertionError, OSError, 
 PATH_KEYS = ("source.root", "source.list", "out")
 """Keys whose values are paths, which are quoted for Hydra's grammar."""
 
+SHORTHANDS = {"source.kind=raw": "source=raw", "source.kind=srgb": "source=default"}
+"""Overrides that choose an option, because patterns and sensor follow from the kind of the source."""
 
-@dataclass(frozen=True, slots=True)
-class OptionFolders:
-    """The folder with the primary config, its name, and the user's folder, which is searched after it.
+MAX_JOBS = 100_000
+"""Most jobs of one sweep: each takes 0.2 s to compose, so a larger number is a mistake."""
 
-    None: `conf_dir`, ``config``, and no folder of the user.
-    """
-
-    main: Path | None = None
-    name: str | None = None
-    own: Path | None = None
+NO_EFFECT: dict[str, Any] = {
+    "run.dir": "outputs/${now:%Y-%m-%d}/${now:%H-%M-%S}",
+    "sweep.dir": "multirun/${now:%Y-%m-%d}/${now:%H-%M-%S}",
+    "sweep.subdir": "${hydra.job.num}",
+    "job.chdir": None,
+    "job.env_set": {},
+    "callbacks": {},
+}
+"""Settings of Hydra that have no effect here, with Hydra's own values; files with others are refused."""
 
 
 def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str] | None = None) -> Config:
@@ -100,69 +117,175 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
 
 
 def composed_config(overrides: Sequence[str], folders: OptionFolders) -> tuple[Config, dict[str, str | None]]:
-    """Compose and validate the config of one dataset; return it with the chosen option of each group.
-
-    ConfigError if the overrides or option files describe a sweep.
-    """
-    for override in overrides:
-        check_override(override)
-        if override.lstrip("+").startswith(("hydra.", "hydra/")):
-            raise ConfigError(f"{override}: settings of Hydra belong to the command line; expected keys of a dataset")
-    node = compose_node(overrides, folders)
-    if is_multirun(node) or OmegaConf.select(node, "hydra.sweeper.params"):
+    """Compose the config of one dataset, with the chosen option of each group; ConfigError for a sweep."""
+    job = next(compose_jobs(overrides, folders))
+    if job.swept is not None:
         raise ConfigError("hydra.sweeper.params: the overrides describe a sweep; expected one config; run gen-dataset")
-    choices = dict(node.hydra.runtime.choices)
-    return validated_config(node, overrides), choices
+    choices = dict(job.node.hydra.runtime.choices)
+    return job.config(), choices
+
+
+@dataclass(frozen=True, slots=True)
+class Composition:
+    """A composed config, whose values are not checked, and the overrides that it is composed from.
+
+    ``swept`` is the value of each swept key; None without a sweep.
+    """
+
+    node: DictConfig
+    overrides: tuple[str, ...]
+    swept: Mapping[str, str] | None = None
+
+    def config(self) -> Config:
+        """Resolve and validate the config; ConfigError if an interpolation or a value is refused."""
+        with _naming(self.swept):
+            config = typed_config(self.node, self.overrides)
+            check_raw_overrides(config, self.overrides)
+            validate_config(config)
+        return config
+
+    def text(self, shown: str, resolve: bool) -> str:
+        """YAML of the settings (``job``), of Hydra's own (``hydra``), or of both (``all``)."""
+        keys = {"job": set(self.node) - {"hydra"}, "hydra": {"hydra"}, "all": set(self.node)}[shown]
+        try:
+            return OmegaConf.to_yaml(OmegaConf.masked_copy(self.node, list(keys)), resolve=resolve).rstrip()
+        except OmegaConfBaseException as error:
+            raise ConfigError(explain(error, self.overrides)) from error
+
+
+def compose_jobs(overrides: Sequence[str], folders: OptionFolders, multirun: bool = False) -> Iterator[Composition]:
+    """Compose the config that overrides describe, or each job of a sweep; the value written last changes fastest.
+
+    A sweep is requested by ``multirun``, or by ``hydra.mode: MULTIRUN`` in an option file. An override of a key wins
+    over a parameter of the same key.
+    """
+    choices = _parse(overrides, folders)
+    node = compose_node([choice.text for choice in choices if not choice.is_swept], folders)
+    is_sweep, params = _sweep_settings(node)
+    if not (multirun or is_sweep):
+        _refuse_values(choices, params)
+        yield Composition(node, tuple(overrides))
+        return
+    given = {choice.name for choice in choices}
+    choices += [choice for choice in _parse(list(params.values()), folders) if choice.name not in given]
+    if math.prod(len(choice.overrides) for choice in choices) > MAX_JOBS:
+        raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
+    for job in itertools.product(*(choice.overrides for choice in choices)):
+        texts = zip(choices, job, strict=True)
+        swept = {choice.name: text.partition("=")[2] for choice, text in texts if choice.is_swept}
+        with _naming(swept):
+            node = compose_node(job, folders)
+            if hidden := _sweep_settings(node)[1].keys() - params.keys():
+                problem = "found in an option that the sweep itself selects; expected it in one that all jobs have"
+                raise ConfigError(f"hydra.sweeper.params.{min(hidden)}: {problem}")
+        yield Composition(node, job, swept)
+
+
+@contextmanager
+def _naming(swept: Mapping[str, str] | None) -> Iterator[None]:
+    """Begin messages with the values that a sweep gives to the job."""
+    try:
+        yield
+    except ConfigError as error:
+        if not swept:
+            raise
+        raise ConfigError(f"{','.join(f'{key}={value}' for key, value in swept.items())}: {error}") from error
+
+
+class _Choice(NamedTuple):
+    """An override as the user wrote it, and one override for each of its values."""
+
+    text: str
+    name: str
+    overrides: tuple[str, ...]
+    is_swept: bool
+
+
+def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
+    """Parse overrides with Hydra's grammar; a key that occurs twice has its last value, as in Hydra."""
+    for text in overrides:
+        check_override(text)
+    loader: Any = SimpleNamespace(get_group_options=lambda group, *_, **__: group_options(group, *folders.all))
+    parser = OverridesParser.create(config_loader=loader)  # glob(…) asks for the options of a group
+    choices: dict[str, _Choice] = {}
+    try:
+        for text, override in zip(overrides, parser.parse_overrides(list(map(normalised, overrides))), strict=True):
+            key, is_swept = override.get_key_element(), override.is_sweep_override()
+            if is_swept and not override.is_discrete_sweep():
+                raise ConfigError(f"{text}: an interval has no list of values; expected choice or range")
+            values = override.sweep_string_iterator() if is_swept else (override.get_value_element_as_str(),)
+            spelled = tuple(f"{key}={value}" for value in itertools.islice(values, MAX_JOBS + 1))
+            choice, other = _Choice(text, key.lstrip("+"), spelled, is_swept), choices.get(key.lstrip("+"))
+            if other is not None and (key.startswith("+") or is_swept or other.is_swept):
+                advice = "remove the other, or separate the values of a sweep by commas"
+                problem = f"{other.text} sets {choice.name} too"
+                raise ConfigError(f"{text}: {problem}; expected one of them; {advice}")
+            choices[choice.name] = choice
+    except (HydraException, ValueError, RecursionError) as error:
+        raise ConfigError(explain(error, overrides)) from error
+    return list(choices.values())
+
+
+def _sweep_settings(node: DictConfig) -> tuple[bool, dict[str, str]]:
+    """Read whether option files request a sweep, and the overrides of ``hydra.sweeper.params`` by key.
+
+    ConfigError for settings of Hydra that would have no effect.
+    """
+    settings: Any = OmegaConf.to_container(node.hydra)
+    for key, own in NO_EFFECT.items():
+        if (value := functools.reduce(dict.__getitem__, key.split("."), settings)) != own:
+            raise ConfigError(f"hydra.{key}={value_text(value)}: has no effect here; remove it and set out instead")
+    try:
+        sweeper: Any = OmegaConf.to_container(node.hydra.sweeper, resolve=True)
+        mode, params = node.hydra.mode, sweeper["params"] or {}
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"hydra.sweeper.params: {explain(error, ())}") from error
+    return mode == RunMode.MULTIRUN, {str(key): f"{key}={value_text(value)}" for key, value in params.items()}
+
+
+def _refuse_values(choices: Sequence[_Choice], params: Mapping[str, str]) -> None:
+    """Refuse values of a sweep if none is requested."""
+    for choice in choices:
+        if choice.is_swept:
+            key, _, values = choice.text.partition("=")
+            as_list = "" if group_options(choice.name) else f"; for a list, write {key}=[{values}]"
+            raise ConfigError(
+                f"{choice.text}: several values; expected one; to sweep over them, add --multirun{as_list}"
+            )
+    for key in params:
+        problem = "values of a sweep without hydra.mode: MULTIRUN; add it to the file, or -m to the command line"
+        raise ConfigError(f"hydra.sweeper.params.{key}: {problem}")
+
+
+# ---------------------------------------------------------------------------------------------------------------- Hydra
 
 
 def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None) -> DictConfig:
-    """Compose overrides, whose paths need no quotes, without validating values; ConfigError if Hydra refuses them.
+    """Compose overrides without checking values; ConfigError if Hydra refuses them.
 
-    The node is unresolved, and has Hydra's own settings in its key ``hydra``.
+    Interpolations are unresolved, and the key ``hydra`` has Hydra's own settings.
     """
     folders = folders or OptionFolders()
-    if folders.own is not None and not folders.own.is_dir():
-        raise ConfigError(f"--config-dir {folders.own}: no such folder; expected a folder of option files")
-    name, main, second = folders.name or "config", folders.main or conf_dir(), folders.own
-    if folders.name is not None and second is not None and (second / f"{name}.yaml").is_file():
+    name, main, second = folders.name or "config", folders.main, folders.own
+    if second is not None and not second.is_dir():
+        raise ConfigError(f"--config-dir {second}: no such folder; expected a folder of option files")
+    if second is not None and folders.name is not None and (second / f"{name}.yaml").is_file():
         main, second = second, main  # Hydra looks for the primary config in the first folder only
-    given = [*map(hydra_override, overrides)]
+    given = [_spelled(normalised(override), overrides) for override in overrides]
     if second is not None:
-        given.append(quoted("hydra.searchpath", f"file://{second.absolute()}", "[{}]"))
-    _check_own_options(overrides, folders)
-    try:
-        node = _compose(main, name, given)
-        added = source_overrides(node, overrides)
-        return _compose(main, name, [*given, *added]) if added else node
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise ConfigError(explain(error, overrides)) from error
-
-
-def _compose(main: Path, name: str, overrides: list[str]) -> DictConfig:
-    """Compose overrides that Hydra can parse; HydraException for whatever Hydra raises about them."""
+        given.append(f"hydra.searchpath=[{quoted(f'file://{second.absolute()}')}]")
+    _check_own_files(overrides, folders)
     with _hydra_in(main.absolute()):
         try:
-            return hydra.compose(name, overrides, return_hydra_config=True)
-        except PLAIN_ERRORS as error:
-            raise HydraException(str(error)) from error
-
-
-def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
-    """Resolve and validate a composed config; messages quote the ``overrides`` that it was composed from.
-
-    ConfigError if a key is not in the schema, an interpolation fails or a value is out of range.
-    """
-    with open_dict(node):
-        node.pop("hydra", None)
-    config = typed_config(node, overrides)
-    validate_config(config)
-    return config
+            return hydra.compose(name, given, return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
+            raise ConfigError(explain(error, overrides)) from error
 
 
 def typed_config(node: DictConfig, overrides: Sequence[str]) -> Config:
-    """Resolve a composed config without checking its values."""
-    for key in _unknown_keys(node, Config()):
-        raise ConfigError(unknown_key(key, overrides))
+    """Resolve a composed config, without the settings of Hydra and without checking values."""
+    with open_dict(node):
+        node.pop("hydra", None)
     try:
         config = OmegaConf.to_object(node)
     except (OmegaConfBaseException, RecursionError) as error:
@@ -171,48 +294,36 @@ def typed_config(node: DictConfig, overrides: Sequence[str]) -> Config:
     return config
 
 
-def is_multirun(node: DictConfig) -> bool:
-    """True if option files request a sweep."""
-    mode = resolved_value(node, "hydra.mode")
-    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+def normalised(override: str) -> str:
+    """Quote a path for Hydra's grammar, expand its ``~``, and drop the plus of keys that need none."""
+    key, _, value = override.partition("=")
+    if key.lstrip("+") not in ADDED_GROUPS:
+        override = override.lstrip("+")
+    if key in PATH_KEYS and value not in ("", "null") and value[0] not in "'\"":
+        return f"{key}={quoted(os.path.expanduser(value))}"
+    return override
 
 
-def resolved_value(node: DictConfig, key: str, overrides: Sequence[str] = ()) -> Any:
-    """Return one value of a composed config, with its interpolations resolved; None if the key does not exist."""
-    try:
-        return OmegaConf.select(node, key)
-    except OmegaConfBaseException as error:
-        raise ConfigError(explain(error, overrides)) from error
+def _spelled(override: str, overrides: Sequence[str]) -> str:
+    """Spell an override as Hydra takes it: ``body=null`` removes the body, and the kind of the source is an option."""
+    if override.removesuffix("=null") in OPTIONAL_GROUPS:
+        return f"~{override.removesuffix('=null')}"
+    has_option = any(other.startswith("source=") for other in overrides)
+    return override if has_option else SHORTHANDS.get(override, override)
 
 
-def hydra_override(override: str) -> str:
-    """Return an override as Hydra takes it: with a quoted path, and without ``null`` as the option of a group."""
-    group, _, option = override.partition("=")
-    return f"~{group}" if group in OPTIONAL_GROUPS and option == "null" else quoted_path(override)
+def quoted(path: str) -> str:
+    r"""Quote a path for Hydra's grammar, in which an umlaut, an apostrophe or a bracket is not part of a word.
 
-
-def quoted_path(override: str) -> str:
-    """Quote the value of a path, and expand ``~``, unless it is empty, null or quoted."""
-    key, _, path = override.partition("=")
-    if key not in PATH_KEYS or path in ("", "null") or path[0] in "'\"":
-        return override
-    return quoted(key, os.path.expanduser(path))
-
-
-def quoted(key: str, path: str, form: str = "{}") -> str:
-    r"""Return an override whose value is quoted for Hydra's grammar.
-
-    An unquoted path with an umlaut, an apostrophe or a bracket is not a word of that grammar. Interpolations stay
-    active; ``\${`` is a literal ``${``.
+    Interpolations stay active; ``\${`` is a literal ``${``.
     """
     path = re.sub(r"(\\*)'", r"\1\1\\'", path)
     path = re.sub(r"(\\+)$", r"\1\1", path)
-    value = form.format(f"'{path}'")
-    return f"{key}={value}"
+    return f"'{path}'"
 
 
-def _check_own_options(overrides: Sequence[str], folders: OptionFolders) -> None:
-    """Refuse chosen option files of the user that Hydra would not use, or could not read safely.
+def _check_own_files(overrides: Sequence[str], folders: OptionFolders) -> None:
+    """Refuse chosen files of the user that Hydra would not use, or could not read safely.
 
     Hydra uses a built-in option of the same name, and OmegaConf has no limits on nesting and aliases.
     """
@@ -223,20 +334,10 @@ def _check_own_options(overrides: Sequence[str], folders: OptionFolders) -> None
         file = Path(folders.own or "", f"{name}.yaml")
         if not file.is_file():
             continue
-        if (folders.main or conf_dir()).joinpath(f"{name}.yaml").is_file():
+        if (folders.main / f"{name}.yaml").is_file():
             problem = "has the name of a built-in file, which would be used instead"
             raise ConfigError(f"{text}: {file} {problem}; rename the file")
         read_yaml_mapping(file)
-
-
-def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> Iterator[str]:
-    """Yield the keys that a ``+`` override added to the config and the schema lacks."""
-    for key in map(str, node):
-        value = getattr(schema, key, None)
-        if not hasattr(schema, key):
-            yield prefix + key
-        elif is_dataclass(value):
-            yield from _unknown_keys(node[key], value, f"{prefix}{key}.")
 
 
 _LOCK = threading.RLock()
@@ -247,12 +348,10 @@ def _hydra_in(main: Path) -> Iterator[None]:
     """Initialise Hydra's Compose API; afterwards restore the state of the application that runs, if any."""
     with _LOCK:
         application, version = GlobalHydra.instance(), VersionBase.instance()
-        state, base = application.hydra, version.version_base
-        job_name = JobRuntime.instance().get("name")
-        application.clear()
+        state, base, job_name = application.hydra, version.version_base, JobRuntime.instance().get("name")
+        application.hydra = None
         try:
-            with hydra.initialize_config_dir(str(main), job_name=job_name, version_base=VERSION_BASE):
-                yield
+            hydra.initialize_config_dir(str(main), job_name=job_name, version_base=VERSION_BASE)
+            yield
         finally:
             application.hydra, version.version_base = state, base
-            GlobalHydra.set_instance(application)

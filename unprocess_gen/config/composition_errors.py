@@ -10,145 +10,89 @@ from typing import Any
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
-from unprocess_gen.config.option_files import ADDED_GROUPS, file_hint, group_options
+from unprocess_gen.config.option_files import ADDED_GROUPS, file_hint
 from unprocess_gen.config.schema import BranchConfig, Config, ProvenanceConfig, all_settings
-from unprocess_gen.config.settings import Setting, settings_of
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.suggestions import did_you_mean
 
+ITEMS = {BranchConfig: "noise.branches", ProvenanceConfig: "noise.provenance"}
+"""Dataclasses of list items, whose place in the config OmegaConf does not name, with the key of the list."""
+
 
 def explain(error: BaseException, overrides: Sequence[str]) -> str:
-    """Return one sentence about why a config could not be composed.
-
-    Parameters
-    ----------
-    error : BaseException
-        What Hydra or OmegaConf raised.
-    overrides : sequence of str
-        Overrides as the user wrote them, to quote the one at fault.
-
-    Returns
-    -------
-    str
-        ``key=value: problem; expected …``, or the message of ``error`` on one line.
-    """
+    """Say in one sentence why Hydra or OmegaConf refuses a config, quoting the user's override."""
     for link in _chain(error):
         if isinstance(link, RecursionError):
             return "an override or option file is nested too deeply; expected lists and mappings of a few levels"
         if isinstance(link, MissingConfigException) and link.missing_cfg_file:
-            return _missing_file(link)
+            return _missing_file(str(link.missing_cfg_file), sorted(link.options or ()))
         if isinstance(link, OverrideParseException):
             return f"{link.override}: not a valid override ({error_in_one_line(link)})"
-        key = getattr(link, "full_key", None)
-        if isinstance(link, OmegaConfBaseException) and key:
-            if link.object_type in ITEMS:
-                return _in_item(link.object_type, key)
-            if isinstance(link, ConfigAttributeError | ConfigKeyError):
-                return unknown_key(key, overrides)
-            return f"{assignment(key, overrides)}: {_wrong_value(link, key, overrides)}"
-    text = error_in_one_line(error)
+        if isinstance(link, OmegaConfBaseException) and link.full_key:
+            if isinstance(link, ConfigAttributeError | ConfigKeyError) and is_dataclass(link.object_type):
+                return _unknown_key(link.full_key, link.object_type, overrides)
+            return f"{_assignment(link.full_key, link.object_type, overrides)}: {_wrong_value(link, overrides)}"
     for override in overrides:
-        if text.startswith(f"Ambiguous value for argument '{override}'"):
-            return several_values(override)
-        parent, _, name = override.lstrip("+").partition("=")[0].rpartition(".")
-        if (setting := _setting(parent)) is not None:  # OmegaConf takes the name for the number of an item
-            return f"{override}: {parent} has no key {name}; expected {parent}=…: {setting.allowed}"
-    return text
+        if allowed := _allowed(override.partition("=")[0].rpartition(".")[0]):
+            return f"{override}: no such key; expected {allowed}"  # OmegaConf takes it for the number of an item
+    return error_in_one_line(error)
 
 
-def several_values(override: str, advice: str = "") -> str:
-    """Return the sentence about an override with several values where one is expected.
-
-    Parameters
-    ----------
-    override : str
-        The override as the user wrote it.
-    advice : str, optional
-        What else to do, where a sweep is possible.
-
-    Returns
-    -------
-    str
-        One sentence; for a key that is no group of options it explains how to write a list.
-    """
-    key, _, values = override.partition("=")
-    as_list = "" if group_options(key.lstrip("+")) else f"; for a list, write {key}=[{values}]"
-    return f"{override}: several values; expected one{advice}{as_list}"
-
-
-def unknown_key(key: str, overrides: Sequence[str]) -> str:
-    """Return the sentence about a key that the schema lacks, with the keys it has there."""
-    if key in ADDED_GROUPS and assignment(key, overrides) != key:
-        return (
-            f"{assignment(key, overrides)}: the keys of the file are below '{key}'; expected '# @package _global_' "
-            "as its first line"
-        )
-    path, name = key.split(".")[:-1], key.split(".")[-1]
-    node: Any = Config()
-    for part in path:
-        node = getattr(node, part, None)
-    if not is_dataclass(node):
-        node, path, name = Config(), [], key.split(".")[0]
-    keys = [field.name for field in fields(node)]
-    allowed = f"{'.'.join(path)} has {', '.join(keys)}" if path else f"expected one of {', '.join(keys)}"
-    return f"{assignment(key, overrides)}: no such key; {allowed}{did_you_mean(name, keys)}"
-
-
-def unknown_option(group: str, name: str, options: Sequence[str]) -> str:
-    """Return the sentence about an option that a group lacks."""
+def _missing_file(file: str, options: Sequence[str]) -> str:
+    """Name the options of a group, or the primary config that is missing."""
+    group, slash, name = file.rpartition("/")
+    if not slash:
+        return f"--config-name: no config named '{name}'; expected the name of a YAML file without its suffix"
     hint = file_hint(group, name) or did_you_mean(name, options)
     return f"{group}={name}: no such option; expected one of {', '.join(options)}{hint}"
 
 
-def assignment(key: str, overrides: Sequence[str]) -> str:
-    """Return ``key=value`` as the user wrote it, or the key alone if no override names it or a key below it."""
-    written = [override.lstrip("+~") for override in overrides]
-    exact = (override for override in written if override.split("=")[0] == key)
-    below = (override for override in written if override.split("=")[0].startswith(f"{key}."))
-    return next((override for matches in (exact, below) for override in matches), key)
+def _unknown_key(key: str, group: Any, overrides: Sequence[str]) -> str:
+    """Name the keys that a group has in place of an unknown one."""
+    written = _assignment(key, group, overrides)
+    if key in ADDED_GROUPS:
+        problem = f"the keys of the file are below '{key}'"
+        return f"{written}: {problem}; expected '# @package _global_' as its first line"
+    place, _, name = key.rpartition(".")
+    names = [field.name for field in fields(group)]
+    allowed = "expected one of" if group is Config else f"{ITEMS.get(group, place)} has"
+    return f"{written}: no such key; {allowed} {', '.join(names)}{did_you_mean(name, names)}"
 
 
-def _wrong_value(error: OmegaConfBaseException, key: str, overrides: Sequence[str]) -> str:
-    """Expected type of a value that OmegaConf refuses, else its message."""
-    message = str(error.msg or error).splitlines()[0]
+def _assignment(key: str, group: Any, overrides: Sequence[str]) -> str:
+    """Find ``key=value`` as the user wrote it, or a key below it; the key alone if no override names it."""
+    written = [override.lstrip("+") for override in overrides]
+    exact = [override for override in written if override.split("=")[0] == key]
+    below = [override for override in written if override.startswith(f"{key}.")]
+    return f"{ITEMS[group]}: {key}" if group in ITEMS else next(iter(exact + below), key)
+
+
+def _wrong_value(error: OmegaConfBaseException, overrides: Sequence[str]) -> str:
+    """Allowed values of a key, else the message of OmegaConf."""
+    key, message = str(error.full_key), str(error.msg or error).splitlines()[0]
     if isinstance(error, InterpolationResolutionError):
         return re.sub(r'^\w+ raised while resolving interpolation: "?(.*?)"?$', r"\1", message)
-    if "is not a ListConfig, list or tuple" in message:
-        value = assignment(key, overrides).partition("=")[2]
-        return f"expected a list{f', such as [{value}]' if value and value[0] not in '[{' else ''}"
-    setting = _setting(key) or _setting(key.partition("[")[0])
-    return message if setting is None else f"expected {setting.allowed}"
+    if error.object_type in ITEMS:
+        return f"expected {settings_of(error.object_type)[key].allowed}"
+    value = _assignment(key, None, overrides).partition("=")[2]
+    if "is not a ListConfig, list or tuple" in message and value and value[0] not in "[{":
+        return f"expected a list, such as [{value}]"
+    allowed = _allowed(key)
+    return f"expected {allowed}" if allowed else message
 
 
-def _setting(key: str) -> Setting | None:
-    """Return the declaration of a key, such as ``noise.a``; None if it is no setting."""
-    return next((setting for group, name, setting in all_settings() if key == f"{group}.{name}".lstrip(".")), None)
-
-
-ITEMS = {BranchConfig: ("noise.branches", "a branch"), ProvenanceConfig: ("noise.provenance", "an item")}
-"""Dataclasses of list items: the key of the list, and what an item is called."""
-
-
-def _in_item(kind: type, key: str) -> str:
-    """Return the sentence about a key of a list's item, whose place in the config OmegaConf does not name."""
-    settings, (place, item) = settings_of(kind), ITEMS[kind]
-    if key in settings:
-        return f"{place}: {key}: expected {settings[key].allowed}"
-    return f"{place}: {key}: no such key; {item} has {', '.join(settings)}{did_you_mean(key, list(settings))}"
-
-
-def _missing_file(error: MissingConfigException) -> str:
-    group, slash, name = str(error.missing_cfg_file).rpartition("/")
-    if not slash:
-        return f"--config-name: no config named '{name}'; expected the name of a YAML file without its suffix"
-    return unknown_option(group, name, sorted(error.options or ()))
+def _allowed(key: str) -> str:
+    """Allowed values of the setting that a key names, or that it is below; empty if there is none."""
+    settings = {f"{group}.{name}".lstrip("."): setting for group, name, setting in all_settings()}
+    while key and key not in settings:
+        key = re.sub(r"(^|[.\[])[^.\[]*$", "", key)
+    return settings[key].allowed if key else ""
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
     """Yield an exception and those that caused it, from the last to the first."""
-    seen: list[BaseException] = []
     link: BaseException | None = error
-    while link is not None and link not in seen:
-        seen.append(link)
+    while link is not None:
         yield link
         link = link.__cause__ or link.__context__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
@@ -13,6 +14,7 @@ MAX_KEY_CHARACTERS = 100
 MAX_BRACKETS = 1000
 """Most opening brackets of one override; Hydra's parser recurses once for each level of nesting."""
 
+YAML_SUFFIXES = (".yaml", ".yml")
 
 ADDED_GROUPS = {"experiment": "settings of published work", "sweep": "prepared sweeps"}
 """Groups without settings of their own, with what they contain: options are added with ``+``."""
@@ -27,6 +29,20 @@ PACKAGE_DIRECTIVE = "# @package"
 def conf_dir() -> Path:
     """Return the folder of the built-in option files."""
     return _shipped_folder("conf", "config.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class OptionFolders:
+    """The folder with the primary config, its name (None: ``config``), and the user's folder, searched last."""
+
+    main: Path = field(default_factory=conf_dir)
+    name: str | None = None
+    own: Path | None = None
+
+    @property
+    def all(self) -> list[Path]:
+        """Folders with options."""
+        return [self.main, *([] if self.own is None else [self.own])]
 
 
 def manifests_dir() -> Path:
@@ -64,27 +80,27 @@ def option_summary(group: str, option: str, folder: Path | None = None) -> str:
 def check_override(override: str) -> None:
     """Refuse an override that Hydra would take for something else, or answer with several lines."""
     key, equals, value = override.lstrip("+").partition("=")
-    if max(override.count(bracket) for bracket in "[{(") > MAX_BRACKETS:
+    if max(map(override.count, "[{(")) > MAX_BRACKETS:
         raise ConfigError(f"{override[:60]}…: nested too deeply; expected at most {MAX_BRACKETS} brackets")
     if override.startswith("~"):
         problem = "a setting cannot be removed; expected key=value; choose another value or option"
         raise ConfigError(f"{override}: {problem}")
-    if not equals:
-        raise ConfigError(f"{override}: expected a setting key=value; see gen-dataset --help")
-    if len(key) > MAX_KEY_CHARACTERS:
-        raise ConfigError(f"{key[:60]}…: no such key; see gen-dataset --help")
+    if not equals or len(key) > MAX_KEY_CHARACTERS:
+        raise ConfigError(f"{override[:MAX_KEY_CHARACTERS]}: expected a setting key=value; see gen-dataset --help")
+    if key.startswith("hydra") and key != "hydra.mode":
+        raise ConfigError(f"{override}: Hydra's own settings are fixed; expected only hydra.mode")
     if key in ADDED_GROUPS and not override.startswith("+"):
         raise ConfigError(f"{override}: is added to the settings; write +{override}")
     options = group_options(key) if key.isalpha() else []
-    word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
-    if key in OPTIONAL_GROUPS and value == "null":
-        return
-    if options and (not word or ("/" in value and value.endswith((".yaml", ".yml")))):
+    is_name = re.match(r"(?!(null|true|false)$)[A-Za-z_]", value) and not (
+        "/" in value and value.endswith(YAML_SUFFIXES)
+    )
+    if options and not is_name and not (key in OPTIONAL_GROUPS and value == "null"):
         raise ConfigError(f"{override}: expected the name of an option: {', '.join(options)}{file_hint(key, value)}")
 
 
 def file_hint(group: str, name: str) -> str:
     """Remedy for the path of a user's YAML file as an option; empty if the name is no such path."""
-    if "/" not in name and not name.endswith((".yaml", ".yml")):
+    if "/" not in name and not name.endswith(YAML_SUFFIXES):
         return ""
     return f"; for a file of your own, put it in FOLDER/{group} and write --config-dir FOLDER {group}={Path(name).stem}"

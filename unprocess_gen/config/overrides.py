@@ -6,8 +6,6 @@ import operator
 from collections.abc import Mapping
 from typing import Any
 
-from omegaconf import open_dict
-
 from unprocess_gen.config.composition import compose_node, load_config, typed_config
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.option_files import conf_dir
@@ -28,10 +26,7 @@ def overrides_of(config: Config) -> dict[str, str]:
     names = {group: getattr(config, group).name for group in NAMED_GROUPS}
     given = {group: name for group, name in names.items() if (conf_dir() / group / f"{name}.yaml").is_file()}
     options = [f"{key}={text}" for key, text in given.items() if key in GROUPS]
-    node = compose_node(options)
-    with open_dict(node):
-        node.pop("hydra")
-    base = typed_config(node, options)
+    base = typed_config(compose_node(options), options)
     given |= {key: override_text(wanted) for key, wanted in _differing_settings(config, base)}
     given = {key: text for key, text in given.items() if default_options().get(key) != text}
     composition = load_config([f"{key}={text}" for key, text in given.items()])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterable
 
 from unprocess_gen.config.interpretation import is_physical, uses_dark_frames
 from unprocess_gen.config.schema import Config, RawConfig, SourceConfig
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import refusal, value_text
+from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.simulation.reference.cfa import MONO
 
 PHOTOGRAPH_SETTINGS = {"downscale": 1, "dequantize": "off", "icc": "ignore"}
@@ -24,6 +26,9 @@ def check_raw_source(config: Config) -> None:
             kind, advice = ("photographs", "use source.shrink") if is_raw else ("raw sources", "set source.kind=raw")
             raise refusal(f"source.{name}", setting, f"is for {kind}; expected {value_text(value)}, or {advice}")
     if is_raw:
+        if source.include == SourceConfig.include:
+            problem = "the patterns of source.include are those of photographs; expected source=raw, or "
+            raise refusal("source.kind", "raw", f"{problem}'- override /source: raw' in the defaults of the file")
         _check_raw_levels(config)
         _check_own_noise(config)
         if config.output.targets and source.shrink == 1:
@@ -31,6 +36,31 @@ def check_raw_source(config: Config) -> None:
             raise refusal("output.targets", config.output.targets, problem)
     elif config.sensor.levels == "source":
         raise refusal("sensor.levels", "source", "photographs state no levels; choose a sensor, or set source.kind=raw")
+
+
+NOT_APPLIED = {
+    "camera": "colours of a photograph; rows record the matrix of the file",
+    "gains": "white balance of a photograph; rows record the gains of the file",
+    "isp": "tone curve of a photograph; raw frames have none",
+}
+"""Groups that undo what a photograph went through."""
+
+SENSOR_LEVELS = tuple(f"sensor.{name}" for name in ("bits", "black_level_dn", "white_level_dn", "pattern"))
+
+
+def check_raw_overrides(config: Config, overrides: Iterable[str]) -> None:
+    """Raise ConfigError for overrides that do not apply to the frames of raw sources."""
+    if config.source.kind != "raw":
+        return
+    for override in overrides:
+        key = override.partition("=")[0]
+        if (group := key.partition(".")[0]) in NOT_APPLIED:
+            raise ConfigError(f"{override}: source.kind=raw: {group} inverts the {NOT_APPLIED[group]}; remove it")
+        if key in SENSOR_LEVELS and config.sensor.levels == "source":
+            raise ConfigError(f"{override}: sensor=source takes it from each file; choose a sensor, or remove it")
+        if key == "sensor.pattern" and config.source.shrink == 1:
+            problem = "the mosaic has the pattern of its file; set source.shrink=2, or remove it"
+            raise ConfigError(f"{override}: source.kind=raw: {problem}")
 
 
 def require_photographs(source: SourceConfig, caller: str) -> None:

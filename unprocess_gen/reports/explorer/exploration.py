@@ -10,7 +10,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from unprocess_gen.config.composition import OptionFolders, composed_config
+from unprocess_gen.config.composition import composed_config
+from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.core.arrays import PACKED, Srgb

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from unprocess_gen.config.composition import OptionFolders, composed_config
+from unprocess_gen.config.composition import composed_config
+from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.config.overrides import override_text, overrides_of
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import SourceConfig
