@@ -43,7 +43,7 @@ def mosaics(config: Any, dn: np.ndarray) -> Photograph:
 def by_site(photograph: Photograph) -> Photograph:
     """Return a mosaic with a black level of its own for each plane, as the tags of a DNG state it."""
     assert photograph.raw is not None
-    source = replace(photograph.raw.source, raw_black_dn=(500.0, 509.0, 511.0, 523.0))
+    source = photograph.raw.source.replace(raw_black_dn=(500.0, 509.0, 511.0, 523.0))
     return replace(photograph, raw=photograph.raw._replace(source=source))
 
 
