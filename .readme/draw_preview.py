@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 
-from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
+from unprocess_gen.reports.sheets import contact_sheet
 
 KEYS = "1,2"
 

@@ -24,6 +24,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.noise_check.checks import Checker
+from unprocess_gen.reports.noise_check.repeat import measure_noise
 from unprocess_gen.simulation.facts import DarkFrames
 from unprocess_gen.sources.dark_frames import open_dark_frames
 
@@ -296,8 +297,8 @@ def test_sums_of_dark_frames_raise_no_alarm(overrides: tuple[str, ...], darks: P
     checker = Checker(2)
     for number in range(2):
         pair = ug.make_pair(pixels(number, 200, 300), replaced(config, {"seed": number}))
-        checker.add(pair.clean, pair.noisy, pair.row, access)
-        checker.add(pair.clean, pair.noisy, pair.row)
+        checker.add(measure_noise(pair.clean, pair.noisy, pair.row, access))
+        checker.add(measure_noise(pair.clean, pair.noisy, pair.row))
     assert (checker.count, checker.unchecked, checker.alarms) == (2, 2, [])
 
 

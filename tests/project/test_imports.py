@@ -26,9 +26,9 @@ ONLY_IN = {
     "numba": {"simulation.kernels.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
-        *("reports.encoding", "reports.explorer.views", "reports.sheets.panels", "camera_noise"),
+        *("reports.explorer.views", "reports.panels", "camera_noise"),
     },
-    "PIL": {"sources.image.decode", "sources.image.headers"},
+    "PIL": {"reports.pictures", "sources.image.decode", "sources.image.headers"},
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng", "sources.raw.decode"},
     "rawpy": {"sources.raw.decode"},

@@ -31,7 +31,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import read_dataset
 from unprocess_gen.reports import formatting, html_pages
-from unprocess_gen.reports.dataset_page import page as dataset_report
+from unprocess_gen.reports.dataset_page import dataset_page
 
 HOSTILE = "<img src=x onerror=alert('&amp;')>\".png"
 """A file name that is markup unless it is escaped."""
@@ -54,7 +54,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
 
 @pytest.fixture(scope="module")
 def text(made: Path) -> str:
-    return dataset_report.dataset_page(made)
+    return dataset_page(made)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def scenes(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scenes_page(scenes: Path) -> str:
-    return dataset_report.dataset_page(scenes)
+    return dataset_page(scenes)
 
 
 def cells(folder: Path, column: str) -> list[str]:
@@ -156,7 +156,7 @@ def test_clipped_sites_agree_with_the_manifest(made: Path, text: str) -> None:
 def test_omitted_effects_are_listed_with_their_reason(make: Make, tmp_path: Path) -> None:
     camera = ["noise=oppo_reno10x", "noise.iso=[uniform,100,3200]", "effects.prnu=off"]
     make(None, tmp_path / "ds", "source.limit=2", *camera, "source.patch=[random,64,3]")
-    text = dataset_report.dataset_page(tmp_path / "ds")
+    text = dataset_page(tmp_path / "ds")
     assert '<tr><td>prnu</td><td class="w">switched off</td></tr>' in text
     assert '<tr><td>row</td><td class="w">noise=oppo_reno10x gives no row_std_dn</td></tr>' in text
     assert "<tr><td>read_std_dn</td>" in text
@@ -181,9 +181,7 @@ def test_noise_that_differs_from_the_manifest_is_reported(
 ) -> None:
     assert "All agree with the manifest." in scenes_page
     monkeypatch.setattr("unprocess_gen.reports.noise_check.checks.alarm_limit", lambda scores: 0.0)
-    assert "The noise of 2 of them differs from the manifest: noise of 00000000: " in dataset_report.dataset_page(
-        scenes
-    )
+    assert "The noise of 2 of them differs from the manifest: noise of 00000000: " in dataset_page(scenes)
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +195,7 @@ def failed(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_dataset_without_pairs_has_a_report(failed: Path) -> None:
-    text = dataset_report.dataset_page(failed)
+    text = dataset_page(failed)
     assert "0 pairs" in text and "failed rows: 1." in text
     assert "there is no pair to show" in text
     assert "<p>empty: 1</p>" in text

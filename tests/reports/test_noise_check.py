@@ -92,7 +92,7 @@ def untouched(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.rando
 def scores_of_pair(clean: Frame, noisy: Frame, row: Row) -> Scores:
     """Scores of a pair that has enough sites."""
     noise = repeat.measure_noise(clean, noisy, row)
-    return scores_of(noise)[0] if np.count_nonzero(noise.weight) >= LEAST_SITES else {}
+    return scores_of(noise)[0] if noise is not None and np.count_nonzero(noise.weight) >= LEAST_SITES else {}
 
 
 def checked(
@@ -326,7 +326,8 @@ def repetitions(pairs: Iterable[Any], **numbers: int) -> list[Alarm]:
     pairs = list(pairs)
     checker = Checker(len(pairs))
     for n, (clean, noisy, row) in enumerate(pairs):
-        checker.add(clean, noisy, {**row, **{name: first + n for name, first in numbers.items()}})
+        renumbered = {**row, **{name: first + n for name, first in numbers.items()}}
+        checker.add(repeat.measure_noise(clean, noisy, renumbered))
     return [alarm for alarm in checker.alarms if alarm.check == "repetition"]
 
 

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.noise_fits import dataset_fits
+from helpers.noise_fits import dataset_fits, fit_pair
 from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs, make_pair
-from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.sources import synthetic
 
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.dataset.manifest import plan_from_row
-from unprocess_gen.reports.sheets import contact_sheet, panels
+from unprocess_gen.reports import panels, sheets
 from unprocess_gen.simulation.reference import isp as process
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import PATTERNS, mosaic
@@ -80,7 +80,7 @@ def test_sheet_contains_every_panel_exactly(few: Path, tmp_path: Path, figure: F
         shown += [light, process.develop(raw, plan)]
     shown.append((difference / (4 * np.sqrt(np.mean(difference**2))) + 1) / 2)
 
-    [drawn] = contact_sheet.write_sheets(few, tmp_path, "0")
+    [drawn] = sheets.write_sheets(few, tmp_path, "0")
     sheet = png(drawn.files[0])
 
     found = [places(sheet, codes(picture)) for picture in shown]
@@ -95,7 +95,7 @@ def test_sheet_contains_every_panel_exactly(few: Path, tmp_path: Path, figure: F
 def test_detail_equals_the_developed_complete_frame(few: Path, tmp_path: Path) -> None:
     clean, _, row = RawPairs(few)[1]
 
-    [drawn] = contact_sheet.write_sheets(few, tmp_path, "1")
+    [drawn] = sheets.write_sheets(few, tmp_path, "1")
 
     part = codes(process.develop(clean, plan_from_row(row))[panels.detail_window(clean.shape)])
     assert part.shape == (*panels.PANEL_PX, 3)
@@ -119,7 +119,7 @@ def test_stages_show_each_step_and_the_frames_of_the_dataset(few: Path, tmp_path
             sites[y::2, x::2, channel] = level[y::2, x::2]
         expected.append(codes(sites))
 
-    [drawn] = contact_sheet.write_sheets(few, tmp_path, "0", with_stages=True)
+    [drawn] = sheets.write_sheets(few, tmp_path, "0", with_stages=True)
 
     assert [path.name for path in drawn.files] == ["00000000.png", "00000000.stages.png"]
     picture = png(drawn.files[1])
@@ -153,7 +153,7 @@ def test_few_defective_sites_do_not_hide_the_others(defects: list[tuple[int, int
     for y, x, dn in defects:
         defective[y, x] = dn
 
-    (before, _), (after, _) = contact_sheet.stretch(raw), contact_sheet.stretch(defective)
+    before, after = panels.stretch(raw), panels.stretch(defective)
 
     assert after[raw == defective].std() > 0.8 * before[raw == defective].std() > 0.1
 
@@ -177,13 +177,13 @@ def test_widest_character_of_the_font_fits() -> None:
 
 
 def test_overview_has_one_strip_per_pair_in_manifest_order(few: Path) -> None:
-    strips = [contact_sheet.contact_sheet(few, key) for key in ("00000000", "1", "00000003")]
-    np.testing.assert_array_equal(contact_sheet.contact_sheet(few), np.vstack(strips))
-    np.testing.assert_array_equal(contact_sheet.contact_sheet(few, "3,0"), np.vstack(strips[::2]))
+    strips = [sheets.contact_sheet(few, key) for key in ("00000000", "1", "00000003")]
+    np.testing.assert_array_equal(sheets.contact_sheet(few), np.vstack(strips))
+    np.testing.assert_array_equal(sheets.contact_sheet(few, "3,0"), np.vstack(strips[::2]))
 
 
 def test_overview_without_photographs_shows_the_reason_and_the_frames(few: Path, tmp_path: Path) -> None:
-    with_source, without = (contact_sheet.contact_sheet(few, "0", source) for source in (None, tmp_path))
+    with_source, without = (sheets.contact_sheet(few, "0", source) for source in (None, tmp_path))
 
     left, height = panels.STRIP_PX[1] + panels.MARGIN_PX, panels.STRIP_PX[0]
     assert (without[:, :left] < panels.EMPTY_GREY - 100).any()  # text of the reason
@@ -191,7 +191,7 @@ def test_overview_without_photographs_shows_the_reason_and_the_frames(few: Path,
 
 
 def test_eight_evenly_spaced_pairs_are_shown_by_default(dataset: Path, tmp_path: Path) -> None:
-    shown = [drawn.key for drawn in contact_sheet.write_sheets(dataset, tmp_path)]
+    shown = [drawn.key for drawn in sheets.write_sheets(dataset, tmp_path)]
 
     assert shown == [f"{i * len(PHOTOS) // 8:08d}" for i in range(8)]
 
@@ -200,7 +200,7 @@ def test_frames_of_any_size_are_shown(dataset: Path, tmp_path: Path) -> None:
     """The sizes include 1 x 1 and 3 x 40."""
     keys = [str(pair.row["key"]) for pair in RawPairs(dataset)]
 
-    drawn = list(contact_sheet.write_sheets(dataset, tmp_path, ",".join(keys), with_stages=True))
+    drawn = list(sheets.write_sheets(dataset, tmp_path, ",".join(keys), with_stages=True))
 
     assert [one.key for one in drawn] == keys
     assert all(one.missing_source == "" and len(one.files) == 2 for one in drawn)
@@ -210,9 +210,7 @@ def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Pa
     one = ("source.include=[large.png]", "output.layout=packed")
     make(gray_world, tmp_path / "whole", *one)
     make(gray_world, tmp_path / "float", *one, "output.dtype=float32")
-    wholes, floats = (
-        next(iter(contact_sheet.selected_pairs(tmp_path / name, "", None))) for name in ("whole", "float")
-    )
+    wholes, floats = (next(iter(sheets.selected_pairs(tmp_path / name, "", None))) for name in ("whole", "float"))
 
     assert np.abs(floats.clean - wholes.clean.astype(np.float64)).max() <= 0.5 + 1e-3  # rounding, and float32
     assert np.abs(floats.noisy - wholes.noisy.astype(np.float64)).max() <= 0.5 + 1e-3
@@ -224,7 +222,7 @@ def test_patch_is_shown_with_its_part_of_the_source(key: str, gray_world: Path, 
     row = RawPairs(tmp_path / "ds")[3].row
     y, x = row["patch_y"], row["patch_x"]
 
-    drawn = list(contact_sheet.write_sheets(tmp_path / "ds", tmp_path / "to", key))
+    drawn = list(sheets.write_sheets(tmp_path / "ds", tmp_path / "to", key))
 
     assert len(drawn) == (4 if key == "00000000" else 2)
     part = pixels(3, HEIGHT, WIDTH)[y : y + 32, x : x + 32]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets import Make, Settings
-from helpers.noise_fits import dataset_fits
+from helpers.noise_fits import dataset_fits, fit_pair
 from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +17,6 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.reports.photon_transfer import fit_pair
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import REFERENCE, Plan

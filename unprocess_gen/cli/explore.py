@@ -18,7 +18,7 @@ def explore(call: Call) -> int:
         name = "--multirun" if call.multirun else "--cfg" if call.cfg else "--resolve"
         raise ConfigError(f"explore: {name}: a page shows one config; expected settings; leave it out")
     from unprocess_gen.reports.explorer import server
-    from unprocess_gen.reports.explorer.opening import open_place
+    from unprocess_gen.reports.explorer.exploration import open_place
 
     place = call.place
     if place is not None and not any_path(place).is_listed():

@@ -64,7 +64,7 @@ def accuracy(call: Call) -> int:
 def report(call: Call) -> int:
     """Write the HTML page of a dataset or a sweep."""
     from unprocess_gen.pipeline.verify import is_sweep
-    from unprocess_gen.reports.dataset_page.page import write_dataset_report
+    from unprocess_gen.reports.dataset_page import write_dataset_report
     from unprocess_gen.sources.dark_frames import dark_folder
 
     folder = dataset_folder(call, sweeps=True)
@@ -93,7 +93,7 @@ def preview(call: Call) -> int:
     """Draw contact sheets of pairs."""
     from unprocess_gen.dataset.selection import select_pairs
     from unprocess_gen.pipeline.replay import source_root
-    from unprocess_gen.reports.sheets.contact_sheet import write_sheets
+    from unprocess_gen.reports.sheets import write_sheets
 
     folder = dataset_folder(call)
     to, root, keys = call.to, given_root(call), call.keys or ""

@@ -13,9 +13,9 @@ from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.output_paths import check_output_file
-from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
+from unprocess_gen.reports.pictures import figure_png
 from unprocess_gen.reports.report_files import require_libraries
 from unprocess_gen.statistics.scores import NORMAL_95
 

@@ -6,33 +6,20 @@ NOT_MEASURED = "–"
 
 
 def short_number(value: float | None, digits: int = 2) -> str:
-    """Return a number with some significant digits, without an exponent if it is short; a dash for None."""
+    """A number with some significant digits, without an exponent if it is short; a dash for None."""
     return NOT_MEASURED if value is None else f"{float(f'{value:.{digits}g}'):g}"
 
 
 def percentage(fraction: float | None, digits: int = 2) -> str:
-    """Return a fraction as a percentage; a dash for None."""
+    """A fraction as a percentage; a dash for None."""
     return NOT_MEASURED if fraction is None else f"{short_number(fraction * 100, digits)} %"
 
 
 def byte_size(count: int) -> str:
-    """Return a number of bytes in decimal megabytes or gigabytes."""
+    """A number of bytes in decimal megabytes or gigabytes."""
     return f"{count / 1e9:,.2f} GB" if count >= 1e9 else f"{count / 1e6:,.1f} MB"
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number and a noun, which gets an s unless the number is 1.
-
-    Parameters
-    ----------
-    number : int
-        The number.
-    noun : str
-        Singular; its plural ends with s.
-
-    Returns
-    -------
-    str
-        Such as ``1 pair`` or ``1200 pairs``.
-    """
+    """A number and a noun with its plural s, such as ``1 pair`` or ``1200 pairs``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,41 +23,36 @@ INVISIBLE = re.compile(
 
 
 class PageTable(NamedTuple):
-    """A table of a page.
-
-    ``numeric`` holds the indices of columns aligned right, ``wrapped`` of columns with long text, ``groups`` of lines
-    that begin a new group.
-    """
+    """A table of a page: ``numeric`` columns are aligned right, and each line in ``groups`` begins a new group."""
 
     headings: Sequence[str]
-    lines: Iterable[Sequence[str]]
+    lines: Sequence[Sequence[str]]
     numeric: Collection[int] = ()
     groups: Collection[int] = ()
-    wrapped: Collection[int] = ()
 
 
 def render_page(template: str, **values: Any) -> str:
-    """Return a page rendered from a template of ``templates/``; a missing value raises `jinja2.UndefinedError`."""
+    """Render a template of ``templates/``; a missing value raises `jinja2.UndefinedError`."""
     return page_template(template).render(values)
 
 
 def page_template(name: str) -> Template:
-    """Return a template of ``templates/``."""
+    """Find a template of ``templates/``."""
     return _environment().get_template(name)
 
 
 def render_macro(name: str, content: Any) -> str:
-    """Return a part of a page, rendered by a macro of ``macros.html``."""
+    """Render a part of a page by a macro of ``macros.html``."""
     return str(getattr(page_template("macros.html").module, name)(content))
 
 
 def data_uri(content: bytes, kind: str = "png") -> str:
-    """Return the ``data:`` address of an encoded image, which makes it part of the page."""
+    """Address of an encoded image that makes it part of the page."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def visible(value: Any) -> Any:
-    r"""Return text with invisible characters as escapes such as ``\x1b``; markup and other types are unchanged."""
+    r"""Write invisible characters of a text as escapes such as ``\x1b``; markup and other types are unchanged."""
     if not isinstance(value, str) or hasattr(value, "__html__"):
         return value
     return INVISIBLE.sub(lambda match: match[0].encode("unicode_escape").decode(), value)

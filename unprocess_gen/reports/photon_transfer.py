@@ -9,13 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unprocess_gen.core.arrays import Float, Frame
-from unprocess_gen.dataset.manifest import plan_from_row
-from unprocess_gen.dataset.row import Row
-from unprocess_gen.reports.encoding import figure_png
-from unprocess_gen.reports.noise_check.repeat import measure_noise
+from unprocess_gen.core.arrays import Float
+from unprocess_gen.reports.noise_check.repeat import Noise
 from unprocess_gen.reports.noise_check.scores import Bins, residual_of
-from unprocess_gen.simulation.facts import DarkPixels
+from unprocess_gen.reports.pictures import figure_png, new_figure
 from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 LEAST_SITES_OF_POINT = 16
@@ -24,16 +21,10 @@ LEAST_SITES_OF_POINT = 16
 
 @dataclass(frozen=True, slots=True)
 class NoiseFit:
-    """The line fitted to the noise of one pair.
+    """The line fitted to the noise of the pair with a key: variance against signal above black.
 
-    Attributes
-    ----------
-    key : str
-        Key of the pair.
-    estimate, error, expected : ndarray of float64, [2]
-        Slope (DN) and intercept (DN²) of the variance, their standard errors, and their values according to the row.
-    signal_dn, variance_dn2 : ndarray of float64, [N]
-        Signal above black, and variance without the offsets of rows and columns.
+    ``estimate``, its standard ``error`` and what the row ``expected`` are slope (DN) and intercept (DN²). The points
+    are variances without the offsets of rows and columns.
     """
 
     key: str
@@ -48,55 +39,45 @@ class NoiseFit:
         """Difference from the expected line in standard errors, the larger of slope and intercept."""
         return float((np.abs(self.estimate - self.expected) / self.error).max())
 
+    @property
+    def line(self) -> tuple[Float, Float]:
+        """Ends of the expected line."""
+        ends = np.array([self.signal_dn.min(initial=0.0), self.signal_dn.max(initial=1.0)])
+        return ends, self.expected[0] * ends + self.expected[1]
+
     def __str__(self) -> str:
-        numbers = (
-            f"{name} {estimate:.6g} ± {NORMAL_95 * error:.2g} {unit} (expected {expected:.6g})"
-            for name, unit, estimate, error, expected in zip(
-                "ab", ("DN", "DN²"), self.estimate, self.error, self.expected, strict=True
-            )
-        )
-        return f"{self.key}: {', '.join(numbers)}: {self.deviation:.1f} standard errors"
+        numbers = zip("ab", ("DN", "DN²"), self.estimate, NORMAL_95 * self.error, self.expected, strict=True)
+        texts = (f"{name} {a:.6g} ± {half:.2g} {unit} (expected {row:.6g})" for name, unit, a, half, row in numbers)
+        return f"{', '.join(texts)}: {self.deviation:.1f} standard errors"
 
 
-def fit_pair(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> NoiseFit | None:
-    """Fit the noise of a pair by weighted least squares; None with fewer than three clean values or no dark frame.
+def fit_noise(noise: Noise | None) -> NoiseFit | None:
+    """Fit the noise of a pair by weighted least squares; None with fewer than three clean values or no noise.
 
     The line of the row is corrected by the difference of the pair from its repetition, which has all recorded effects.
     """
-    plan = plan_from_row(row)
-    if plan.dark and dark_pixels is None:
+    if noise is None:
         return None
-    noise = measure_noise(clean, noisy, row, dark_pixels)
     bins, (own, repeated) = Bins(noise, np.s_[:, :]), residual_of(noise)[0].z
     if len(bins.signal) < 3:
         return None
     variances = np.stack([bins.sums(z**2) / (bins.count * bins.precision) for z in (own, repeated)])
     fourth_moment = float(bins.sums((repeated**2 - 1) ** 2).sum() / bins.count.sum())
+    expected, drawn = np.array(noise.plan.noise.variance_line), bins.count >= LEAST_SITES_OF_POINT
     spread = 2 * fourth_moment / (bins.count * bins.precision**2)
-    spread += noise.rounding_dn2 * (noise.rounding_dn2 + plan.noise.variance_line[0] ** 2)
+    spread += noise.rounding_dn2 * (noise.rounding_dn2 + expected[0] ** 2)
     by_point = influence(np.stack([bins.signal, np.ones_like(bins.signal)]), 1 / spread)
-    expected, drawn = np.array(plan.noise.variance_line), bins.count >= LEAST_SITES_OF_POINT
-    return NoiseFit(
-        key=str(row["key"]),
-        estimate=expected + by_point @ (variances[0] - variances[1]),
-        error=np.sqrt(by_point**2 @ spread),
-        expected=expected,
-        signal_dn=bins.signal[drawn],
-        variance_dn2=variances[0][drawn],
-    )
+    estimate, error = expected + by_point @ (variances[0] - variances[1]), np.sqrt(by_point**2 @ spread)
+    return NoiseFit(noise.key, estimate, error, expected, bins.signal[drawn], variances[0][drawn])
 
 
 def draw_fits(fits: list[NoiseFit]) -> bytes:
     """Draw variance against signal with the expected lines; return a PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = new_figure(8, 5)
     for number, fit in enumerate(fits):
         colour = f"C{number % 10}"
         axes.plot(fit.signal_dn, fit.variance_dn2, ".", color=colour, markersize=2, alpha=0.5)
-        ends = np.array([fit.signal_dn.min(initial=0.0), fit.signal_dn.max(initial=0.0)])
-        axes.plot(ends, fit.expected[0] * ends + fit.expected[1], color=colour, label=fit.key)
+        axes.plot(*fit.line, color=colour, label=fit.key)
     axes.set(xlabel="signal above black (DN)", ylabel="variance of the noise (DN²)", title="Photon transfer")
     axes.legend(title="line: expected from the manifest")
     return figure_png(figure, dpi=120)

@@ -1,7 +1,4 @@
-"""Check that a report can be written to the requested place, and write its files.
-
-A report is not part of a dataset.
-"""
+"""Check that a report can be written to the requested place, and write its files, which are no part of a dataset."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_file, check_output_folder
 from unprocess_gen.core.paths import AnyPath
@@ -35,7 +32,7 @@ def check_report_folder(out: Path, verb: str) -> None:
 
 
 def page_file(folder: AnyPath, to: Path | None = None) -> Path:
-    """Return the file for the page of a dataset or sweep: ``report.html`` in its folder, unless ``to`` names another.
+    """The file for the page of a dataset or sweep: ``report.html`` in its folder, unless ``to`` names another.
 
     ConfigError if a library is missing, or if the page cannot be written there.
     """
@@ -53,9 +50,7 @@ def page_file(folder: AnyPath, to: Path | None = None) -> Path:
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
     """Write files into a folder, replacing the files of an earlier report; MachineError if that fails."""
-    try:
+    with machine_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         for name, content in contents.items():
             (out / name).write_bytes(content)
-    except OSError as error:
-        raise machine_error(error, out) from error

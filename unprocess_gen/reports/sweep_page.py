@@ -1,6 +1,6 @@
 """Write the page of a sweep: a grid of its swept keys, with pictures of a pair and a link to the page of each dataset.
 
-The page is one file without scripts. Datasets without a page of their own get one, so that all links lead somewhere.
+Datasets without a page of their own get one, so that all links lead somewhere.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from unprocess_gen.core.errors import UnprocessGenError
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.pipeline.progress import with_bar
-from unprocess_gen.reports.dataset_page.page import write_dataset_report
-from unprocess_gen.reports.encoding import picture_jpeg
+from unprocess_gen.reports.dataset_page import write_dataset_report
 from unprocess_gen.reports.html_pages import data_uri, render_page
+from unprocess_gen.reports.panels import STRIP_PX, byte_codes, common_stretch, detail_window
+from unprocess_gen.reports.pictures import picture_jpeg
 from unprocess_gen.reports.report_files import page_file, write_files
-from unprocess_gen.reports.sheets.contact_sheet import common_stretch
-from unprocess_gen.reports.sheets.panels import STRIP_PX, byte_codes, detail_window
 
 JPEG_QUALITY = 70
 
@@ -48,7 +47,7 @@ def write_sweep_page(
     rows: dict[tuple[str, ...], dict[str, SweepCell]] = {}
     for job in with_bar(jobs, "dataset", len(jobs)):
         row = rows.setdefault(tuple(job.get(key, "") for key in down), {})
-        row[job.get(across, "")] = _job_cell(folder, job, file.parent)
+        row[job.get(across, "")] = _sweep_cell(folder / job["folder"], job, file.parent)
     values = list(dict.fromkeys(job.get(across, "") for job in jobs))
     title = f"Sweep {folder.absolute().name}"
     content = render_page("sweep.html", title=title, down=down, across=across, values=values, rows=rows, jobs=jobs)
@@ -56,24 +55,15 @@ def write_sweep_page(
     return file
 
 
-def _job_cell(sweep: Path, job: Mapping[str, str], start: Path) -> SweepCell:
-    """Describe a job; one without a readable dataset has the reason in place of a picture."""
-    folder = sweep / job["folder"]
+def _sweep_cell(folder: Path, job: Mapping[str, str], start: Path) -> SweepCell:
+    """The centre of the first pair, clean and noisy, one pixel per site; the reason without a readable dataset."""
     try:
-        picture, page = _picture(folder), page_file(folder)
+        pairs, page = RawPairs(folder), page_file(folder)
+        frames = [common_stretch(mosaic_dn(dn, row), plan_from_row(row)) for *pair, row in pairs[:1] for dn in pair]
         if not page.exists():
             write_dataset_report(folder)
     except (UnprocessGenError, OSError) as error:
         return SweepCell(job, problem=str(error))
+    details = [frame[detail_window(frame.shape, STRIP_PX)] for frame in frames]
+    picture = data_uri(picture_jpeg(byte_codes(np.hstack(details)), JPEG_QUALITY), "jpeg") if details else ""
     return SweepCell(job, quote(os.path.relpath(page, start)), picture)
-
-
-def _picture(folder: Path) -> str:
-    """Draw the centre of the first pair, clean and noisy, one pixel per site; empty without a pair."""
-    pairs = RawPairs(folder)
-    if not len(pairs):
-        return ""
-    clean, noisy, row = pairs[0]
-    frames = [common_stretch(mosaic_dn(frame, row), plan_from_row(row)) for frame in (clean, noisy)]
-    window = detail_window(frames[0].shape, STRIP_PX)
-    return data_uri(picture_jpeg(byte_codes(np.hstack([frame[window] for frame in frames])), JPEG_QUALITY), "jpeg")

@@ -36,8 +36,8 @@ from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.pipeline.progress import Progress
-from unprocess_gen.reports.encoding import picture_jpeg
 from unprocess_gen.reports.formatting import counted
+from unprocess_gen.reports.pictures import picture_jpeg
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance

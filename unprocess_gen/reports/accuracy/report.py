@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Measurement
-from unprocess_gen.reports.encoding import figure_png
 from unprocess_gen.reports.formatting import percentage, short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
+from unprocess_gen.reports.pictures import figure_png
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE
 

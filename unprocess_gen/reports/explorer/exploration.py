@@ -1,31 +1,39 @@
-"""Hold the settings of a page, make their pair with the functions that make datasets, and write their command."""
+"""Open photographs, built-in scenes and rows of a dataset as settings of a page, and make their pair as datasets do."""
 
 from __future__ import annotations
 
 import functools
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from unprocess_gen.config.composition import composed_config
 from unprocess_gen.config.option_files import OptionFolders
+from unprocess_gen.config.overrides import override_text, overrides_of
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config, SourceConfig
+from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.arrays import PACKED, Srgb
+from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.source import Source
-from unprocess_gen.dataset.keys import pair_key, patch_key
+from unprocess_gen.core.output_paths import is_dataset
+from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.core.source import NO_CLIP, Source
+from unprocess_gen.dataset.keys import image_key, pair_key, patch_key
 from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.dataset.row import Row
-from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
+from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
+from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_root
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.estimate import SourceEstimate
+from unprocess_gen.reports.panels import MosaicArray
 from unprocess_gen.reports.plan_text import noise_lines
-from unprocess_gen.reports.sheets.panels import MosaicArray
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Pair
@@ -39,10 +47,11 @@ from unprocess_gen.sources.photograph import Photograph
 
 PAIR_FOLDER = "pair"
 """Folder of the dataset that the command of a page makes."""
+SOURCES_LISTED = 1000
+"""Photographs or rows that a page offers; the others are opened by their name or key."""
 
 
-@dataclass(frozen=True, slots=True)
-class Shown:
+class Shown(NamedTuple):
     """The pair of the settings, and what they follow from.
 
     ``choices`` are the options by group, ``srgb`` the pixels of the patch, ``clean`` and ``noisy`` the frames as
@@ -60,8 +69,8 @@ class Shown:
     saturated: NDArray[Any]
     row: Row
     keys: tuple[str, ...]
-    lines: tuple[str, ...]
-    dark_pixels: DarkPixels | None = None
+    lines: list[str]
+    dark_pixels: DarkPixels | None
 
 
 @dataclass
@@ -90,6 +99,13 @@ class Exploration:
         out = [] if "out" in self.settings else [f"out={PAIR_FOLDER}"]
         return shlex.join(["gen-dataset", *self.flags, *self.overrides, *out])
 
+    @property
+    def source_config(self) -> SourceConfig:
+        """The settings of the sources; ConfigError for raw ones."""
+        config, _ = composed_config(self.overrides, self.folders)
+        require_photographs(config.source, "explore")
+        return config.source
+
     def add(self, overrides: Sequence[str]) -> None:
         """Apply overrides as the command line does."""
         for override in overrides:
@@ -102,19 +118,16 @@ class Exploration:
 
     def choose(self, group: str, option: str | None) -> None:
         """Choose an option of a group, None for none, and forget settings that it replaces."""
-        replaced_groups = (group, "camera", "sensor", "noise") if group == "body" else (group,)
-        self.settings = {
-            key: text for key, text in self.settings.items() if key.partition(".")[0] not in replaced_groups
-        }
+        replaced = (group, "camera", "sensor", "noise") if group == "body" else (group,)
+        self.settings = {key: text for key, text in self.settings.items() if key.partition(".")[0] not in replaced}
         self.settings[group] = "null" if option is None else option
 
     def shown(self) -> Shown:
         """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
         config, choices = composed_config(self.overrides, self.folders)
         require_photographs(config.source, "explore")
-        source = listed_sources(config.source)[self.index]
+        source, settings = listed_sources(config.source)[self.index], PairSettings.read(config)
         sha256, photograph = _loaded_source(config.source, source, config.output.layout)
-        settings = PairSettings.read(config)
         image = plan_pixels(settings, photograph, source, sha256)
         is_cut, several = config.source.patch is not None, len(image.plans) > 1
         parts = {
@@ -130,36 +143,109 @@ class Exploration:
         pair = next(make_pairs(srgb, [plan], patch.origin, image.dark_folder))
         digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
         row = pair_row(key, source, sha256, photograph.orientation, 0, plan, pair, digests, patch)
-        frames = mosaic_dn(pair.clean, row), mosaic_dn(pair.noisy, row)
         saturated = pair.clean == plan.saturated_value
-        if plan.output.layout == PACKED:
-            saturated = unpack(saturated, plan.sensor.pattern)
-        lines = tuple(_plan_lines(settings, source, sha256, image, plan, pair))
-        keys = tuple(parts)
-        return Shown(config, choices, srgb, plan, pair, *frames, saturated, row, keys, lines, image.dark_folder)
-
-
-def _plan_lines(
-    settings: PairSettings, source: Source, sha256: str, image: PlannedImage, plan: Plan, pair: Pair
-) -> list[str]:
-    """Lines of ``plan`` about the scene and the noise of a pair."""
-    assert image.config is not None
-    levels = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
-    estimate = SourceEstimate(
-        source,
-        0.0,
-        levels=(plan,),
-        predictions=(levels[plan.place.level][1],),
-    )
-    return noise_lines(image.config, [estimate], settings.dark_frames)
+        assert image.config is not None
+        levels = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
+        estimate = SourceEstimate(source, 0.0, levels=(plan,), predictions=(levels[plan.place.level][1],))
+        return Shown(
+            config=config,
+            choices=choices,
+            srgb=srgb,
+            plan=plan,
+            pair=pair,
+            clean=mosaic_dn(pair.clean, row),
+            noisy=mosaic_dn(pair.noisy, row),
+            saturated=unpack(saturated, plan.sensor.pattern) if plan.output.layout == PACKED else saturated,
+            row=row,
+            keys=tuple(parts),
+            lines=noise_lines(image.config, [estimate], settings.dark_frames),
+            dark_pixels=image.dark_folder,
+        )
 
 
 @functools.lru_cache(maxsize=4)
 def listed_sources(config: SourceConfig) -> tuple[Source, ...]:
-    """List photographs, or return them as they were listed before."""
+    """List photographs, or repeat an earlier listing."""
     return list_photographs(config).sources
 
 
 @functools.lru_cache(maxsize=1)
 def _loaded_source(config: SourceConfig, source: Source, layout: str) -> tuple[str, Photograph]:
     return load_source(config, source, layout)
+
+
+# ------------------------------------------------------------------------------------------------------------- opening
+
+Choices = dict[str, Callable[[], Exploration]]
+"""What a page offers to open, by its label."""
+
+
+def open_place(
+    place: AnyPath | None, keys: str | None, overrides: Sequence[str], flags: Sequence[str], folders: OptionFolders
+) -> Choices:
+    """List the explorations of a photograph, a folder, a dataset, or without a place of ``source.root``.
+
+    ConfigError if the place or a setting is wrong; DamageError if a manifest cannot be read.
+    """
+    start = Exploration(folders, flags=tuple(flags))
+    start.add(overrides)
+    if place is not None and is_dataset(place):
+        return _open_rows(place, keys, start)
+    if keys is not None:
+        raise ConfigError(f"--keys {keys}: {place or 'the source'} is no dataset; expected one; leave --keys out")
+    if place is not None:
+        if root := start.settings.get("source.root"):
+            raise ConfigError(f"explore: {place}: the source is also given by source.root={root}; expected one of them")
+        start.settings["source.root"] = _path_text(str(place))
+    config = start.source_config
+    sources = listed_sources(config)[:SOURCES_LISTED]
+    return {f"{source.index} {source.name}": partial(_open_source, start, config, source) for source in sources}
+
+
+def _path_text(path: str) -> str:
+    """A path in which nothing is an interpolation."""
+    return path.replace("${", "\\${")
+
+
+def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Exploration:
+    """Choose a source: a photograph of a folder by itself, others with the sources that are listed before them."""
+    root = config.root
+    is_alone = config.list is None and source.clip == NO_CLIP and not source.occurrence
+    if root is not None and is_alone and any_path(root).is_dir():
+        path = _path_text(f"{root.rstrip('/')}/{source.path}")
+        kept = {key: text for key, text in state.settings.items() if key not in ("source.limit", "source.include")}
+        return replace(state, settings=kept | {"source.root": path})
+    is_last = source.index + 1 == len(listed_sources(config))
+    limit = {} if is_last else {"source.limit": str(source.index + 1)}
+    return replace(state, settings=state.settings | limit, index=source.index)
+
+
+def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices:
+    rows = [row for row in select_rows(folder / "manifest.csv", keys) if keys or row["status"] == "ok"]
+    for row in rows:
+        if row["status"] != "ok":
+            raise ConfigError(f"--keys {keys}: {row['key']} has no pair ({row['reason']}); expected a row with a pair")
+    if not rows:
+        raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
+    return {f"{row['key']} {row['source']}": partial(_open_row, folder, row, start) for row in rows[:SOURCES_LISTED]}
+
+
+def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
+    """Write the settings of a dataset as overrides that give the pair of the row."""
+    manifest, given = folder / "manifest.csv", dict(start.settings)
+    recorded, kind = read_dataset_yaml(folder / "config.yaml")
+    settings = overrides_of(recorded)
+    settings.pop("source.limit", None)
+    root = source_root(manifest, given.pop("source.root", None))
+    if kind == "folder" and root is None:
+        raise ConfigError(f"explore: {folder} does not record the folder of its sources; give source.root=ROOT")
+    places = source_changes(root, folder) | {"noise.dark_frames": dark_frames_root(manifest)}
+    for key, place in places.items():
+        if place:
+            settings[key] = _path_text(place) if isinstance(place, str) else override_text(place)
+    state = replace(start, settings=settings | given, part=str(row["key"]).removeprefix(image_key(row)))
+    config = state.source_config
+    source = next((source for source in listed_sources(config) if source.name == row["source"]), None)
+    if source is None:
+        raise ConfigError(f"explore: {row['source']}: is not among the sources of {folder}; restore the photograph")
+    return _open_source(state, config, source)

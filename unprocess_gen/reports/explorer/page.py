@@ -16,21 +16,13 @@ from bokeh.models import Button, ColumnDataSource, CustomJS, Div, HoverTool, Ran
 from bokeh.plotting import figure
 
 from unprocess_gen.core.errors import UnprocessGenError
-from unprocess_gen.reports.dataset_page.statistics import MEANINGS, SITE_COLUMNS
 from unprocess_gen.reports.explorer import views
 from unprocess_gen.reports.explorer.controls import NONE, SECTIONS, SETTINGS, shown_value, widget
-from unprocess_gen.reports.explorer.exploration import Shown
-from unprocess_gen.reports.explorer.opening import Choices
+from unprocess_gen.reports.explorer.exploration import Choices, Shown
 from unprocess_gen.reports.html_pages import page_template, render_macro, render_page
+from unprocess_gen.reports.manifest_statistics import MEANINGS, SITE_COLUMNS
+from unprocess_gen.reports.photon_transfer import NoiseFit
 
-LINE_COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0072b2", "noisy": "#d55e00"}
-PLOTS = {
-    "source_histogram": ("Histogram of the source", "code", "share of the pixels"),
-    "raw_histogram": ("Histogram of the raw frames", "DN", "share of the sites"),
-    "highlight": ("Highlight function (Figure 4)", "intensity i of grey light", "f(i)"),
-    "transfer": ("Photon transfer", "signal above black, DN", "variance of the noise, DN²"),
-}
-"""Titles and axes."""
 TIPS = [
     ("site", "column $x{%d}, row $y{%d}"),
     ("source", "@r, @g, @b"),
@@ -42,6 +34,8 @@ TIPS = [
 MOVES = "pan,wheel_zoom,zoom_in,zoom_out,pan_left,pan_right,pan_up,pan_down,reset"
 SMALLEST_PX = 8
 """Fewest sites of a side of the window."""
+POINTS_DRAWN = 1000
+"""Most points of the photon transfer."""
 STRETCHES = ("common stretch", "own stretch")
 WAIT_MS = 20
 """Time in which changes are collected before the pair is computed."""
@@ -59,9 +53,9 @@ class Page:
         self._x, self._y = (Range1d(*ends, min_interval=SMALLEST_PX) for ends in ((0, 1), (1, 0)))
         self._message, self._facts, self._plan = map(_text_box, ("message", "facts", "plan"))
         self._pictures = [self._picture(name) for name in views.PICTURES]
-        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in PLOTS}
-        self._curves = {name: self._curve(name) for name in PLOTS}
-        self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=LINE_COLOURS["clean"])
+        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in views.PLOTS}
+        self._curves = {name: self._curve(name) for name in views.PLOTS}
+        self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=views.COLOURS["clean"])
         self._command = TextInput(name="command", title="Command of this pair")
         self._stretch = Select(name="stretch", title="raw and developed", options=list(STRETCHES), value=STRETCHES[0])
         self._open = Select(name="open", title="photograph or row", options=list(choices), value=label)
@@ -87,7 +81,7 @@ class Page:
         return drawn
 
     def _curve(self, name: str) -> Any:
-        title, x, y = PLOTS[name]
+        title, x, y = views.PLOTS[name]
         size = {"width": 420, "height": 260, "sizing_mode": "stretch_width", "tools": "pan,wheel_zoom,box_zoom,reset"}
         scale = {"y_axis_type": "log", "y_range": (1e-6, 1)} if name == "raw_histogram" else {}
         drawn = figure(name=name, title=title, x_axis_label=x, y_axis_label=y, **size, **scale)
@@ -101,7 +95,7 @@ class Page:
         """Fill the document, and show the first pair."""
         document = self._document
         document.title, document.template = "unprocess_gen explorer", page_template("explorer.html")
-        document.template_variables.update(sections=SECTIONS, pictures=views.PICTURES, curves=PLOTS)
+        document.template_variables.update(sections=SECTIONS, pictures=views.PICTURES, curves=views.PLOTS)
         for name, control in self._widgets.items():
             control.name = name
             control.on_change("value", partial(self._changed, name))
@@ -167,18 +161,14 @@ class Page:
         self._pixels.data = {name: [value] for name, value in columns.items()}
 
     def _draw_statistics(self, shown: Shown) -> None:
-        points, line, fit = views.photon_transfer(shown)
-        curves = {
-            "source_histogram": views.source_histogram(shown),
-            "raw_histogram": views.raw_histogram(shown),
-            "highlight": views.highlight_curves(shown),
-            "transfer": {"expected": line},
-        }
-        for name, lines in curves.items():
-            colours = [LINE_COLOURS.get(label.partition(",")[0], LINE_COLOURS["noisy"]) for label in lines]
-            xs, ys = ([list(line[axis]) for line in lines.values()] for axis in (0, 1))
-            self._lines[name].data = {"xs": xs, "ys": ys, "label": list(lines), "colour": colours}
-        self._points.data = dict(zip("xy", points, strict=True))
+        fit = views.noise_fit(shown)
+        for name, lines in views.curves(shown, fit).items():
+            labels, colours, xs, ys = zip(*lines, strict=True) if lines else [()] * 4
+            data = {"xs": [list(x) for x in xs], "ys": [list(y) for y in ys], "label": list(labels)}
+            self._lines[name].data = data | {"colour": list(colours)}
+        points: Any = ([], []) if fit is None else (fit.signal_dn, fit.variance_dn2)
+        step = len(points[0]) // POINTS_DRAWN + 1
+        self._points.data = {"x": points[0][::step], "y": points[1][::step]}
         self._facts.text = render_macro("facts", _pair_facts(shown, fit))
         self._plan.text = render_macro("lines", "\n".join(shown.lines))
 
@@ -241,14 +231,14 @@ def _text_box(name: str) -> Div:
     return Div(name=name, sizing_mode="stretch_width", stylesheets=[render_page("explorer_texts.css")])
 
 
-def _pair_facts(shown: Shown, fit: str) -> dict[str, str]:
+def _pair_facts(shown: Shown, fit: NoiseFit | None) -> dict[str, str]:
     """Numbers of the pair, by what the page calls them."""
     row, sites, camera = shown.row, shown.clean.size, shown.plan.camera
     return {
         "frame": f"{row['width']} × {row['height']} sites, {row['pattern']}",
         **{MEANINGS[column].removesuffix(", sites"): f"{int(row[column] or 0) / sites:.3%}" for column in SITE_COLUMNS},
         "gains": f"red {camera.red_gain:.4g}, blue {camera.blue_gain:.4g}, inverse rgb {camera.inverse_rgb_gain:.4g}",
-        "noise of the pair": fit,
+        "noise of the pair": "too few sites or levels for a fit" if fit is None else str(fit),
         "effects": ", ".join(shown.plan.noise.effects),
         "XXH3": f"clean {row['clean_xxh3']}, noisy {row['noisy_xxh3']}",
     }

@@ -9,7 +9,7 @@ import webbrowser
 from collections.abc import Callable
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.reports.explorer.opening import Choices
+from unprocess_gen.reports.explorer.exploration import Choices
 
 HOST = "127.0.0.1"
 

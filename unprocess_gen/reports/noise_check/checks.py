@@ -14,11 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.arrays import Frame
-from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import Sample
-from unprocess_gen.dataset.row import Row
-from unprocess_gen.reports.noise_check.repeat import measure_noise
+from unprocess_gen.reports.noise_check.repeat import Noise, measure_noise
 from unprocess_gen.reports.noise_check.scores import Residual, Scores, scores_of
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.plan import Plan
@@ -97,8 +94,8 @@ def failed_checks(key: str, scores: Scores, limit: float) -> list[Alarm]:
 class Pool:
     """Sums of the scores of pairs.
 
-    Variances add, but within groups the standard deviations do: pairs with the same curve and gains have the same
-    rounding errors of clean frames, and overlapping patches the same noise.
+    Variances add, but standard deviations do within groups: pairs with the same curve and gains have the same rounding
+    errors of clean frames, and overlapping patches the same noise.
     """
 
     def __init__(self) -> None:
@@ -121,37 +118,30 @@ class Pool:
 
 
 class Checker:
-    """Check the pairs of a dataset, one after the other.
+    """Check the noise of a number of pairs, one after the other.
 
-    Attributes
-    ----------
-    count, unchecked, wrong_pairs : int
-        Pairs that were checked, those that cannot be, and those with wrong noise.
-    pair_alarms : list of Alarm
-        First alarms of the first pairs with wrong noise.
+    ``count``, ``unchecked`` and ``wrong_pairs`` count pairs that were checked, that cannot be, and with wrong noise;
+    ``pair_alarms`` has the first alarm of the first wrong pairs.
     """
 
     def __init__(self, pairs: int) -> None:
         self._limit = alarm_limit(TESTS * (pairs + 1))
         self._pool, self.pair_alarms = Pool(), list[Alarm]()
-        self._before: tuple[list[Any], Residual] | None = None
+        self._before: tuple[tuple[object, ...], Residual] | None = None
         self.count = self.unchecked = self.wrong_pairs = 0
 
-    def add(self, clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> None:
+    def add(self, noise: Noise | None) -> None:
         """Check the next pair; one with few usable sites, or whose dark frame is not available, counts as unchecked."""
-        plan = plan_from_row(row)
-        is_available = plan.dark is None or dark_pixels is not None
-        noise = measure_noise(clean, noisy, row, dark_pixels) if is_available else None
         if noise is None or np.count_nonzero(noise.weight) < LEAST_SITES:
             self.unchecked += 1
             return
         self.count += 1
-        frame = [row[name] for name in ("stream_key", "frame", "level", "draw")]
-        is_other = self._before is not None and self._before[0] != frame  # patches of a frame share its noise
-        scores, residual = scores_of(noise, self._before[1] if self._before is not None and is_other else None)
+        frame = noise.plan.stream_key, noise.plan.place
+        before = self._before if self._before is not None and self._before[0] != frame else None
+        scores, residual = scores_of(noise, before and before[1])  # patches of a frame share its noise
         self._before = frame, residual
-        self._pool.add(scores, plan)
-        failed = failed_checks(str(row["key"]), scores, self._limit)
+        self._pool.add(scores, noise.plan)
+        failed = failed_checks(noise.key, scores, self._limit)
         self.wrong_pairs += bool(failed)
         self.pair_alarms += failed[:1] if self.wrong_pairs <= PAIRS_LISTED else []
 
@@ -166,5 +156,5 @@ def check_pairs(pairs: Iterable[Sample], count: int, dark_pixels: DarkPixels | N
     """Check the noise of a number of pairs."""
     checker = Checker(count)
     for pair in pairs:
-        checker.add(*pair, dark_pixels)
+        checker.add(measure_noise(*pair, dark_pixels))
     return checker

@@ -1,8 +1,8 @@
 """Simulate the noise of a pair again from its clean frame: the same sensor, with other random numbers.
 
 The repetition is what the row says the noisy frame could be. Fixed patterns of the camera body, defects, dark frames
-and column offsets are those of the row, so both noisy frames have them. The reference simulates it, not the kernels
-that make datasets.
+and column offsets are those of the row, so both noisy frames have them. The reference simulates it, although kernels
+take a tenth of the time: a fault of the kernels, which make datasets, would be in both frames, and not be found.
 """
 
 from __future__ import annotations
@@ -37,24 +37,14 @@ Single = NDArray[np.float32]
 
 
 class Noise(NamedTuple):
-    """Noise of a pair, and of its repetition.
+    """Noise of the pair with a key, and of its repetition; frames are in DN, without an odd last row or column.
 
-    Attributes
-    ----------
-    plan : Plan
-        Plan of the pair.
-    clean_dn, noisy_dn : ndarray of float64, [H, W] and [2, H, W]
-        Clean frame, noisy frame and its repetition, DN; an odd last row or column is left out.
-    weight : ndarray of float32, [H, W]
-        1 / std, the standard deviation of shot and read noise in DN; 0 at sites that are not used.
-    z : ndarray of float32, [2, H, W]
-        Noise over std, without the median of each plane, limited to ±`LARGEST_Z`.
-    is_far : ndarray of bool, [2, H, W]
-        Sites beyond `FAR_Z`.
-    is_hot : ndarray of bool, [H, W]
-        Hot pixels of the camera body whose mean is far beyond that.
+    ``noisy_dn``, ``z`` and ``is_far`` [2, H, W] have the noisy frame, then its repetition. ``weight`` is 1 / std of
+    shot and read noise, 0 at sites that are not used. ``z`` is noise over std without the median of each plane,
+    limited to ±`LARGEST_Z`; ``is_far`` marks sites beyond `FAR_Z`, ``is_hot`` hot pixels whose mean is far beyond.
     """
 
+    key: str
     plan: Plan
     clean_dn: Float
     noisy_dn: Float
@@ -69,11 +59,13 @@ class Noise(NamedTuple):
         return 0.0 if self.plan.output.clean_normalised else 1 / 12
 
 
-def measure_noise(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> Noise:
-    """Measure the noise of a pair with its manifest row, and of its repetition."""
+def measure_noise(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> Noise | None:
+    """Measure the noise of a pair and of its repetition; None if its dark frame is not available."""
     plan, patch = plan_from_row(row), patch_from_row(row)
-    even = tuple(slice(length // 2 * 2) for length in mosaic_dn(clean, row).shape)
-    clean_dn, own_dn = (mosaic_dn(frame, row)[even].astype(np.float64) for frame in (clean, noisy))
+    if plan.dark is not None and dark_pixels is None:
+        return None
+    frames = (mosaic_dn(frame, row).astype(np.float64) for frame in (clean, noisy))
+    clean_dn, own_dn = (dn[: len(dn) // 2 * 2, : dn.shape[1] // 2 * 2] for dn in frames)
     noisy_dn = np.stack([own_dn, _repetition(clean_dn, plan, patch, dark_pixels)])
     std = _usable_std(clean_dn, plan)
     weight = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
@@ -82,9 +74,16 @@ def measure_noise(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels 
         of_repetition = noise_dn[1, y::2, x::2][std[y::2, x::2] > 0]
         noise_dn[:, y::2, x::2] -= np.median(of_repetition) if of_repetition.size else 0.0
     z = (noise_dn * weight).astype(np.float32)
-    limited = np.clip(z, -LARGEST_Z, LARGEST_Z)
-    is_hot = _hot_sites(plan, patch, weight)
-    return Noise(plan, clean_dn, noisy_dn, weight.astype(np.float32), limited, np.abs(z) > FAR_Z, is_hot)
+    return Noise(
+        key=str(row["key"]),
+        plan=plan,
+        clean_dn=clean_dn,
+        noisy_dn=noisy_dn,
+        weight=weight.astype(np.float32),
+        z=np.clip(z, -LARGEST_Z, LARGEST_Z),
+        is_far=np.abs(z) > FAR_Z,
+        is_hot=_hot_sites(plan, patch, weight),
+    )
 
 
 def _hot_sites(plan: Plan, patch: Patch, weight: Float) -> NDArray[np.bool_]:

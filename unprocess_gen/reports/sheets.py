@@ -5,14 +5,13 @@ available or differs from the row's. Each panel shows the complete frame, averag
 Raw frames are drawn from the black to the white level of the scene, square root. A sheet of stages shows the
 photograph after each step of unprocessing (Figure 1 of the article), computed with the reference functions.
 
-Each PNG file contains the digest of the manifest that it shows. A folder with sheets of another dataset is refused,
+Each PNG file names the digest of the manifest that it shows. A folder with sheets of another dataset is refused,
 because their names are keys: sheets of two datasets would replace each other or be mixed.
 """
 
 from __future__ import annotations
 
 import functools
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -33,13 +32,12 @@ from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.replay import ADVICE, recorded_source, source_of, source_root
-from unprocess_gen.reports.encoding import picture_png
+from unprocess_gen.reports import panels
+from unprocess_gen.reports.panels import MosaicArray, Picture, SheetPanel, Window
+from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.reports.report_files import write_files
-from unprocess_gen.reports.sheets import panels
-from unprocess_gen.reports.sheets.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
-from unprocess_gen.simulation.reference.isp import develop, process, to_light
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
 from unprocess_gen.sources.photograph import Photograph
@@ -48,9 +46,8 @@ PAIRS_SHOWN = 8
 """Number of pairs shown if no keys are given."""
 RMS_SHOWN = 4.0
 """Differences that are drawn black and white, in units of their RMS."""
-
-PNG_HEADER_BYTES = 33
-"""Bytes of the signature and the first chunk of a PNG file, behind which text may follow (PNG specification, 5.6)."""
+MARK = "unprocess_gen"
+"""Keyword of the text in a sheet that names its dataset."""
 
 Load = Callable[[SourceConfig, Source], tuple[str, Photograph]]
 
@@ -120,9 +117,9 @@ def write_sheets(
     `selected_pairs`.
     """
     check_output_folder(to, f"--to {to}")
-    mark = _dataset_mark(folder)
+    mark = f"manifest_sha256={file_sha256(folder / 'manifest.csv')}"
     for path in sorted(to.glob("[0-9]" * 8 + "*.png")):
-        if mark not in path.read_bytes():
+        if f"tEXt{MARK}\0{mark}".encode() not in path.read_bytes():
             raise ConfigError(
                 f"--to {to}: {path.name} is not a sheet of {folder}; expected a folder without sheets of other "
                 "datasets; choose another folder, or remove them"
@@ -133,16 +130,8 @@ def write_sheets(
         drawn = {f"{key}.png": panels.lay_out(heading, _pair_panels(pair, window, panels.PANEL_PX), 3)}
         if with_stages and pair.source is not None:
             drawn[f"{key}.stages.png"] = panels.lay_out(heading, _stage_panels(pair, pair.source, window), 4)
-        pictures = {name: picture_png(sheet) for name, sheet in drawn.items()}
-        contents = {name: png[:PNG_HEADER_BYTES] + mark + png[PNG_HEADER_BYTES:] for name, png in pictures.items()}
-        write_files(to, contents)
-        yield SheetFiles(key, str(pair.row["source"]), tuple(to / name for name in contents), pair.missing_source)
-
-
-def _dataset_mark(folder: AnyPath) -> bytes:
-    """Text chunk of a PNG file (PNG specification, 11.3.3.2) that identifies a dataset."""
-    body = f"tEXtunprocess_gen\0manifest_sha256={file_sha256(folder / 'manifest.csv')}".encode("ascii")
-    return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
+        write_files(to, {name: picture_png(sheet, **{MARK: mark}) for name, sheet in drawn.items()})
+        yield SheetFiles(key, str(pair.row["source"]), tuple(to / name for name in drawn), pair.missing_source)
 
 
 def contact_sheet(folder: AnyPath, keys: str = "", source: AnyPath | None = None) -> Picture:
@@ -170,12 +159,16 @@ def _heading(pair: SheetPair, window: Window) -> list[str]:
 
 def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> list[SheetPanel]:
     """Panels of the source, of both frames raw and developed, and of their difference."""
-    drawn = [SheetPanel("source", f"not available: {pair.missing_source}", None)]
+    plan, drawn = pair.plan, [SheetPanel("source", f"not available: {pair.missing_source}", None)]
     if pair.source is not None:
         drawn = [SheetPanel("source", f"{8 * pair.source.itemsize} bits", *_views(pair.source, window, panel_px))]
+    white_dn = plan.sensor.black_level_dn + plan.sensor.span_dn * plan.scene.exposure
+    levels = f"{plan.sensor.black_level_dn} to {white_dn:.5g} DN, square root"
     averages = [panels.average_planes(raw, panel_px) for raw in (pair.clean, pair.noisy)]
     for name, raw, planes in zip(("clean", "noisy"), (pair.clean, pair.noisy), averages, strict=True):
-        drawn += _frame_panels(name, raw, planes, pair.plan, window)
+        light = (panels.common_stretch(dn, plan) for dn in (planes.mean(axis=-1), raw[window]))
+        developed = panels.develop_planes(planes, plan), panels.develop_detail(raw, plan, window)
+        drawn += [SheetPanel(f"{name} raw", levels, *light), SheetPanel(f"{name}, developed", "", *developed)]
     detail = pair.noisy[window].astype(np.float64) - pair.clean[window]
     differences = (averages[1] - averages[0]).mean(axis=-1), detail
     limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(dn * dn))), 1.0) for dn in differences]
@@ -190,60 +183,18 @@ def _views(source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Flo
     return panels.fit_image(source, panel_px) / white, source[window] / white
 
 
-def _frame_panels(name: str, raw: MosaicArray, planes: Float, plan: Plan, window: Window) -> list[SheetPanel]:
-    """A frame from black to white, and developed; ``planes`` are its averages."""
-    light = (common_stretch(dn, plan) for dn in (planes.mean(axis=-1), raw[window]))
-    rgb = process(to_light(panels.planes_to_rgb(planes, plan.sensor.pattern), plan), plan)
-    white_dn = plan.sensor.black_level_dn + plan.sensor.span_dn * plan.scene.exposure
-    return [
-        SheetPanel(f"{name} raw", f"{plan.sensor.black_level_dn} to {white_dn:.5g} DN, square root", *light),
-        SheetPanel(f"{name}, developed", "", rgb, develop_detail(raw, plan, window)),
-    ]
-
-
-def stretch(dn: MosaicArray, least: float = 1.0) -> tuple[Float, str]:
-    """Stretch a frame to [0, 1] between its percentiles 0.1 and 99.9, which are also given in words.
-
-    A few defective sites do not hide the picture. A range of less than ``least`` is not stretched to [0, 1].
-    """
-    low, high = np.percentile(dn, (0.1, 99.9))
-    return np.clip((dn - low) / max(high - low, least), 0, 1), f"{low:.5g} to {high:.5g} DN"
-
-
-def common_stretch(dn: MosaicArray, plan: Plan) -> Float:
-    """Stretch a frame from black to white of the darkened scene, square root, the same for every frame of a scene."""
-    return np.sqrt(np.clip(to_light(dn, plan), 0, 1))
-
-
-DEMOSAIC_REACH_PX = 2
-"""Distance from which sites influence a demosaicked pixel (`isp.KERNELS`)."""
-
-
-def develop_detail(raw: MosaicArray, plan: Plan, window: Window) -> Float | None:
-    """Develop the detail with a border as wide as the demosaicking filter, as if the complete frame were developed.
-
-    A frame of one row or column lacks a colour: it is not developed.
-    """
-    if min(raw.shape) == 1:
-        return None
-    y, x = (max(0, part.start - DEMOSAIC_REACH_PX) for part in window)  # even, as the reach is
-    rows, columns = window
-    bordered = develop(raw[y : rows.stop + DEMOSAIC_REACH_PX, x : columns.stop + DEMOSAIC_REACH_PX], plan)
-    return bordered[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
-
-
 # -------------------------------------------------------------------------------------------------------------- stages
 
 
 def _stage_panels(pair: SheetPair, source: Srgb, window: Window) -> list[SheetPanel]:
     """Panels of the source after each step, black 0 and white 1, and of the frames in the colours of their filters."""
     plan, pattern, views = pair.plan, pair.plan.sensor.pattern, _views(source, window, panels.PANEL_PX)
+    steps = zip(*(processing_steps(view, plan) for view in views), strict=True)
     drawn = [SheetPanel("source", "", *views)]
-    for (title, note, overview), (_, _, detail) in zip(*(processing_steps(view, plan) for view in views), strict=True):
-        drawn.append(SheetPanel(title, note, overview, detail))
+    drawn += [SheetPanel(title, note, overview, detail) for (title, note, overview), (*_, detail) in steps]
     for name, raw in (("clean", pair.clean), ("noisy", pair.noisy)):
         averaged = panels.planes_to_rgb(panels.average_planes(raw, panels.PANEL_PX), pattern)
-        light, sites = (common_stretch(dn, plan) for dn in (averaged, raw[window]))
+        light, sites = (panels.common_stretch(dn, plan) for dn in (averaged, raw[window]))
         drawn.append(SheetPanel(f"{name} raw", f"{pattern}, square root", light, panels.colour_sites(sites, pattern)))
     return drawn
 

@@ -28,7 +28,7 @@ NUMBER_COLUMNS = tuple(
 )
 TEXT_COLUMNS = (
     *("camera", "sensor_unit", "scene", "noise", "noise_law", "tone", "gamma", "highlight", "pattern", "accuracy"),
-    "split",
+    *("split",),
 )
 
 
@@ -55,7 +55,7 @@ def add_value(counts: Counter[str], value: str) -> None:
 
 
 def values_text(counts: Counter[str]) -> str:
-    """Return the values, most frequent first, with their counts; a single value without one."""
+    """The values, most frequent first, with their counts; a single value without one."""
     if len(counts) > VALUES_LISTED:
         return f"more than {VALUES_LISTED} different values"
     return next(iter(counts)) if len(counts) == 1 else ", ".join(f"{name} ({n:,})" for name, n in counts.most_common())

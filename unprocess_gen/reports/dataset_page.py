@@ -1,7 +1,6 @@
 """Write the HTML page of a dataset: settings, contents, failures, parameters, noise check, how to load it.
 
-The page is one self-contained file. It is not part of the dataset: nothing reads it. It describes ``dataset.json``,
-``config.yaml`` and ``manifest.csv``, whose SHA-256 are checked first; ``gen-dataset verify`` checks every byte. Of the
+The page describes ``dataset.json``, ``config.yaml`` and ``manifest.csv``, whose SHA-256 are checked first. Of the
 arrays, only a few evenly spaced pairs are read: `PAIRS_CHECKED` for the noise, and the pairs of the contact sheet.
 """
 
@@ -24,14 +23,15 @@ from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.workspace import read_dataset
-from unprocess_gen.reports.dataset_page.statistics import MEANINGS, SITE_COLUMNS, read_statistics, values_text
-from unprocess_gen.reports.encoding import picture_jpeg
 from unprocess_gen.reports.formatting import byte_size, short_number
 from unprocess_gen.reports.html_pages import data_uri, render_page
-from unprocess_gen.reports.noise_check.checks import check_pairs
-from unprocess_gen.reports.photon_transfer import NoiseFit, draw_fits, fit_pair
+from unprocess_gen.reports.manifest_statistics import MEANINGS, SITE_COLUMNS, read_statistics, values_text
+from unprocess_gen.reports.noise_check.checks import Checker
+from unprocess_gen.reports.noise_check.repeat import measure_noise
+from unprocess_gen.reports.photon_transfer import NoiseFit, draw_fits, fit_noise
+from unprocess_gen.reports.pictures import picture_jpeg
 from unprocess_gen.reports.report_files import page_file, write_files
-from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
+from unprocess_gen.reports.sheets import contact_sheet
 from unprocess_gen.sources.dark_frames import dark_folder
 from unprocess_gen.sources.names import encode_name
 
@@ -58,13 +58,15 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: st
     """Render the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
     from jinja2 import TemplateError  # optional library, extra "figures"
 
-    facts = checked_facts(folder)
+    facts, name = checked_facts(folder), folder_name(folder)
     statistics = read_statistics(with_bar(read_rows(folder / "manifest.csv"), "row"))
-    first, name = statistics.first_pair, folder_name(folder)
+    first = statistics.first_pair
     try:
         return render_page(
             "dataset.html",
             title=f"Dataset {encode_name(name)}",
+            name=name,
+            quoted=shlex.quote(name),
             facts=facts,
             size=byte_size(sum(entry["bytes"] for entry in facts["shards"])),
             config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
@@ -74,8 +76,6 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: st
             meanings=MEANINGS,
             site_columns=SITE_COLUMNS,
             shards=[(shard_name(number), entry) for number, entry in enumerate(facts["shards"][:SHARDS_LISTED])],
-            name=name,
-            quoted=shlex.quote(name),
             **({} if first is None else _pair_values(folder, source, dark_frames, first)),
         )
     except (TypeError, ValueError, ZeroDivisionError, TemplateError) as error:  # what a row of facts should have
@@ -87,9 +87,9 @@ def checked_facts(folder: AnyPath) -> dict[str, Any]:
     if not (folder / "dataset.json").exists():
         raise DamageError(f"{folder}: dataset.json does not exist; expected a finished dataset")
     facts = read_dataset(folder / "dataset.json")
-    for name, key in (("manifest.csv", "manifest_sha256"), ("config.yaml", "config_sha256")):
+    for name, digest in (("manifest.csv", facts["manifest_sha256"]), ("config.yaml", facts["config_sha256"])):
         path = folder / name
-        if not path.is_file() or file_sha256(path) != facts[key]:
+        if not path.is_file() or file_sha256(path) != digest:
             raise DamageError(
                 f"{path}: differs from the SHA-256 in dataset.json; run gen-dataset verify {folder} for details"
             )
@@ -101,26 +101,25 @@ def checked_facts(folder: AnyPath) -> dict[str, Any]:
 
 
 def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | None, first: Row) -> dict[str, Any]:
-    """Values of the sections about pairs.
-
-    The noise of a few evenly spaced pairs is checked and fitted, unless their dark frames are not available.
-    """
-    every, missing, checks, fits = RawPairs(folder), "", None, list[NoiseFit]()
-    pairs = [every[number] for number in evenly_spaced(range(len(every)), PAIRS_CHECKED)]
+    """Values of the sections about pairs; noise is examined unless the dark frames are not available."""
+    pairs = RawPairs(folder)
+    numbers, fits, missing = evenly_spaced(range(len(pairs)), PAIRS_CHECKED), list[NoiseFit](), ""
+    checks = Checker(len(numbers))
     try:
         if first["dark_frame"] and dark_frames is None:
             raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
         access = dark_folder(dark_frames) if dark_frames and first["dark_frame"] else None
-        fits = [fit for pair in pairs if (fit := fit_pair(*pair, access)) is not None]
-        checks = check_pairs(pairs, len(pairs), access)
+        for noise in (measure_noise(*pairs[number], access) for number in numbers):
+            checks.add(noise)
+            fits += filter(None, [fit_noise(noise)])
     except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
-        missing = str(error)
+        missing, fits = str(error), []
     return {
         "contact_sheet": data_uri(picture_jpeg(contact_sheet(folder, source=source), JPEG_QUALITY), "jpeg"),
         "checks": checks,
         "fits": fits,
         "missing": missing,
-        "count": len(pairs),
+        "count": len(numbers),
         "figure": data_uri(draw_fits(fits)) if fits else "",
         "first_shard": f"{folder_name(folder)}/shards/{shard_name(int(first['shard'] or 0))}",
         "first_key": sample_key(first),

@@ -1,1 +1,0 @@
-"""Write the page that describes a dataset."""
