@@ -41,9 +41,9 @@ from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.patches import list_patches
-from unprocess_gen.sources.photograph import Photograph
 
 ARRAY_NAME = "array"
 """The column ``source`` of a pair made from an array."""

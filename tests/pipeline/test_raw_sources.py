@@ -19,7 +19,7 @@ from unprocess_gen.pipeline.replay import PairRegenerator
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.sources.photograph import Photograph
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.raw.frames import read_raw_source
 
 SENSORS = [("BGGR", 12, 241), ("GBRG", 16, 4097)]

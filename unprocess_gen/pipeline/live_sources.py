@@ -34,8 +34,8 @@ from unprocess_gen.pipeline.replay import PairRegenerator, dark_frames_root, sou
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.photograph import Photograph
 from unprocess_gen.sources.pixel_cache import PixelCache
 
 KEPT = 4096

@@ -20,8 +20,8 @@ from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.patches import crop_patch, list_patches
-from unprocess_gen.sources.photograph import Photograph
 
 
 @dataclass(frozen=True, slots=True)

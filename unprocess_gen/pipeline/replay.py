@@ -42,9 +42,9 @@ from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan, SourcePlan
 from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
-from unprocess_gen.sources.photograph import Photograph
 from unprocess_gen.sources.reading import source_file
 
 NO_LIMIT = 2**40

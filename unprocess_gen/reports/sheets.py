@@ -38,9 +38,9 @@ from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
-from unprocess_gen.sources.photograph import Photograph
 
 PAIRS_SHOWN = 8
 """Number of pairs shown if no keys are given."""

@@ -13,8 +13,7 @@ from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb
 from unprocess_gen.core.errors import FilteredError, MachineError, SourceError
 from unprocess_gen.core.source import Source
 from unprocess_gen.sources import synthetic
-from unprocess_gen.sources.image.decode import decode
-from unprocess_gen.sources.photograph import Photograph
+from unprocess_gen.sources.image.decode import Photograph, decode
 from unprocess_gen.sources.raw.frames import read_raw_source
 from unprocess_gen.sources.reading import ReadFile, read_bytes
 

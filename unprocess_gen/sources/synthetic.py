@@ -115,11 +115,6 @@ def _encode(light: Float, draws: _Draws) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.floor(codes).astype(np.uint8).transpose(1, 2, 0))
 
 
-def _grid(height: int, width: int) -> tuple[Float, Float]:
-    """Pixel coordinates ``[H, 1]`` and ``[1, W]``, which broadcast."""
-    return np.arange(height, dtype=np.float64)[:, None], np.arange(width, dtype=np.float64)[None, :]
-
-
 def _colour(*light: float) -> Float:
     """Linear R, G, B as ``[3, 1, 1]``."""
     return np.array(light)[:, None, None]
@@ -213,7 +208,7 @@ BAR_PERIODS = (24, 18, 14, 10, 8, 6, 5, 4, 3, 2)
 
 
 def _colour_chart(draws: _Draws, height: int, width: int) -> Float:
-    y, x = _grid(height, width)
+    y, x = np.ogrid[0.0:height, 0.0:width]
     canvas = 0.2 + 0.02 * _noise(draws, height, width, (2, 2)) + np.zeros((3, 1, 1))
     margin = width // 16
     canvas[:, margin // 2 : height - margin // 2, margin : width - margin] = 0.012
@@ -269,7 +264,7 @@ PLACES = ((0.60, 0.22, 0.085), (0.57, 0.43, 0.075), (0.61, 0.66, 0.085), (0.78, 
 
 def _highlights(draws: _Draws, height: int, width: int) -> Float:
     """Draw a sky from blue to white with clipped clouds and the sun, and glossy balls on a dark wooden table."""
-    y, x = _grid(height, width)
+    y, x = np.ogrid[0.0:height, 0.0:width]
     horizon = height * 7 // 16
     t = _unit(y / horizon)
     canvas = _colour(0.10, 0.26, 0.68) + _colour(0.62, 0.58, 0.27) * t * (0.4 + 0.6 * t) + np.zeros((height, width))

@@ -17,7 +17,7 @@ from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.simulation.facts import RawParts
 from unprocess_gen.simulation.reference.cfa import plane_sites
-from unprocess_gen.sources.photograph import Photograph
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.raw.frames import read_raw_source
 
 BLACK = {"R": 500, "G": 509, "B": 523}

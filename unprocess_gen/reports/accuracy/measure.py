@@ -47,9 +47,9 @@ from unprocess_gen.simulation.kernels.render import render_clean
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan
 from unprocess_gen.simulation.reference.sensor import in_dn
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.listing import list_photographs
 from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.photograph import Photograph
 
 LOGGER = logging.getLogger("unprocess_gen")
 

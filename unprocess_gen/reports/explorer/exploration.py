@@ -40,10 +40,10 @@ from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import unpack
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.listing import list_photographs
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
-from unprocess_gen.sources.photograph import Photograph
 
 PAIR_FOLDER = "pair"
 """Folder of the dataset that the command of a page makes."""

@@ -26,6 +26,7 @@ import io
 import logging
 import re
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import cast
 
@@ -34,9 +35,9 @@ import numpy as np
 
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import SourceError
+from unprocess_gen.simulation.facts import RawParts
 from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
-from unprocess_gen.sources.photograph import Photograph
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -73,17 +74,18 @@ _LOG_PREFIX = re.compile(r"\[ *[A-Z]+:\d+@[\d.]+\] global \S+ \S+ ")
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _COLOUR_16 = _COLOUR | cv2.IMREAD_ANYDEPTH
 
-# orientation -> (swap rows and columns first, row step, column step), after the EXIF standard's table of tag 274
-_TURNS = {
-    1: (False, 1, 1),
-    2: (False, 1, -1),
-    3: (False, -1, -1),
-    4: (False, -1, 1),
-    5: (True, 1, 1),
-    6: (True, 1, -1),
-    7: (True, -1, -1),
-    8: (True, -1, 1),
-}
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """Decoded pixels ``srgb``, uint8 or uint16 [H, W, 3], R, G, B, after applying the EXIF ``orientation``.
+
+    Of a raw source, they are codes of its camera RGB, and ``raw`` is what the file states. ``note`` is a warning.
+    """
+
+    srgb: Srgb
+    orientation: int
+    raw: RawParts | None = None
+    note: str = ""
 
 
 def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Photograph:
@@ -137,28 +139,26 @@ def _refuse_cicp(cicp: bytes, icc: str) -> None:
 
 @lru_cache(maxsize=32)
 def _profile_objection(icc: bytes) -> str:
-    """Reason why an embedded profile is not sRGB, or an empty text: judged by its effect, since names prove little."""
-    from PIL import ImageCms
+    """Reason why an embedded profile is not sRGB, or an empty text: judged by its effect, since names prove little.
 
-    try:
-        moved = _codes_moved(icc)
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError, KeyError) as error:
-        return f"the embedded colour profile cannot be used ({type(error).__name__})"
-    return f"the embedded colour profile moves colours by up to {moved} codes" if moved > SRGB_TOLERANCE else ""
-
-
-def _codes_moved(icc: bytes) -> int:
-    """Largest difference from sRGB, in 8-bit codes, over a grid of colours or over all grays."""
+    The effect is the largest difference from sRGB, in 8-bit codes, over a grid of colours or over all grays.
+    """
     from PIL import Image, ImageCms
 
-    profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
-    mode = {"RGB ": "RGB", "GRAY": "L"}[profile.profile.xcolor_space]
-    grid = np.stack(np.meshgrid(*[np.arange(0, 256, 51, dtype=np.uint8)] * 3), -1).reshape(1, -1, 3)
-    colours = Image.fromarray(grid if mode == "RGB" else np.arange(256, dtype=np.uint8)[None])
-    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-    transform = ImageCms.buildTransform(profile, ImageCms.createProfile("sRGB"), mode, "RGB", renderingIntent=intent)
-    converted = np.asarray(ImageCms.applyTransform(colours, transform)).astype(int)
-    return int(np.abs(converted - np.asarray(colours.convert("RGB"))).max())
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
+        mode = {"RGB ": "RGB", "GRAY": "L"}[profile.profile.xcolor_space]
+        grid = np.stack(np.meshgrid(*[np.arange(0, 256, 51, dtype=np.uint8)] * 3), -1).reshape(1, -1, 3)
+        colours = Image.fromarray(grid if mode == "RGB" else np.arange(256, dtype=np.uint8)[None])
+        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+        transform = ImageCms.buildTransform(
+            profile, ImageCms.createProfile("sRGB"), mode, "RGB", renderingIntent=intent
+        )
+        converted = np.asarray(ImageCms.applyTransform(colours, transform)).astype(int)
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError, KeyError) as error:
+        return f"the embedded colour profile cannot be used ({type(error).__name__})"
+    moved = int(np.abs(converted - np.asarray(colours.convert("RGB"))).max())
+    return f"the embedded colour profile moves colours by up to {moved} codes" if moved > SRGB_TOLERANCE else ""
 
 
 # Pixels ---------------------------------------------------------------------------------------------------------------
@@ -210,6 +210,6 @@ def _check(decoded: Srgb, header: Header) -> None:
 
 def upright(srgb: Srgb, orientation: int) -> Srgb:
     """Rotate and mirror stored pixels by an EXIF orientation, 1 to 8 (tag 274)."""
-    swap, row_step, column_step = _TURNS[orientation]
-    turned = srgb.swapaxes(0, 1) if swap else srgb
+    turned = srgb.swapaxes(0, 1) if orientation > 4 else srgb
+    row_step, column_step = (-1 if orientation in mirrored else 1 for mirrored in ((3, 4, 7, 8), (2, 3, 6, 7)))
     return cast(Srgb, np.ascontiguousarray(turned[::row_step, ::column_step]))

@@ -22,7 +22,7 @@ from unprocess_gen.simulation.facts import RawParts
 from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Levels, SensorPlan, SourcePlan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites
-from unprocess_gen.sources.photograph import Photograph
+from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.raw.decode import LOSSY_JPEG, RawFrame, RawMetadata, decode_raw
 from unprocess_gen.sources.raw.mosaics import mosaic_pixels
 

@@ -50,22 +50,19 @@ def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ..
         raise ConfigError(f"camera {file}: has no ColorMatrix, and LibRaw knows no matrix of its camera; expected one")
     levels = ", ".join(f"{level:g}" for level in dict.fromkeys(black))
     black_tag, white_tag = ("LibRaw" if fact is None else "tag" for fact in (tags.black_dn, tags.white_dn))
-    sources = {
-        "matrix": _matrix_source(tags),
-        "gains": _gains_source(tags, gains),
-        "levels": f"black {levels} ({black_tag}), white {sensor.white_level_dn} ({white_tag}); mean of black",
-        "pattern": f"{sensor.pattern} at the corner of the visible part",
-    }
-    model = " ".join((frame.metadata.model or "a camera without a name").split())
-    facts = tuple(f"{fact}: {source}" for fact, source in sources.items())
-    head = f"# {model}. {MARK}.\n# {file.name}, SHA-256 {file_sha256(file)}.\n" + "".join(
-        f"# {fact}\n" for fact in facts
+    facts = (
+        f"matrix: {_matrix_source(tags)}",
+        f"gains: {_gains_source(tags, gains)}",
+        f"levels: black {levels} ({black_tag}), white {sensor.white_level_dn} ({white_tag}); mean of black",
+        f"pattern: {sensor.pattern} at the corner of the visible part",
     )
+    model = " ".join((frame.metadata.model or "a camera without a name").split())
+    head = f"# {model}. {MARK}.\n# {file.name}, SHA-256 {file_sha256(file)}.\n# " + "\n# ".join(facts)
     entries = ", ".join(f"{entry:.6g}" for entry in matrix)
-    levels = f"black_level_dn: {sensor.black_level_dn}\nwhite_level_dn: {sensor.white_level_dn}\n"
+    levels = f"black_level_dn: {sensor.black_level_dn}\nwhite_level_dn: {sensor.white_level_dn}"
     options = {
-        "camera": f"{head}name: {name}\nlaw: custom\nxyz2cam: [{entries}]\n",
-        "sensor": f"{head}bits: {sensor.bits}\n{levels}pattern: {sensor.pattern}\nsaturated: auto\n",
+        "camera": f"{head}\nname: {name}\nlaw: custom\nxyz2cam: [{entries}]\n",
+        "sensor": f"{head}\nbits: {sensor.bits}\n{levels}\npattern: {sensor.pattern}\nsaturated: auto\n",
     }
     return options, facts
 
