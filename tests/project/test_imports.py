@@ -32,7 +32,7 @@ ONLY_IN = {
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng", "sources.raw.decode"},
     "rawpy": {"sources.raw.decode"},
-    "scipy": {"calibration.body", "calibration.frame_sums", "calibration.shape"},
+    "scipy": {"calibration.calibrate", "calibration.frame_sums", "calibration.shape"},
     "torch": {"torch"},
     "dask": {"pipeline.executors.dask"},
     "distributed": {"pipeline.executors.dask"},

@@ -1,32 +1,71 @@
-"""Write measured noise as a noise profile in YAML, and as a list of estimates in JSON."""
+"""Write measured noise as a noise profile in YAML, and as a list of estimates in JSON.
+
+Numbers of several ISOs are tables in branches, one for each gain mode of the sensor. The variance of read noise in one
+gain mode, c0 + c1·ISO + c2·ISO², is convex. A value below the line through the two ISOs before it therefore means that
+the sensor has switched its conversion gain: a new branch begins.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
-from unprocess_gen.calibration.captures import CaptureSet, Sensor
-from unprocess_gen.calibration.gain import Estimate, combined, estimate
-from unprocess_gen.calibration.iso_laws import DIGITS, black_law, modes, rounded, table
+from unprocess_gen.calibration.calibrate import NULL, Calibration
+from unprocess_gen.calibration.captures import Sensor
+from unprocess_gen.calibration.gain import SIGNIFICANT, Estimate, combined, estimate
 from unprocess_gen.calibration.measure import IsoResult
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
+from unprocess_gen.config.limits import NAME
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import machine_errors
+from unprocess_gen.core.libraries import require
+from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.statistics.mosaics import plane_names
 
 MARK = "by gen-dataset calibrate"
 """Part of the first line of a profile, by which a later run recognises it."""
-UNITS = {
-    "dn_per_e": "DN/e",
-    "b_dn2": "DN²",
-    "dark_e_per_s": "e/s",
-    "hot_pixel_e_per_s": "e/s",
-}
+UNITS = {"dn_per_e": "DN/e", "b_dn2": "DN²", "dark_e_per_s": "e/s", "hot_pixel_e_per_s": "e/s"}
 """Units of numbers; others are in DN or in electrons as their names end, or without a unit."""
+ENDS = ("value", "low", "high")
+DIGITS, SHAPE_DIGITS = 7, 4
+"""Digits of numbers in a profile, and of shapes."""
+ASSUMED_C = 25.0
+"""Temperature of darks that do not state it."""
+SAME_GAIN = 0.003
+"""Largest difference of the gains of colours that are not written."""
+LEAST_CORRELATION = 0.02
+"""Least correlation of neighbouring rows that is written."""
+MODE_RATIO = 0.85
+"""Ratio of read noise to the least read noise of a gain mode, below which it belongs to another mode."""
+LEAST = 1e-3
+"""Least standard deviation of a table relative to its largest, because 0 has no logarithm."""
+
+
+def check_outputs(to: Path) -> None:
+    """Refuse, before any work, names to which a profile cannot be written."""
+    if to.suffix != ".yaml" or not NAME.allows(to.stem):
+        raise ConfigError(f"--to {to}: is no name of a profile; expected {NAME}, and .yaml")
+    check_output_file(to, f"--to {to}", "an earlier profile of this verb", MARK.lower().encode())
+    to_json = to.with_suffix(".json")
+    check_output_file(to_json, f"--to {to}: {to_json.name}", "an earlier list of estimates", b'{"name": "')
+    require("scipy", "calibrate: fits need scipy", "calibrate")
+
+
+def write_profile(to: Path, profile: str, listed: str) -> None:
+    """Write the text of a profile, and of a list of estimates next to it."""
+    for path, text in {to: profile, to.with_suffix(".json"): listed}.items():
+        with machine_errors(path):
+            path.write_text(text, encoding="utf-8")
+
+
+# ----------------------------------------------------------------------------------------------------------- estimates
 
 
 class NamedNumber(NamedTuple):
@@ -43,78 +82,37 @@ class NamedNumber(NamedTuple):
         return UNITS.get(self.name, {"dn": "DN", "e": "e"}.get(self.name.rpartition("_")[2], ""))
 
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """Everything measured on a folder of captures; ``celsius`` is the temperature of the darks, if it is stated."""
-
-    captures: CaptureSet
-    isos: list[IsoResult]
-    body: dict[str, Estimate | None]
-    celsius: float | None
-    notes: list[str]
-
-    @property
-    def sensor(self) -> Sensor:
-        """Levels and pattern of the sensor."""
-        return self.captures.sensor
-
-
 def site_names(sensor: Sensor) -> list[str]:
-    """Return the names of the planes of a sensor; none for a monochrome one, whose sites are equal."""
+    """Names of the planes of a sensor; none for a monochrome one, whose sites are equal."""
     return [] if sensor.pattern == MONO else plane_names(sensor.pattern)
 
 
 def estimates(calibration: Calibration) -> list[NamedNumber]:
-    """Return the list of all estimates: those of the body, then those of each ISO."""
-    sites = site_names(calibration.sensor)
-    listed = [NamedNumber(name, None, None, number) for name, number in calibration.body.items()]
+    """All estimates: those of all ISOs together, then those of each ISO, of the sensor and then of its sites."""
+    sites = [None, *site_names(calibration.sensor)]
+    listed = [NamedNumber(name, None, None, number) for name, number in calibration.shared.items()]
     for result in calibration.isos:
-        listed += _named(result.numbers, result.iso, sites)
+        for name, numbers in result.numbers.items():
+            listed += [NamedNumber(name, result.iso, *both) for both in zip(sites, numbers, strict=False)]
     return listed
 
 
-def _named(numbers: Mapping[str, Sequence[Estimate]], iso: float, sites: Sequence[str]) -> Iterator[NamedNumber]:
-    """Yield estimates of the sensor, then of its sites."""
-    for name, (sensor, *planes) in numbers.items():
-        yield NamedNumber(name, iso, None, sensor)
-        yield from (NamedNumber(name, iso, site, plane) for site, plane in zip(sites, planes, strict=False))
-
-
 def estimates_json(named: Sequence[NamedNumber], digits: int = DIGITS) -> str:
-    """Return the list of estimates as JSON, an object a line; null where the captures do not show a number."""
+    """The list of estimates as JSON, an object a line; null where the captures do not show a number."""
     lines = []
-    for one in named:
-        values = [getattr(one.number, end, math.inf) for end in ENDS]
+    for entry in named:
+        values = [getattr(entry.number, end, math.inf) for end in ENDS]
         value, *interval = (rounded(value, digits) if math.isfinite(value) else None for value in values)
-        number = {"value": value, "interval": interval, "unit": one.unit}
-        lines.append({"name": one.name, "iso": one.iso, "site": one.site, **number})
+        number = {"value": value, "interval": interval, "unit": entry.unit}
+        lines.append({"name": entry.name, "iso": entry.iso, "site": entry.site, **number})
     return "[\n" + ",\n".join(map(json.dumps, lines)) + "\n]\n"
-
-
-ENDS = ("value", "low", "high")
-ASSUMED_C = 25.0
-"""Temperature of darks that do not state it."""
-SAME_GAIN = 0.003
-"""Largest difference of the gains of colours that are not written."""
-LEAST_CORRELATION = 0.02
-"""Least correlation of neighbouring rows that is written."""
-SHAPE_DIGITS = 4
-
-NULL = ("prnu_std", "dark_e_per_s", "hot_pixel_share")
-"""Numbers that are null in a profile if captures do not show them; others are left out."""
-
-
-def unknown_numbers(body: Mapping[str, Estimate | None]) -> list[str]:
-    """Return a note for each number that is null."""
-    advice = "the captures do not show it; the guide on calibration lists the frames that do"
-    return [f"{name} is null: {advice}" for name in NULL if body[name] is None]
 
 
 # ---------------------------------------------------------------------------------------------------------------- YAML
 
 
 def profile_yaml(start: str, sha256: str, notes: Sequence[str], profile: Mapping[str, Any]) -> str:
-    """Return a profile as YAML, with the source and notes in comments; ``start`` is the source in words."""
+    """A profile as YAML, with the source and notes in comments; ``start`` is the source in words."""
     lines = [
         f"# {start}.",
         "# SHA-256 of the list of their SHA-256, one a line in ascending order:",
@@ -127,18 +125,18 @@ def profile_yaml(start: str, sha256: str, notes: Sequence[str], profile: Mapping
 
 
 def profile_head(name: str, sensor: Sensor) -> dict[str, Any]:
-    """Return the first keys of a profile."""
+    """The first keys of a profile."""
     levels = {"bits": sensor.bits, "black_level_dn": round(sensor.black_dn), "white_level_dn": round(sensor.white_dn)}
     return {"name": name, "scatter": "off", "units": "dn", "black": "subtracted", **levels}
 
 
 def provenance(numbers: Sequence[str], isos: Sequence[float], source: str, uncertainty: str) -> dict[str, Any]:
-    """Return a statement of sources, which `plan` prints."""
+    """A statement of sources, which `plan` prints."""
     return {"numbers": [*numbers], "iso": [isos[0], isos[-1]], "source": source, "uncertainty": uncertainty}
 
 
 def measured_yaml(calibration: Calibration, name: str) -> str:
-    """Return the noise profile of measured frames."""
+    """The noise profile of measured frames."""
     isos, digest = [result.iso for result in calibration.isos], calibration.captures.sha256
     places = modes(isos, [result["read_std_dn"] for result in calibration.isos])
     branches = [_branch([calibration.isos[place] for place in mode], calibration.sensor) for mode in places]
@@ -152,7 +150,7 @@ def measured_yaml(calibration: Calibration, name: str) -> str:
 
 
 def dark_variance(result: IsoResult) -> Estimate:
-    """Return the variance of a site without light, DN², all dark noise but rounding."""
+    """Variance of a site without light, DN², all dark noise but rounding."""
     names = ("read_std_dn", "row_std_dn", "column_std_dn", "column_temporal_std_dn", "dsnu_std_dn")
     stds = [result[name] for name in names]
     error = 2 * math.sqrt(sum((std.value * std.error) ** 2 for std in stds))
@@ -160,48 +158,83 @@ def dark_variance(result: IsoResult) -> Estimate:
 
 
 def _branch(results: Sequence[IsoResult], sensor: Sensor) -> dict[str, Any]:
-    """Return a branch of neighbouring ISOs: gain, and noise without light."""
+    """A branch of neighbouring ISOs: gain, and noise without light."""
     isos, shapes = [result.iso for result in results], [result.shape for result in results]
     branch: dict[str, Any] = {"iso": [isos[0], isos[-1]], "read_law": "gaussian"}
     if any(shape.is_tukey for shape in shapes):
         values = [shape.interval.value if shape.is_tukey else NORMAL_SHAPE for shape in shapes]
-        branch |= {"read_law": "tukey_lambda", "read_shape": table(isos, values, SHAPE_DIGITS)}
+        branch |= {"read_law": "tukey_lambda", "read_shape": std_table(isos, values, SHAPE_DIGITS)}
     for name in ("dn_per_e", "read_std_dn", "row_std_dn", "column_std_dn"):
-        branch[name] = table(isos, [result[name].value for result in results])
+        branch[name] = std_table(isos, [result[name].value for result in results])
     if (temporal := max(result["column_temporal_std_dn"].value for result in results)) > 0:  # the key takes no table
         branch["column_temporal_std_dn"] = rounded(temporal)
     names = site_names(sensor)
     # of red, both greens and blue; a monochrome sensor has one
     places = [1 + names.index(name) for name in ("R", "Gr", "B", "Gb")] if names else [0]
-    blacks = [[result.numbers["black_error_dn"][place].value for place in places] for result in results]
-    return branch | {"black_error_dn": black_law(isos, blacks)}
+    blacks = [[round(result.numbers["black_error_dn"][place].value, 4) for place in places] for result in results]
+    return branch | {"black_error_dn": table(isos, blacks if names else [black for (black,) in blacks])}
 
 
 def _common_keys(calibration: Calibration) -> dict[str, Any]:
-    """Return the keys that do not depend on ISO; null for numbers that the captures do not show."""
+    """The keys that do not depend on ISO; null for numbers that the captures do not show."""
     keys: dict[str, Any] = {} if (gains := _gains_by_colour(calibration)) is None else {"gain_by_colour": gains}
     rows = [result["row_correlation"] for result in calibration.isos]
     row = max(rows, key=lambda number: abs(number.value) / max(number.error, 1e-9))
     if abs(row.value) > max(4 * row.error, LEAST_CORRELATION):
         keys["row_correlation"] = rounded(max(min(row.value, 0.95), -0.95))
-    for name, number in calibration.body.items():
+    for name, number in calibration.shared.items():
         if number is not None or name in NULL:
             keys[name] = None if number is None else rounded(number.value)
-    if calibration.body["dark_e_per_s"] is not None:
+    if calibration.shared["dark_e_per_s"] is not None:
         keys["dark_reference_c"] = ASSUMED_C if calibration.celsius is None else calibration.celsius
     return keys
 
 
 def _gains_by_colour(calibration: Calibration) -> list[float] | None:
-    """Return the gains of red, green and blue relative to the sensor's, if they differ by more than their errors."""
+    """The gains of red, green and blue relative to the sensor's, if they differ by more than their errors."""
     sites, colours = site_names(calibration.sensor), list[Estimate]()
-    for colour in ("R", "G", "B") if sites else ():
+    for colour in "RGB" if sites else "":
         places = [1 + place for place, site in enumerate(sites) if site[0] == colour]
-        relative = [
-            result.numbers["dn_per_e"][place].scaled(1 / result["dn_per_e"].value)
-            for result in calibration.isos
-            for place in places
-        ]
-        colours.append(combined(relative))
+        gains = [(result["dn_per_e"].value, result.numbers["dn_per_e"]) for result in calibration.isos]
+        colours.append(combined([planes[place].scaled(1 / gain) for gain, planes in gains for place in places]))
     differ = any(abs(gain.value - 1) > max(4 * gain.error, SAME_GAIN) for gain in colours)
     return [rounded(gain.value) for gain in colours] if differ else None
+
+
+# --------------------------------------------------------------------------------------------------------------- tables
+
+
+def modes(isos: Sequence[float], reads: Sequence[Estimate]) -> list[list[int]]:
+    """The places of the ISOs of each gain mode."""
+    result = [[0]]
+    for place in range(1, len(isos)):
+        mode = result[-1]
+        last = reads[mode[-1]].value ** 2
+        slope = 0.0
+        if len(mode) > 1:
+            slope = (last - reads[mode[-2]].value ** 2) / (isos[mode[-1]] - isos[mode[-2]])
+        least = math.sqrt(max(last + max(slope, 0.0) * (isos[place] - isos[mode[-1]]), 0.0))
+        read = reads[place]
+        margin = MODE_RATIO if len(mode) > 1 else 1.0
+        if read.value + SIGNIFICANT * math.hypot(read.error, reads[mode[-1]].error) < margin * least:
+            result.append([place])
+        else:
+            mode.append(place)
+    return result
+
+
+def table(isos: Sequence[float], values: Sequence[Any]) -> Any:
+    """The value of one ISO, or a table ``by_iso``."""
+    return values[0] if len(isos) == 1 else ["by_iso", *itertools.chain(*zip(isos, values, strict=True))]
+
+
+def std_table(isos: Sequence[float], values: Sequence[float], digits: int = DIGITS) -> Any:
+    """Gains, standard deviations or shapes of a branch as one number, or as a table ``by_iso``."""
+    if len(isos) == 1 or not any(values):
+        return rounded(values[0], digits)
+    return table(isos, [rounded(value or LEAST * max(values), digits) for value in values])
+
+
+def rounded(value: float, digits: int = DIGITS) -> float:
+    """A number with the digits that a profile has."""
+    return float(f"{value:.{digits}g}")

@@ -17,8 +17,16 @@ import numpy as np
 
 from unprocess_gen.calibration.captures import Sensor, common, joined_sha256
 from unprocess_gen.calibration.gain import Estimate
-from unprocess_gen.calibration.iso_laws import rounded, table
-from unprocess_gen.calibration.profile import MARK, NamedNumber, estimates_json, profile_head, profile_yaml, provenance
+from unprocess_gen.calibration.profile import (
+    MARK,
+    NamedNumber,
+    estimates_json,
+    profile_head,
+    profile_yaml,
+    provenance,
+    rounded,
+    std_table,
+)
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
@@ -149,8 +157,8 @@ def stated_yaml(stated: StatedNoise, name: str) -> str:
     profile["branches"] = []
     for mode in stated.modes:
         own = [record.iso for record in mode]
-        gain = table(own, [record.a[1] for record in mode], DIGITS)
-        read = table(own, [math.sqrt(record.b[1]) for record in mode], DIGITS)
+        gain = std_table(own, [record.a[1] for record in mode], DIGITS)
+        read = std_table(own, [math.sqrt(record.b[1]) for record in mode], DIGITS)
         branch = {"iso": [own[0], own[-1]], "dn_per_e": gain, "read_law": "gaussian", "read_std_dn": read}
         profile["branches"].append(branch)
     gains = stated.isos[len(isos) // 2].a

@@ -16,7 +16,7 @@ from unprocess_gen.reports.formatting import counted, short_number
 
 def calibrate(call: Call) -> int:
     """Write a noise profile and the list of its estimates, from captures or from what DNG files state."""
-    from unprocess_gen.calibration.calibrate import check_outputs
+    from unprocess_gen.calibration.profile import check_outputs
 
     assert call.place is not None
     folder = local_path(call.place, f"calibrate: {call.place} is in an object store; expected a local folder")
@@ -31,12 +31,12 @@ def calibrate(call: Call) -> int:
 
 def _state(folder: Path, to: Path) -> Sequence[float]:
     """Write the profile that NoiseProfile tags state; return its ISOs."""
-    from unprocess_gen.calibration.calibrate import write_files
+    from unprocess_gen.calibration.profile import write_profile
     from unprocess_gen.calibration.stated_noise import read_stated_noise, stated_json, stated_yaml
 
     stated = read_stated_noise(folder)
     _report_notes(stated.notes)
-    write_files(to, stated_yaml(stated, to.stem), stated_json(stated))
+    write_profile(to, stated_yaml(stated, to.stem), stated_json(stated))
     for iso, a, b, *_ in stated.isos:
         print_results(f"ISO {iso:g}: a {short_number(a[1], 4)} DN, b {short_number(b[1], 4)} DN² (stated)")
     return [result.iso for result in stated.isos]
@@ -44,8 +44,8 @@ def _state(folder: Path, to: Path) -> Sequence[float]:
 
 def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:
     """Write the profile of flats and darks, and a page about them; return its ISOs."""
-    from unprocess_gen.calibration.calibrate import calibrate, write_files
-    from unprocess_gen.calibration.profile import estimates, estimates_json, measured_yaml
+    from unprocess_gen.calibration.calibrate import calibrate
+    from unprocess_gen.calibration.profile import estimates, estimates_json, measured_yaml, write_profile
     from unprocess_gen.pipeline.progress import with_bar
 
     if page is not None:
@@ -54,7 +54,7 @@ def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:
         check_page(page)
     calibration = calibrate(folder, partial(with_bar, unit="frame"))
     _report_notes(calibration.notes)
-    write_files(to, measured_yaml(calibration, to.stem), estimates_json(estimates(calibration)))
+    write_profile(to, measured_yaml(calibration, to.stem), estimates_json(estimates(calibration)))
     for result in calibration.isos:
         gain, read, row = (result[name] for name in ("dn_per_e", "read_std_dn", "row_std_dn"))
         print_results(

@@ -12,12 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from unprocess_gen.calibration.calibrate import measure_all
+from unprocess_gen.calibration.calibrate import Calibration, measure_all
 from unprocess_gen.calibration.captures import Sensor, read_captures
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.measure import Watch
 from unprocess_gen.calibration.profile import (
-    Calibration,
     NamedNumber,
     dark_variance,
     estimates,

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from unprocess_gen.calibration.calibrate import Calibration
 from unprocess_gen.calibration.measure import IsoResult
-from unprocess_gen.calibration.profile import ENDS, Calibration, NamedNumber, estimates, site_names
+from unprocess_gen.calibration.profile import ENDS, NamedNumber, estimates, site_names
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_errors

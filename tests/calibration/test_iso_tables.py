@@ -1,0 +1,27 @@
+"""Numbers of several ISOs become tables, in branches at a change of gain."""
+
+from __future__ import annotations
+
+import pytest
+
+from unprocess_gen.calibration.gain import estimate
+from unprocess_gen.calibration.profile import modes, std_table, table
+
+ISOS = [100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0]
+POWERS = [[(1 + (iso / 100) ** (2 * power)) ** 0.5 for iso in ISOS] for power in (0.0, 0.5, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("reads", "branches"),
+    [([1.01, 1.29, 2.06, 3.55, 6.30, 3.92], [[0, 1, 2, 3, 4], [5]]), *((reads, [[*range(6)]]) for reads in POWERS)],
+)
+def test_lower_read_noise_begins_a_branch(reads: list[float], branches: list[list[int]]) -> None:
+    """The A7S II (PMN) switches its gain at ISO 2000; behind an amplifier, noise is ISO to a power of at most 1."""
+    assert modes(ISOS, [estimate(read, 1e-3 * read) for read in reads]) == branches
+
+
+def test_numbers_of_several_isos_are_a_table() -> None:
+    """A standard deviation of 0 has no logarithm; unequal steps keep their ISO."""
+    assert std_table(ISOS[:3], [3, 0, 3.5]) == ["by_iso", 100, 3, 200, 0.0035, 400, 3.5]
+    assert (std_table(ISOS[:1], [2]), std_table(ISOS[:2], [0, 0])) == (2, 0)
+    assert table([100, 125], [[1.0] * 4, [2.0] * 4]) == ["by_iso", 100, [1] * 4, 125, [2] * 4]
