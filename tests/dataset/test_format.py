@@ -108,7 +108,7 @@ def test_another_format_is_refused_by_every_reader(read: Callable[[Path], object
         "again ds out=new",
         "out=ds",
         "merge ds",
-        "part ds 0",
+        "part 0/1 out=ds",
     ],
 )
 def test_another_format_is_refused_in_one_line(

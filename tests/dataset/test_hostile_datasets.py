@@ -17,7 +17,7 @@ from helpers.datasets import Make
 from helpers.photographs import fill
 
 from unprocess_gen import DamageError, RawPairs
-from unprocess_gen.dataset.dataset_json import check_dataset_json
+from unprocess_gen.dataset.dataset_json import check_dataset_json, dataset_text, fingerprint, read_dataset
 from unprocess_gen.dataset.manifest import (
     MAX_DETAIL,
     MAX_LINE_BYTES,
@@ -31,7 +31,6 @@ from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.dataset.shards import read_index
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
-from unprocess_gen.pipeline.workspace import dataset_text, fingerprint, read_dataset
 
 KEY = "00000001"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 from unprocess_gen import RawPairs
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.files import array_xxh3, file_sha256
+from unprocess_gen.dataset.dataset_json import dataset_text, fingerprint, read_dataset
 from unprocess_gen.dataset.shards import shard_name
-from unprocess_gen.pipeline.workspace import dataset_text, fingerprint, read_dataset
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import Plan
 
@@ -45,8 +46,8 @@ def with_numbers(**numbers: Any) -> Fault:
     """Simulate the noise of other physical numbers than those of the plan."""
 
     def simulate(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
-        assert plan.physics is not None
-        return make_pair(srgb, plan.replace(**numbers)).noisy
+        assert plan.noise.physics is not None
+        return make_pair(srgb, plan.replace(physics=replace(plan.noise.physics, **numbers))).noisy
 
     return simulate
 
@@ -67,15 +68,17 @@ def swapped_red_and_blue(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draw
 
 def stripes(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
     """Add an offset to each column, with a tenth of the standard deviation of the read noise."""
-    assert plan.physics is not None
+    assert plan.noise.physics is not None
     _, exact = unrounded(srgb, plan)
-    return rounded(exact + 0.1 * plan.physics.read_std_dn * draws.standard_normal(exact.shape[1]), plan)
+    return rounded(exact + 0.1 * plan.noise.physics.read_std_dn * draws.standard_normal(exact.shape[1]), plan)
 
 
 def uniform(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
     """Replace the noise by uniform noise of the same variance."""
     clean, _ = unrounded(srgb, plan)
-    row_dn2 = plan.physics.row_std_dn**2 if plan.physics is not None and "row" in plan.noise.effects else 0.0
+    row_dn2 = (
+        plan.noise.physics.row_std_dn**2 if plan.noise.physics is not None and "row" in plan.noise.effects else 0.0
+    )
     slope, intercept = plan.noise.variance_line
     std = np.sqrt(slope * (clean - plan.sensor.black_level_dn) + intercept + row_dn2)
     return rounded(clean + std * draws.uniform(-(3**0.5), 3**0.5, clean.shape), plan)

@@ -99,8 +99,7 @@ def test_cluster_makes_the_bytes_of_a_local_run(
 def test_run_that_a_local_one_began_is_finished_by_dask(
     cluster: DaskCluster, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
-    assert run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
-    assert run_main("part", "ds", 0, "-q").code == 0
+    assert run_main("part", "0/2", ROOT, ONE, "n_jobs=1", "out=ds", "-q").code == 0
     before = committed(tmp_path / "ds")
     done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
     assert (done.code, len(before)) == (0, 6), done.err
@@ -119,12 +118,12 @@ def test_run_that_dask_began_is_finished_locally(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def interrupted(reports: Iterator[object], progress: object) -> None:
+    def interrupted(reports: Iterator[object], *_: object) -> None:
         next(iter(reports))
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "follow", interrupted)
+        patch.setattr(runner, "_follow", interrupted)
         done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
     assert (done.code, len(committed(tmp_path / "ds")) > 0) == (130, True)
     assert run_main(ROOT, ONE, "n_jobs=1", "out=ds").code == 0

@@ -51,8 +51,8 @@ from unprocess_gen.core import paths
 from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import worker
+from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.replay import replay
-from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import ShardReport
 
 COUNT = 24
@@ -79,8 +79,8 @@ def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.Mo
     """Call ``action`` once a run of this process has committed ``number`` shards."""
     commit, done = worker.commit_shard, []
 
-    def commits(storage: Storage, made: Any, columns: Any) -> ShardReport:
-        report = commit(storage, made, columns)
+    def commits(folder: OutFolder, made: Any, columns: Any) -> ShardReport:
+        report = commit(folder, made, columns)
         done.append(made.shard)
         if len(done) == number:
             action()
@@ -166,7 +166,7 @@ def test_run_continues_when_a_worker_is_killed_at_random_moments(
             assert process.returncode in (0, 3), err
             wait_for_the_end(process.pid)
         lines = messages(err)
-        assert all("its worker died twice" in line for line in lines) and len(lines) <= 1, err
+        assert all("its worker died four times" in line for line in lines) and len(lines) <= 1, err
         make(photographs, out, ONE)
         assert tree_hash(out) == undisturbed, kill
         assert_complete(out)

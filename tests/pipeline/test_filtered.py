@@ -85,9 +85,8 @@ def test_filtered_rows_are_verified_replayed_regenerated_and_repaired(
 
 
 def test_run_in_parts_counts_filtered_images(photos: Path, run_main: RunMain) -> None:
-    assert run_main("prepare", "parts=2", f"source.root={photos}", *ARGUMENTS, "out=ds").code == 0
-    for part in ("0", "1"):
-        assert run_main("part", "ds", part).code == 0
+    for part in ("0/2", "1/2"):
+        assert run_main("part", part, f"source.root={photos}", *ARGUMENTS, "out=ds").code == 0
     merged = run_main("merge", "ds")
     assert merged.code == 0
     assert "0 failed, 3 filtered (source.min_side)" in merged.out

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.commands import Cli
-from helpers.datasets import Make, TreeHash
+from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import PHOTOS, fill, pixels
 from helpers.processes import wait_for
 from helpers.promise_report import Figure
@@ -30,8 +30,10 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import worker
 from unprocess_gen.pipeline.executors import local
-from unprocess_gen.pipeline.run import shard_tasks
+from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.pipeline.run import Run
 from unprocess_gen.pipeline.tasks import COUNTS
+from unprocess_gen.sources.listing import Listing
 
 SHARDS_OF_5 = "output.pairs_per_shard=5"
 
@@ -309,16 +311,13 @@ def test_built_in_scenes_are_the_source_without_a_root(make: Make, tmp_path: Pat
 # Work -----------------------------------------------------------------------------------------------------------------
 
 
-def sources(count: int) -> list[Source]:
-    return [Source(i, f"{i}.png", f"{i}.png", 1) for i in range(count)]
-
-
 @pytest.mark.parametrize(("count", "per_shard", "lengths"), [(5, 2, [2, 2, 1]), (4, 2, [2, 2]), (1, 8, [1])])
-def test_shard_tasks_split_the_listing_in_order(count: int, per_shard: int, lengths: list[int]) -> None:
-    tasks = shard_tasks(sources(count), per_shard)
+def test_shards_split_the_listing_in_order(count: int, per_shard: int, lengths: list[int], settings: Settings) -> None:
+    sources = tuple(Source(i, f"{i}.png", f"{i}.png", 1) for i in range(count))
+    run = Run(PairSettings(settings(f"output.pairs_per_shard={per_shard}")), Listing(sources))
+    tasks = [run.task(shard) for shard in range(run.shards)]
     assert [len(task.sources) for task in tasks] == lengths
-    assert [source for task in tasks for source in task.sources] == sources(count)
-    assert [task.shard for task in tasks] == list(range(len(tasks)))
+    assert [source for task in tasks for source in task.sources] == [*sources]
 
 
 def test_no_more_workers_than_tasks_and_at_least_one() -> None:

@@ -14,13 +14,11 @@ from helpers.cases import slow_except
 from helpers.commands import Done, RunMain
 from helpers.photographs import fill
 
-from unprocess_gen.core.files import file_sha256
-from unprocess_gen.pipeline.frozen_run import PLAN
-from unprocess_gen.pipeline.run_records import INDEX
-from unprocess_gen.pipeline.workspace import dataset_text
+from unprocess_gen.dataset.dataset_json import dataset_text
+from unprocess_gen.pipeline.run import LISTING, RUN
 
-PREPARED = ("source.root=p", "out=ds", "output.pairs_per_shard=2", "n_jobs=1")
-RUN_FILES = (PLAN, INDEX, ".work/sources/00000.json", ".work/rows/00000.json", "config.yaml")
+SETTINGS = ("source.root=p", "out=ds", "output.pairs_per_shard=2", "n_jobs=1")
+RUN_FILES = (RUN, LISTING, ".work/rows/00000.json", ".work/deaths/00001", "config.yaml")
 DATASET_FILES = ("dataset.json", "manifest.csv", "config.yaml", "shards/shard-00000.tar")
 
 CONTENTS = {
@@ -92,13 +90,13 @@ def folder(run_main: RunMain, tmp_path: Path) -> Path:
 @pytest.mark.linux_only(reason="makes pipes")
 @pytest.mark.parametrize("name", slow_except((".work/rows/00000.json",), RUN_FILES))
 def test_edited_record_of_a_run_is_reported_in_one_line(name: str, folder: Path, run_main: RunMain) -> None:
-    assert run_main("prepare", "parts=2", *PREPARED).code == 0
-    assert run_main("part", "ds", 0).code == 0
+    assert run_main("part", "0/2", *SETTINGS).code == 0
+    (folder / "ds/.work/deaths/00001").write_text("[2, 2]")
     shutil.copytree(folder / "ds", folder / "original")
     problems = []
     for variant, write in variants(folder / "original" / name):
-        verbs = (("status", "ds"), ("merge", "ds"), ("part", "ds", 1), PREPARED)
-        for verb in verbs[:2] if "=" in variant else verbs:  # these two read every record
+        verbs = (("merge", "ds"), ("part", "1/2", *SETTINGS), SETTINGS)
+        for verb in verbs[:1] if "=" in variant else verbs:  # merge reads every record
             restore(folder / "ds", folder / "original")
             write(folder / "ds" / name)
             problems.append(problem(run_main(*verb), f"{verb[0]}: {variant}"))
@@ -108,10 +106,10 @@ def test_edited_record_of_a_run_is_reported_in_one_line(name: str, folder: Path,
 @pytest.mark.linux_only(reason="makes pipes")
 @pytest.mark.parametrize("name", slow_except(("manifest.csv", "config.yaml"), DATASET_FILES))
 def test_edited_file_of_a_dataset_is_reported_in_one_line(name: str, folder: Path, run_main: RunMain) -> None:
-    assert run_main(*PREPARED).code == 0
+    assert run_main(*SETTINGS).code == 0
     shutil.copytree(folder / "ds", folder / "original")
     verbs = (("verify", "ds"), ("report", "ds"), ("verify", "ds", "--repair"), ("replay", "ds/manifest.csv"))
-    others = (("again", "ds", "out=new", "n_jobs=1"), PREPARED)
+    others = (("again", "ds", "out=new", "n_jobs=1"), SETTINGS)
     problems = []
     for variant, write in variants(folder / "original" / name):
         for verb in verbs[1:2] if "=" in variant else (*verbs, *others):
@@ -123,14 +121,14 @@ def test_edited_file_of_a_dataset_is_reported_in_one_line(name: str, folder: Pat
 
 
 def test_edited_record_names_file_problem_and_remedy(folder: Path, run_main: RunMain) -> None:
-    assert run_main("prepare", "parts=2", *PREPARED).code == 0
-    plan = json.loads((folder / "ds" / PLAN).read_text())
-    (folder / "ds" / PLAN).write_text(json.dumps(plan | {"parts": 1e308}))
+    assert run_main("part", "0/2", *SETTINGS).code == 0
+    run = json.loads((folder / "ds" / RUN).read_text())
+    (folder / "ds" / RUN).write_text(json.dumps(run | {"parts": 1e308}))
 
-    done = run_main("status", "ds")
+    done = run_main("merge", "ds")
 
     assert done.code == 5
     assert done.err == (
-        f"gen-dataset: ds/{PLAN}: cannot be read (parts: expected `int`, got `float`); delete ds/.work and run again\n"
+        f"gen-dataset: ds/{RUN}: cannot be read (parts: expected `int | null`, got `float`); delete ds/.work and run "
+        "again\n"
     )
-    assert file_sha256(folder / "ds" / INDEX) == plan["listing_sha256"]

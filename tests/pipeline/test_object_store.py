@@ -8,8 +8,8 @@ import signal
 import tempfile
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,11 +27,10 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.object_store import TEMPORARY_PREFIX, ObjectPath
-from unprocess_gen.core.source import Source
-from unprocess_gen.pipeline import workspace as workspaces
+from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.generate import Summary, generate
-from unprocess_gen.pipeline.run_records import write_listing
-from unprocess_gen.pipeline.storage import Storage
+from unprocess_gen.pipeline.run import LISTING, Run
 
 
 @pytest.fixture(autouse=True)
@@ -176,25 +175,30 @@ def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, un
 def test_run_with_other_settings_loses_the_race(
     twelve: Path, bucket: ObjectPath, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    checked = workspaces.Workspace.check_begun
+    checked = runner.check_begun
 
-    def begun_by_another(workspace: workspaces.Workspace, *arguments: object) -> None:
-        checked(workspace, *arguments)  # type: ignore[arg-type]
-        monkeypatch.setattr(workspaces.Workspace, "check_begun", checked)
+    def begun_by_another(*arguments: Any) -> None:
+        checked(*arguments)
+        monkeypatch.setattr(runner, "check_begun", checked)
         generate(config_of(twelve, bucket / "ds"))
 
-    monkeypatch.setattr(workspaces.Workspace, "check_begun", begun_by_another)
+    monkeypatch.setattr(runner, "check_begun", begun_by_another)
     with pytest.raises(ConfigError, match=r"was begun with other settings: seed=4 \(there: 0\)"):
         generate(config_of(twelve, bucket / "ds", "seed=4"))
     assert_same(bucket / "ds", undisturbed)
 
 
-def test_record_of_sources_is_never_replaced(bucket: ObjectPath) -> None:
-    storage = Storage(str(bucket / "ds"))
-    sources = [Source(0, "a", "a", 1, etag="1")]
-    assert write_listing(storage, sources) == write_listing(storage, sources)
+def test_run_with_other_sources_loses_the_race(
+    twelve: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The listing is never replaced."""
+
+    def begun_by_another(folder: OutFolder, run: Run) -> None:
+        folder.create(LISTING, run.listing_text.partition(b"\n")[2])
+
+    monkeypatch.setattr(runner, "check_begun", begun_by_another)
     with pytest.raises(ConfigError, match=r"ds: was begun with other sources"):
-        write_listing(storage, [replace(sources[0], etag="2")])
+        generate(config_of(twelve, bucket / "ds"))
 
 
 def test_interrupted_upload_leaves_no_object(bucket: ObjectPath, proxy: Proxy, tmp_path: Path) -> None:
@@ -254,28 +258,16 @@ def test_run_in_parts_writes_the_same_bytes(
 ) -> None:
     out = bucket / "ds"
     servers.upload(twelve, bucket / "photos")
-    prepared = run_main("prepare", "parts=3", f"source.root={bucket}/photos", f"out={out}", ONE, "n_jobs=1")
-    assert (prepared.code, prepared.out.partition(";")[0]) == (0, f"{out}: 12 sources, 12 shards, 3 parts")
-    for part in (2, 0, 2):
-        assert run_main("part", str(out), str(part)).code == 0
+    settings = (f"source.root={bucket}/photos", f"out={out}", ONE, "n_jobs=1", "-q")
+    for number in (2, 0, 2):
+        assert run_main("part", f"{number}/3", *settings).code == 0
     early = run_main("merge", str(out))
-    assert early.code == 5 and not (out / "dataset.json").exists()
-    assert run_main("status", str(out), "--left").out == "1\n"
-    assert run_main("part", str(out), "1").code == 0
+    assert (early.code, "parts 1 of 3 are not done" in early.err) == (5, True)
+    assert not (out / "dataset.json").exists()
+    assert run_main("part", "1/3", *settings).code == 0
     assert run_main("merge", str(out)).code == 0
     assert_same(out, undisturbed)
     assert not list(scratch.iterdir())
-
-
-def test_provisional_rows_keep_the_records(twelve: Path, bucket: ObjectPath) -> None:
-    storage = Storage(str(bucket / "ds"))
-    storage.write(".work/rows/00000.json", "{}")
-    storage.remove_work(keep_records=True)
-    assert storage.read(".work/rows/00000.json") == "{}"
-    storage.remove_work(keep_records=False)
-    assert storage.path.entries() == {}
-    with pytest.raises(FileNotFoundError):
-        storage.read(".work/rows/00000.json")
 
 
 @pytest.mark.parametrize(

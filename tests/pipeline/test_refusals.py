@@ -28,6 +28,7 @@ from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineE
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.paths import LocalPath
 from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import progress as progress_module
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -35,7 +36,6 @@ from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.verify import verify, verify_sweep
-from unprocess_gen.pipeline.workspace import Workspace
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_out_inside_an_unfinished_dataset_is_refused(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(Workspace, "finish", lambda *_: 1 / 0)
+        patch.setattr(runner, "_finish", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             make(fill(tmp_path / "p", 1), tmp_path / "ds", ONE)
     with pytest.raises(ConfigError, match="is inside the dataset"):

@@ -56,7 +56,7 @@ def test_resumed_run_needs_space_only_for_missing_shards(
 ) -> None:
     source = fill(tmp_path / "p", 3)
     with monkeypatch.context() as patch:
-        patch.setattr("unprocess_gen.pipeline.generate.Workspace.finish", lambda *_: 1 / 0)
+        patch.setattr("unprocess_gen.pipeline.generate._finish", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             make(source, tmp_path / "ds", ONE)
     (tmp_path / "ds/shards/shard-00001.tar").unlink()

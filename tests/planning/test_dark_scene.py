@@ -14,7 +14,7 @@ from unprocess_gen.planning.dark_scene import dark_scene_warning
 WARNING = "scene=night: light is divided by 100 to 300, but noise=imx385_iso3200 ignores ISO 6400; "
 
 
-@pytest.mark.parametrize("verb", [(), ("prepare", "parts=1")])
+@pytest.mark.parametrize("verb", [(), ("part", "0/1")])
 def test_run_in_a_dark_scene_warns_of_two_numbers(verb: tuple[str, ...], run_main: RunMain, tmp_path: Path) -> None:
     done = run_main(*verb, "source.limit=1", "scene=night", "n_jobs=1", f"out={tmp_path / 'ds'}")
     assert done.code == 0, done.err

@@ -33,7 +33,7 @@ def test_chosen_sensor_and_two_number_profiles_are_not_warned_about(
     assert sensor_warning(settings(*overrides)) == ""
 
 
-@pytest.mark.parametrize("verb", [(), ("plan",), ("prepare", "parts=1")], ids=["run", "plan", "prepare"])
+@pytest.mark.parametrize("verb", [(), ("plan",), ("part", "0/1")], ids=["run", "plan", "part"])
 def test_runs_and_plans_warn(verb: tuple[str, ...], run_main: RunMain, tmp_path: Path) -> None:
     done = run_main(*verb, "noise=oppo_reno10x", "source.limit=1", "source.patch=64", "n_jobs=1", f"out={tmp_path}/ds")
     assert done.code == 0

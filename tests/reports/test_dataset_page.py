@@ -27,9 +27,9 @@ from jinja2 import UndefinedError
 from PIL import Image
 
 from unprocess_gen import RawPairs
+from unprocess_gen.dataset.dataset_json import read_dataset
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import verify
-from unprocess_gen.pipeline.workspace import read_dataset
 from unprocess_gen.reports import formatting, html_pages
 from unprocess_gen.reports.dataset_page import dataset_page
 

@@ -273,7 +273,7 @@ def test_only_shards_of_the_failing_process_are_recorded(
 ) -> None:
     arguments = ("n_jobs=1", two, "output.pairs_per_shard=1", "self_test=go_on")
     with monkeypatch.context() as patched:
-        patched.setattr("unprocess_gen.pipeline.workspace.Workspace.finish", interrupted)
+        patched.setattr("unprocess_gen.pipeline.generate._finish", interrupted)
         assert run_main(*arguments).code == 130
     (tmp_path / "ds" / ".work" / "rows" / "00001.json").unlink()
     (tmp_path / "ds" / "shards" / "shard-00001.tar").unlink()

@@ -7,7 +7,7 @@ from unprocess_gen.cli.arguments import Place, Verb, count, flag, local, switch
 
 DATASET = Place("DIR", "the folder of a dataset")
 ANY_DATASET = Place("DIR", "the folder of a dataset or of a sweep")
-PREPARED = Place("OUT", "the folder of a prepared run")
+BEGUN = Place("OUT", "the folder of a run in parts")
 N_JOBS = {"n_jobs=N": "number of worker processes; -1: all cores"}
 SOURCE = {"source.root=ROOT": "folder of the photographs; by default the one recorded in dataset.json"}
 INPUTS = SOURCE | {"noise.dark_frames=FOLDER": "folder of the dark frames, if it is not the recorded one"}
@@ -26,29 +26,15 @@ _VERBS = (
         resumes=True,
     ),
     Verb(
-        "prepare",
-        "list the sources of a run and split it into parts, for separate jobs",
-        parts.prepare,
-        keys={"parts=N": "number of parts"},
-        composes=True,
-    ),
-    Verb(
         "part",
-        "generate part K (from 0) of a prepared run; default: that of the array job",
+        "generate part K (from 0) of N of a dataset, for separate jobs; merge finishes it",
         parts.part,
-        PREPARED,
-        keys=N_JOBS | SOURCE | {"part=K": "number of the part, from 0"},
+        keys={"part=K/N": "the part; /N: K is the number of the array job"},
+        composes=True,
         resumes=True,
         extra="part",
     ),
-    Verb(
-        "status",
-        "show which parts of a prepared run are left",
-        parts.status,
-        PREPARED,
-        (switch("--left", "print only the numbers of the parts that are left: 3,7-9"),),
-    ),
-    Verb("merge", "write manifest.csv and dataset.json when all parts are finished", parts.merge, PREPARED),
+    Verb("merge", "write manifest.csv and dataset.json when all parts are finished", parts.merge, BEGUN),
     Verb(
         "plan",
         "estimate pairs, bytes and time, and explain the effects; write nothing",

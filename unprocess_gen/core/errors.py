@@ -31,7 +31,7 @@ REASONS = {
     "alpha": "pixels are transparent, or could be",
     "animated": "the file contains several pictures",
     "icc": "with `source.icc=refuse`: the colours are not those of sRGB",
-    "worker_died": "each worker process that tried this shard died, usually out of memory; the next run retries it",
+    "worker_died": "four workers died at this source, usually out of memory; the next run tries it again",
 }
 """Reasons for which a source fails, the values of the manifest column ``reason``, with their explanations."""
 

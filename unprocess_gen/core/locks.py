@@ -1,7 +1,7 @@
 """Lock a place with a file, so that two processes do not write to it at the same time.
 
 The system releases the lock of a process that ends, however it ends. Some network file systems have no locks, and
-object stores have none. Callers must therefore stay correct with two owners; `pipeline.workspace` does, because every
+object stores have none. Callers must therefore stay correct with two owners; `pipeline.folder` does, because every
 writer makes the same bytes. Design: ``docs/design/pipeline.md``.
 """
 

@@ -26,7 +26,7 @@ def is_dataset(folder: AnyPath) -> bool:
     try:
         return (
             (folder / "dataset.json").is_file()
-            or any((folder / ".work" / name).is_file() for name in ("listing.json", "sources.json"))
+            or (folder / ".work" / "run.json").is_file()
             or ((folder / "manifest.csv").is_file() and (folder / "shards").is_dir())
         )
     except OSError:  # a folder that may not be searched, above one that may

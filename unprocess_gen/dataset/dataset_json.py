@@ -1,28 +1,31 @@
-"""Define the records of ``dataset.json``, so that an edited file is reported as damage by every verb."""
+"""Read and write ``dataset.json``; its records are typed, so that every verb reports an edited file as damage."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 from typing import Any, Literal
 
 import msgspec
 
+from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.records import MAX_BYTES, Amount, Count, Digest, check_record, parse_json
 from unprocess_gen.dataset.shards import shard_name
 
 
-class SourceFacts(msgspec.Struct, frozen=True):
-    """Hold kind and place of the sources, and the file that lists them."""
+class SourceFacts(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Kind and place of the sources, and the file that lists them."""
 
     kind: Literal["folder", "synthetic", "raw"]
     root: str | None
     list: str | None = None
 
 
-class DarkFrameFacts(msgspec.Struct, frozen=True):
-    """Hold place and statistics of the dark frames of a run."""
+class DarkFrameFacts(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Place and statistics of the dark frames of a run."""
 
     root: str | None = None
     count: Count = 0
@@ -32,7 +35,7 @@ class DarkFrameFacts(msgspec.Struct, frozen=True):
 
 
 class ShardFacts(msgspec.Struct, frozen=True):
-    """Hold file, counts and digest of a shard; no file if all its sources failed."""
+    """File, counts and digest of a shard; no file if all its sources failed."""
 
     file: str | None
     pairs: Count
@@ -42,7 +45,7 @@ class ShardFacts(msgspec.Struct, frozen=True):
 
 
 class RunFacts(msgspec.Struct, frozen=True):
-    """Hold where and how a dataset was finished; a run in parts has no times."""
+    """Host and process that finished a dataset; a run in parts has no times."""
 
     host: str
     platform: str
@@ -50,11 +53,12 @@ class RunFacts(msgspec.Struct, frozen=True):
     n_jobs: int = 0
     seconds: Amount = 0.0
     shards_made: Count = 0
-    parts: Count = 0
+    parts: Count | None = None
+    max_failed: Count | None = None
 
 
 class DatasetFacts(msgspec.Struct, frozen=True):
-    """Hold the contents of a ``dataset.json`` that a verb reads; None is what a repair could not restore."""
+    """Contents of a ``dataset.json`` that a verb reads; None is what a repair could not restore."""
 
     format: Literal[1]
     fingerprint: Digest
@@ -114,3 +118,54 @@ def check_shard(number: int, entry: ShardFacts) -> None:
         raise ValueError(f"shards[{number}].file={entry.file[:40]!r}: expected null or {name}")
     if entry.file is not None and entry.sha256 is None:
         raise ValueError(f"shards[{number}].sha256=null: expected 64 hexadecimal digits")
+
+
+def dataset_facts(
+    config_yaml: str, manifest_sha256: str, entries: list[dict[str, Any]], facts: dict[str, Any]
+) -> dict[str, Any]:
+    """Contents of ``dataset.json``, including the text of ``config.yaml``, from which a repair restores it."""
+    config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
+    return {
+        "format": FORMAT,
+        "fingerprint": fingerprint(config_sha256, manifest_sha256),
+        "manifest_sha256": manifest_sha256,
+        "config_sha256": config_sha256,
+        "self_test": "failed" if any("self_test" in entry for entry in entries) else "passed",
+        **facts,
+        "config": config_yaml,
+        "shards": entries,
+    }
+
+
+def fingerprint(config_sha256: str, manifest_sha256: str) -> str:
+    """Digest that identifies a dataset, from the digests of its config and of its manifest."""
+    return hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
+
+
+def dataset_text(facts: dict[str, Any]) -> str:
+    """Text of ``dataset.json``: the facts and, as the last key, the SHA-256 of the text without it."""
+    text = json.dumps(facts, indent=1) + "\n"
+    return f'{text[: -len(_END)]},\n "dataset_sha256": "{hashlib.sha256(text.encode()).hexdigest()}"{_END}'
+
+
+def read_dataset(path: AnyPath) -> dict[str, Any]:
+    """Read a ``dataset.json`` and check it against its own SHA-256; DamageError if it is damaged."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES} bytes")
+        content = path.read_bytes()
+        facts = parse_json(content)
+        check_format_of(path, facts)
+        facts.pop("dataset_sha256")
+        intact = dataset_text(facts).encode() == content
+        if intact:
+            check_dataset_json(facts)
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
+    if not intact:
+        raise DamageError(f"{path}: was changed: its SHA-256 differs from dataset_sha256")
+    return dict(facts)
+
+
+_END = "\n}\n"
+"""End of the text of a mapping. A digest is inserted there: serializing twice takes a fifth of a merge."""

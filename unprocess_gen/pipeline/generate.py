@@ -1,49 +1,58 @@
-"""Generate a dataset: list sources, split them into shards, run workers, commit shards, write the manifest.
+"""Generate a dataset: find the shards that are missing, make and commit them, and finish when none is missing.
 
-A shard is the unit of work, retry and commit:
-
-* `tasks`: the records that travel between coordinator and workers.
-* `executors.local`: starts worker processes; its docstring says what happens when one dies.
-* `executors.dask`: gives shards to the workers of a Dask cluster.
-* `worker`: makes one shard in a temporary file, commits it and reports counts.
-* `run_records`: what a run keeps until it is finished.
-* `workspace`: checks and locks the output folder; writes ``manifest.csv`` and ``dataset.json``.
-* `storage`: the files below ``out``.
-
-Shards are committed in any order; the finished dataset does not depend on it. Design: ``docs/design/pipeline.md``.
+`generate` does this for all shards, `make_part` for those of a part, `merge` finishes a run in parts. Read on in `run`
+(what a run is, how it begins), `executors` (processes that make shards), `worker` (make one, commit it) and `records`
+(a shard is done when its record exists). Design: ``docs/design/pipeline.md``.
 """
 
 from __future__ import annotations
 
-import math
-import os
+import hashlib
 import platform
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
 from unprocess_gen.config.schema import Config, replaced
-from unprocess_gen.config.serialization import dataset_yaml, source_kind
-from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
+from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
+from unprocess_gen.config.values import error_in_one_line
+from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
+from unprocess_gen.core.files import machine_errors
+from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.dataset.columns import columns_of
-from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
+from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text
+from unprocess_gen.dataset.manifest import header_text
+from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
-from unprocess_gen.pipeline.run import Run, resolve
+from unprocess_gen.pipeline.records import done_shards, read_records
+from unprocess_gen.pipeline.run import (
+    Run,
+    RunFile,
+    begin,
+    check_begun,
+    check_finished,
+    check_settings,
+    part_of_run,
+    read_run,
+    resolve,
+)
 from unprocess_gen.pipeline.sizes import check_free_space
-from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, RunContext, ShardReport, ShardTask, StageTimes, Tally
-from unprocess_gen.pipeline.workspace import Workspace
+from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, Made, ShardReport, StageTimes, Tally
 from unprocess_gen.sources.raw.decode import decoder_versions
 
 PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
 """Packages whose versions ``dataset.json`` records."""
 
+RANGES_SHOWN = 20
+"""Ranges of missing shards that an error names."""
+
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Hold the outcome of a run.
+    """The outcome of a run.
 
     Attributes
     ----------
@@ -82,10 +91,10 @@ class Summary:
     filtered: int = 0
 
     @classmethod
-    def of(cls, out: str, facts: dict[str, Any], started: float, **made: Any) -> Summary:
+    def of(cls, out: AnyPath, facts: dict[str, Any], started: float, **made: Any) -> Summary:
         """Describe a dataset by its ``dataset.json``; ``made`` are the fields about this run, which began at a time."""
         return cls(
-            out=any_path(out),
+            out=out,
             pairs=facts["pairs"],
             failed=facts["failed"],
             sites=facts["sites"],
@@ -154,152 +163,173 @@ def generate(config: Config, label: str = "") -> Summary:
     """
     started = time.monotonic()
     run = resolve(config)
-    made, facts = Made(), None
-    with Workspace(config.out, dataset_yaml(run.config)) as workspace:
-        workspace.open()
-        if not workspace.is_complete():
-            todo = begin(workspace, run)
-            with Progress(len(run.sources), len(run.sources) - images_in(todo), label) as progress:
-                for warning in run.warnings():
-                    progress.warn(warning)
-                execute = EXECUTORS[config.executor.kind] if todo else execute_locally
-                made = execute(workspace, run, todo, progress)
-            if not workspace.is_complete():  # a concurrent run, if the lock is not honoured, may have finished it
-                facts = _finish(workspace, run, made, started)
-        facts = facts or workspace.check_complete(run.sources)
-    return Summary.of(config.out, facts, started, made=made.rows, times=made.times, unmatched=run.listing.unmatched)
+    with OutFolder(config.out) as folder:
+        folder.open()
+        facts = folder.finished()
+        if facts is None:
+            folder.lock()
+            check_begun(folder, run)
+            known, made = _make(folder, run, range(run.shards), None, label)
+            facts = folder.finished()  # by a concurrent run, where there is no lock
+        if facts is None:
+            process = {
+                "seconds": round(time.monotonic() - started, 3),
+                **{stage: round(stage_s, 3) for stage, stage_s in asdict(made.times).items()},
+                "executor": config.executor.kind,
+                "n_jobs": made.n_jobs,
+                "shards_made": made.shards,
+                "max_failed": config.source.max_failed,
+            }
+            facts = _finish(folder, known, columns_of(run.config), run.file(None).facts(), process)
+        else:
+            made = Made()
+            check_finished(folder, run, facts)
+    return Summary.of(folder.path, facts, started, made=made.rows, times=made.times, unmatched=run.listing.unmatched)
 
 
-def begin(workspace: Workspace, run: Run) -> list[ShardTask]:
-    """Check the opened folder and begin or continue the dataset in it; return the shards that are not committed."""
-    workspace.check_begun(run.sources, run.config.source.place)
-    tasks = run.tasks()
-    done = workspace.records.committed(range(len(tasks)))
-    todo = [task for task in tasks if task.shard not in done]
-    if run.config.check_disk:
-        check_free_space(run.config, [source for task in todo for source in task.sources])
-    workspace.begin(run.sources, len(tasks))
-    return todo
+def make_part(config: Config, part: int, parts: int, label: str = "") -> Made | None:
+    """Make and commit the missing shards of part ``part`` of ``parts``; None if the dataset is finished.
 
-
-def images_in(tasks: Iterable[ShardTask]) -> int:
-    """Number of sources in shards."""
-    return sum(len(task.sources) for task in tasks)
-
-
-@dataclass(slots=True)
-class Made:
-    """Count what executors made: rows, shards, processor time of the stages, and workers."""
-
-    rows: int = 0
-    shards: int = 0
-    times: StageTimes = field(default_factory=StageTimes)
-    n_jobs: int = 1
-
-
-def execute_locally(workspace: Workspace, run: Run, todo: list[ShardTask], progress: Progress) -> Made:
-    """Make shards in worker processes of this machine."""
-    n_jobs = effective_jobs(run.config.n_jobs, len(todo))
-    context = RunContext(run.settings, str(workspace.storage.scratch), os.getpid(), core_to_spare=n_jobs < own_cores())
-    progress.watch(context)
-    return follow(run_tasks(context, todo, n_jobs), progress, n_jobs)
-
-
-def execute_on_dask(workspace: Workspace, run: Run, todo: list[ShardTask], progress: Progress) -> Made:
-    """Make shards on a Dask cluster."""
-    from unprocess_gen.pipeline.executors.dask import connected, make_shards
-
-    config = run.config
-    places = {"out": absolute_text(config.out), "noise.dark_frames": absolute_text(config.noise.dark_frames)}
-    places |= {"source.root": absolute_text(config.source.place)}
-    context = RunContext(PairSettings.read(replaced(config, places)), "", None)
-    with connected(config.executor, effective_jobs(config.n_jobs, len(todo))) as client:
-        made = follow(make_shards(client, context, todo), progress)
-        made.n_jobs = client.scheduler_info(n_workers=0)["n_workers"]
+    Raises as `generate`; also ConfigError if the run was begun by another version or with another number of parts.
+    """
+    with OutFolder(config.out) as folder:
+        folder.open()
+        if folder.finished() is not None:
+            check_settings(folder, dataset_yaml(PairSettings.read(config).config))
+            return None
+        run, shards = part_of_run(folder, config, part, parts)
+        _, made = _make(folder, run, shards, parts, ": ".join(filter(None, (label, f"part {part} of {parts}"))))
+        if folder.finished() is not None:  # another process made the part and merged
+            folder.remove_work()
         return made
 
 
-EXECUTORS: dict[str, Callable[[Workspace, Run, list[ShardTask], Progress], Made]] = {
-    "local": execute_locally,
-    "dask": execute_on_dask,
-}
-"""Function for each value of ``executor.kind``."""
+def merge(out: str) -> tuple[Summary, int]:
+    """Write manifest and ``dataset.json`` of a run whose parts are done; return also ``source.max_failed``.
+
+    ConfigError if no run has begun, MachineError if shards are missing, which the message names; nothing is written
+    then. LockedError if a run holds the folder.
+    """
+    started = time.monotonic()
+    with OutFolder(out) as folder:
+        facts = folder.finished()
+        if facts is not None:
+            summary = Summary.of(folder.path, facts, started)
+            max_failed = (facts["run"] or {}).get("max_failed")
+            return summary, sum(summary.failed.values()) if max_failed is None else max_failed
+        known = read_run(folder)
+        if known is None:
+            raise ConfigError(f"merge: {out}: no run has begun there; expected one; run gen-dataset part K/N first")
+        folder.lock()
+        try:
+            config, _ = parse_dataset_yaml(known.config)
+        except (ValueError, ConfigError) as error:
+            raise DamageError(f"{out}: its config cannot be read ({error_in_one_line(error)})") from error
+        config = replaced(config, {"source.root": known.source.root})
+        process = {"max_failed": known.max_failed} | ({"parts": known.parts} if known.parts else {})
+        facts = _finish(folder, known, columns_of(config), known.facts(), process)
+    summary = Summary.of(folder.path, facts, started)
+    return replace(summary, made=summary.rows), known.max_failed
 
 
-def follow(reports: Iterable[ShardReport], progress: Progress, n_jobs: int = 1) -> Made:
+def _make(folder: OutFolder, run: Run, shards: range, parts: int | None, label: str) -> tuple[RunFile, Made]:
+    """Make and commit those of some shards that are not done."""
+    if run.config.executor.kind == "dask":
+        from unprocess_gen.pipeline.executors.dask import make_shards
+    else:
+        from unprocess_gen.pipeline.executors.local import make_shards
+    done = done_shards(folder, shards)
+    todo = [run.task(shard) for shard in shards if shard not in done]
+    if run.config.check_disk:
+        check_free_space(run.config, [source for task in todo for source in task.sources])
+    known, made = begin(folder, run, parts), Made(done=len(done))
+    images = sum(len(task.sources) for task in todo)
+    total = images if parts else len(run.sources)
+    with machine_errors(folder.path, RESUME), Progress(total, total - images, label) as progress:
+        for warning in run.warnings():
+            progress.warn(warning)
+        if todo:
+            _follow(make_shards(folder, run.settings, todo, progress, made), progress, made)
+    return known, made
+
+
+def _follow(reports: Iterable[ShardReport], progress: Progress, made: Made) -> None:
     """Show the progress and warnings of committed shards, whose reports come in any order."""
-    made, shown = Made(n_jobs=n_jobs), 0
-    self_test = ""
+    shown, self_test = 0, ""
     for report in reports:
-        if report.killer is not None:
-            progress.warn(f"{report.killer}; run the same command again to retry it")
-        if report.log.self_test and not self_test:
-            self_test = report.log.self_test
+        for killer in report.killers:
+            progress.warn(f"{killer}: its worker died four times; run the same command again to retry it")
+        if report.self_test and not self_test:
+            self_test = report.self_test
             progress.warn(f"the self-test failed: {self_test}; continuing because of self_test=go_on")
-        for text in report.failures[: FAILURES_SHOWN - shown]:
+        for text in report.warnings[: FAILURES_SHOWN - shown]:
             progress.warn(text)
-        shown = min(FAILURES_SHOWN, shown + len(report.failures))
+        shown = min(FAILURES_SHOWN, shown + len(report.warnings))
         made.rows += report.rows
         made.shards += 1
-        made.times.add(report.log.times)
+        made.times.add(report.times)
         progress.advance(report.images, report.failed)
-    return made
 
 
-def _finish(workspace: Workspace, run: Run, made: Made, started: float) -> dict[str, Any]:
-    """Write manifest and ``dataset.json``; return the contents of the latter."""
-    facts = {
-        "seconds": round(time.monotonic() - started, 3),
-        **{stage: round(stage_s, 3) for stage, stage_s in asdict(made.times).items()},
-        "executor": run.config.executor.kind,
-        "n_jobs": made.n_jobs,
-        "shards_made": made.shards,
-    }
-    listing = run.listing
-    return workspace.finish(
-        len(run.tasks()),
-        columns_of(run.config),
-        lambda tally: dataset_json_facts(run.settings, listing.not_matched, listing.skipped_links, tally, facts),
+def _finish(
+    folder: OutFolder, run: RunFile, columns: Sequence[str], sources: dict[str, Any], process: dict[str, Any]
+) -> dict[str, Any]:
+    """Write ``manifest.csv``, then ``dataset.json``, whose contents are returned, with facts on sources and process.
+
+    If a row is provisional, ``.work`` is kept, so that the next run retries it. MachineError if shards are missing.
+    """
+    entries, missing, tally = list[dict[str, Any]](), list[int](), Tally()
+    with machine_errors(folder.path, RESUME):
+        manifest, digest = folder.scratch / "manifest.csv", hashlib.sha256()
+        with manifest.open("wb", buffering=2**20) as stream:
+
+            def add(text: bytes) -> None:
+                digest.update(text)
+                stream.write(text)
+
+            add(header_text(columns).encode())
+            for shard, record in enumerate(read_records(folder, range(run.shards))):
+                if record is None:
+                    missing.append(shard)
+                    continue
+                entries.append(record.entry)
+                tally.add(record.tally)
+                add(record.csv)
+        if missing:
+            raise _missing_error(folder, run, missing)
+        (folder / "manifest.csv").commit(manifest)
+        decoders = decoder_versions() if run.source.kind == "raw" else {}
+        versions = {package: version(package) for package in PACKAGES} | decoders
+        facts = tally.facts() | sources | {"run": process | _machine(), "versions": versions}
+        dataset = dataset_facts(run.config, digest.hexdigest(), entries, facts)
+        folder.write("dataset.json", dataset_text(dataset).encode())
+        if not any(entry.get("provisional") for entry in entries):
+            folder.remove_work()
+    return dataset
+
+
+def _missing_error(folder: OutFolder, run: RunFile, missing: Sequence[int]) -> MachineError:
+    """Name the missing shards of a run, and their parts if it has some."""
+    parts = sorted({shard % run.parts for shard in missing}) if run.parts else []
+    named = f"parts {_ranges(parts)} of {run.parts} are not done, with " if parts else ""
+    return MachineError(
+        f"merge: {folder}: {named}{len(missing)} of {run.shards} shards missing ({_ranges(missing)}); run "
+        f"gen-dataset part K/{run.parts or 'N'} with the same settings for each, then merge again; nothing was written"
     )
 
 
-def dataset_json_facts(
-    settings: PairSettings, not_matched: int, skipped_links: int, tally: Tally, run: dict[str, Any]
-) -> dict[str, Any]:
-    """Collect what ``dataset.json`` holds apart from digests and shards: counts, source, run and versions."""
-    config = settings.config
-    decoders = decoder_versions() if config.source.kind == "raw" else {}
-    return {
-        **tally.facts(),
-        "not_matched": not_matched,
-        "skipped_links": skipped_links,
-        "source": source_facts(config),
-        **_dark_facts(settings),
-        "run": run | machine(),
-        "versions": {package: version(package) for package in PACKAGES} | decoders,
-    }
+def _ranges(numbers: Sequence[int]) -> str:
+    """Numbers as ranges, as batch systems take them: ``3,7-9``; at most `RANGES_SHOWN`."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and runs[-1][1] == number - 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    texts = [str(first) if first == last else f"{first}-{last}" for first, last in runs[:RANGES_SHOWN]]
+    return ",".join(texts) + ", …" * (len(runs) > RANGES_SHOWN)
 
 
-def source_facts(config: Config) -> dict[str, Any]:
-    """Kind and places of the sources, for ``dataset.json`` only."""
-    facts = {"kind": source_kind(config), "root": absolute_text(config.source.place)}
-    file = absolute_text(config.source.list)
-    return facts if file is None else facts | {"list": file}
-
-
-def machine() -> dict[str, Any]:
+def _machine() -> dict[str, Any]:
     """Names of host, platform and Python version, for ``dataset.json`` only."""
     return {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
-
-
-def _dark_facts(settings: PairSettings) -> dict[str, Any]:
-    """Place, number, sizes and noise of the dark frames; the place alone if they cannot be read here."""
-    noise, dark_frames = settings.config.noise, settings.dark_frames
-    if noise.dark_frames is None:
-        return {}
-    facts: dict[str, Any] = {"root": absolute_text(noise.dark_frames)}
-    if dark_frames is not None:
-        sizes = {f"{frame.width}x{frame.height}" for frame in dark_frames.frames}
-        facts |= {"count": len(dark_frames.frames), "sizes": sorted(sizes)}
-        facts |= {"black_dn": dark_frames.black_dn, "std_dn": math.sqrt(dark_frames.variance_dn2)}
-    return {"dark_frames": facts}

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,18 +21,18 @@ from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, So
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import columns_of
-from unprocess_gen.dataset.dataset_json import check_format
+from unprocess_gen.dataset.dataset_json import check_format, dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import has_frames, read_rows, write_rows
 from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, check_members, shard_name
+from unprocess_gen.pipeline.folder import OutFolder
+from unprocess_gen.pipeline.records import tar_name
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, source_changes
 from unprocess_gen.pipeline.run import resolve
-from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask, Tally
 from unprocess_gen.pipeline.verify import expected_samples, shard_rows
 from unprocess_gen.pipeline.worker import make_shard
-from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, fingerprint, read_dataset
 
 LEAST_PROOF = 100
 """Characters of a ``dataset.json`` that may contain a digest of another file."""
@@ -57,8 +55,8 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
     proves what they were, ConfigError if sources are needed and ``root`` is None, SourceChangedError if the manifest is
     damaged and a source was changed or deleted, MachineError if a file cannot be read or written.
     """
-    with closing(Storage(folder)) as storage, machine_errors(folder):
-        storage.hold()
+    with OutFolder(folder) as place, machine_errors(folder):
+        place.lock()
         manifest, dataset = folder / "manifest.csv", folder / "dataset.json"
         check_format(folder)
         try:
@@ -67,18 +65,18 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
             facts = {}
             _check_proof(folder)
         if facts and _digest(folder / "config.yaml") != facts["config_sha256"]:
-            storage.write("config.yaml", facts["config"])
+            place.write("config.yaml", facts["config"].encode())
             yield RepairStep("config.yaml: restored from dataset.json")
         config, kind = _read_config(folder, root)
         if facts and _digest(manifest) != facts["manifest_sha256"]:
-            _restore_manifest(storage, replaced(config, {"noise.dark_frames": dark_frames}), facts["manifest_sha256"])
+            _restore_manifest(place, replaced(config, {"noise.dark_frames": dark_frames}), facts["manifest_sha256"])
             yield RepairStep("manifest.csv: regenerated from the settings and the sources")
         regenerator = PairRegenerator(root, dark_frames)
         for number, rows in shard_rows(manifest):
             if not _is_intact(folder, number, rows):
-                yield _regenerate_shard(storage, number, [*filter(has_frames, rows)], regenerator)
+                yield _regenerate_shard(place, number, [*filter(has_frames, rows)], regenerator)
         if not facts:
-            storage.write("dataset.json", _dataset_json(folder, {"kind": kind, "root": absolute_text(root)}))
+            place.write("dataset.json", _dataset_json(folder, {"kind": kind, "root": absolute_text(root)}).encode())
             yield RepairStep("dataset.json: rewritten; host, time and versions of the run are lost")
 
 
@@ -112,22 +110,22 @@ def _check_proof(folder: Path) -> None:
         raise DamageError(f"{folder}: dataset.json and another file are damaged; {AGAIN}")
 
 
-def _restore_manifest(storage: Storage, config: Config, sha256: str) -> None:
+def _restore_manifest(place: OutFolder, config: Config, sha256: str) -> None:
     """Regenerate every row, and write them as the manifest if they have its digest."""
-    run, part = resolve(config), storage.scratch / "manifest.csv"
-    context = RunContext(run.settings, str(storage.scratch), os.getpid())
+    run, part = resolve(config), place.scratch / "manifest.csv"
+    context = RunContext(run.settings, str(place.scratch), os.getpid())
     with part.open("w", encoding="utf-8", newline="") as stream:
-        rows = (row for task in run.tasks() for row in _rows_of_shard(context, task))
+        rows = (row for shard in range(run.shards) for row in _rows_of_shard(context, run.task(shard)))
         write_rows(stream, rows, columns_of(run.config))
     if file_sha256(part) != sha256:
         raise SourceChangedError(
-            f"{storage.out}/manifest.csv: the regenerated one has another SHA-256: a source was changed, added or "
+            f"{place}/manifest.csv: the regenerated one has another SHA-256: a source was changed, added or "
             f"deleted; {ADVICE}"
         )
-    (storage / "manifest.csv").commit(part)
+    (place / "manifest.csv").commit(part)
 
 
-def _rows_of_shard(context: RunContext, task: ShardTask) -> tuple[Row, ...]:
+def _rows_of_shard(context: RunContext, task: ShardTask) -> list[Row]:
     result = make_shard(context, task)
     if result.path is not None:
         Path(result.path).unlink()
@@ -136,13 +134,13 @@ def _rows_of_shard(context: RunContext, task: ShardTask) -> tuple[Row, ...]:
 
 def _is_intact(folder: Path, number: int, rows: Sequence[Row]) -> bool:
     """Check whether a shard contains its rows; one without pairs has no file."""
-    path, pairs = folder / "shards" / shard_name(number), [*filter(has_frames, rows)]
+    path, pairs = folder / tar_name(number), [*filter(has_frames, rows)]
     return not pairs or (path.is_file() and not any(check_members(path, expected_samples(pairs))))
 
 
-def _regenerate_shard(storage: Storage, number: int, rows: Sequence[Row], regenerator: PairRegenerator) -> RepairStep:
+def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regenerator: PairRegenerator) -> RepairStep:
     """Regenerate a shard; an error becomes a step, so that other shards are repaired nevertheless."""
-    name, part = f"shards/{shard_name(number)}", storage.scratch / shard_name(number)
+    name, part = tar_name(number), place.scratch / shard_name(number)
     try:
         with ShardWriter(part) as writer:
             for sample, sample_rows in zip(expected_samples(rows), group_by_sample(rows), strict=True):
@@ -156,8 +154,8 @@ def _regenerate_shard(storage: Storage, number: int, rows: Sequence[Row], regene
     except UnprocessGenError as error:
         exit_code = error.exit_code if isinstance(error, MachineError) else DamageError.exit_code
         return RepairStep(f"{name}: cannot be regenerated: {error}", exit_code)
-    (storage / "shards").mkdir(exist_ok=True)
-    (storage / name).commit(part)
+    (place / "shards").mkdir(exist_ok=True)
+    (place / name).commit(part)
     return RepairStep(f"{name}: regenerated")
 
 
@@ -165,11 +163,10 @@ def _dataset_json(folder: Path, source: dict[str, Any]) -> str:
     """Describe the other files of a dataset as ``dataset.json`` does."""
     manifest, entries = folder / "manifest.csv", []
     for number, rows in shard_rows(manifest):
-        path = folder / "shards" / shard_name(number)
-        killer = "provisional" if all(row["reason"] == "worker_died" for row in rows) else None
-        result = ShardResult(number, None, 0, None, tuple(rows), killer)
+        path = folder / tar_name(number)
+        result = ShardResult(number, rows=rows)
         if path.is_file():
-            result = replace(result, path=str(path), bytes=path.stat().st_size, sha256=file_sha256(path))
+            result.path, result.bytes, result.sha256 = str(path), path.stat().st_size, file_sha256(path)
         entries.append(result.entry())
     lost = dict.fromkeys(("not_matched", "skipped_links", "run", "versions"))
     facts = Tally.of(read_rows(manifest)).facts() | lost | {"source": source}

@@ -1,26 +1,86 @@
-"""Resolve a config to a run: list its sources, open its dark frames, and divide it into shards.
+"""A run is a list of shards: its config, its sources, and the files with which it begins.
 
-A config is complete after `resolve`; no later step changes it.
+    out/.work/listing.jsonl    the sources as the first process listed them, a line of JSON each
+    out/.work/run.json         config, version, shards, parts, and what the listing left out
+    out/config.yaml            the config again, by which a user recognises the folder
+
+They are created in this order and never replaced. Whoever comes first creates them; others compare what they have with
+what is recorded. A part reads the listing instead of making its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import hashlib
+import itertools
+import json
+import math
+import re
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from importlib.metadata import version
+from typing import Any
+
+import msgspec
+import numpy as np
+from yaml import YAMLError
 
 from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import dataset_yaml, differences, source_kind
+from unprocess_gen.config.values import error_in_one_line
+from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.paths import AnyPath, absolute_text
+from unprocess_gen.core.records import Count, Digest, check_record, parse_record
 from unprocess_gen.core.source import Source
+from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
+from unprocess_gen.dataset.keys import group_by_image
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline.deaths import DEATHS
+from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.pipeline.records import tar_name
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.sensor_levels import sensor_warning
 from unprocess_gen.sources.listing import Listing, list_photographs
+from unprocess_gen.sources.names import decode_name
+
+RUN, LISTING = f"{WORK}/run.json", f"{WORK}/listing.jsonl"
+
+MOST_BYTES = 2**35
+"""Largest listing that is read: a hundred million sources."""
+
+DIFFERENCES_SHOWN = 3
+"""Differences named in an error; the others are counted."""
 
 
-@dataclass(frozen=True, slots=True)
+class RunFile(msgspec.Struct, frozen=True):
+    """Facts on which all processes of a run agree; ``parts`` is None if it was not begun by a part."""
+
+    version: str
+    config: str
+    sources: Count
+    shards: Count
+    parts: Count | None
+    listing_sha256: Digest
+    max_failed: Count
+    not_matched: Count
+    skipped_links: Count
+    source: SourceFacts
+    dark_frames: DarkFrameFacts | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Facts about the sources, as ``dataset.json`` has them."""
+        names = "not_matched", "skipped_links", "source", "dark_frames"
+        facts: dict[str, Any] = msgspec.to_builtins({name: getattr(self, name) for name in names})
+        return {name: value for name, value in facts.items() if value is not None}
+
+
+@dataclass(frozen=True)
 class Run:
-    """Hold the settings of a run and its sources."""
+    """The settings of a run and its sources; shard s has those from index s·N on, N = ``output.pairs_per_shard``."""
 
     settings: PairSettings
     listing: Listing
@@ -31,31 +91,320 @@ class Run:
         return self.settings.config
 
     @property
-    def sources(self) -> tuple[Source, ...]:
+    def sources(self) -> Sequence[Source]:
         """All sources, in the order of the manifest."""
         return self.listing.sources
 
-    def tasks(self) -> list[ShardTask]:
-        """Divide the sources into shards."""
-        return shard_tasks(self.sources, self.config.output.pairs_per_shard)
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-len(self.sources) // self.config.output.pairs_per_shard)
+
+    def task(self, shard: int) -> ShardTask:
+        """The work of a shard."""
+        first = shard * self.config.output.pairs_per_shard
+        return ShardTask(shard, tuple(self.sources[first : first + self.config.output.pairs_per_shard]))
 
     def warnings(self) -> tuple[str, ...]:
-        """Collect what the user should know before the run begins, a sentence each."""
+        """Sentences that the user should read before the run begins."""
         checks = body_sentence, dark_scene_warning, sensor_warning
         warnings = *self.listing.warnings, *(check(self.config) for check in checks)
         return tuple(dict.fromkeys(filter(None, warnings)))
+
+    @cached_property
+    def config_yaml(self) -> str:
+        """Text of the dataset's ``config.yaml``."""
+        return dataset_yaml(self.config)
+
+    @cached_property
+    def listing_text(self) -> bytes:
+        """Lines of `LISTING`."""
+        return b"".join(msgspec.json.encode(_values(source)) + b"\n" for source in self.sources)
+
+    def file(self, parts: int | None) -> RunFile:
+        """Facts on which all processes of the run must agree, as this process finds them."""
+        config = self.config
+        place, listed = absolute_text(config.source.place), absolute_text(config.source.list)
+        return RunFile(
+            version=version("unprocess_gen"),
+            config=self.config_yaml,
+            sources=len(self.sources),
+            shards=self.shards,
+            parts=parts,
+            listing_sha256=hashlib.sha256(self.listing_text).hexdigest(),
+            max_failed=config.source.max_failed,
+            not_matched=self.listing.not_matched,
+            skipped_links=self.listing.skipped_links,
+            source=check_record({"kind": source_kind(config), "root": place, "list": listed}, SourceFacts),
+            dark_frames=_dark_facts(self.settings),
+        )
 
 
 def resolve(config: Config) -> Run:
     """List the sources of a validated config and complete it with the digests of dark frames.
 
-    Raises ConfigError if sources or dark frames cannot be used, SourceChangedError if recorded dark frames changed.
+    ConfigError if sources or dark frames cannot be used, SourceChangedError if recorded dark frames changed.
     """
     listing = list_photographs(config.source)
     return Run(PairSettings.read(config), listing)
 
 
-def shard_tasks(sources: Sequence[Source], per_shard: int) -> list[ShardTask]:
-    """Split the listing into shards: shard s begins at source s·N, N = ``per_shard``."""
-    starts = range(0, len(sources), per_shard)
-    return [ShardTask(shard, tuple(sources[start : start + per_shard])) for shard, start in enumerate(starts)]
+def _dark_facts(settings: PairSettings) -> DarkFrameFacts | None:
+    """Place, number, sizes and noise of the dark frames."""
+    root, dark_frames = settings.config.noise.dark_frames, settings.dark_frames
+    if root is None or dark_frames is None:
+        return None
+    sizes = sorted({f"{frame.width}x{frame.height}" for frame in dark_frames.frames})
+    std_dn = math.sqrt(dark_frames.variance_dn2)
+    return DarkFrameFacts(absolute_text(root), len(dark_frames.frames), sizes, dark_frames.black_dn, std_dn)
+
+
+# ----------------------------------------------------------------------------------------------------------- listings
+
+_FIELDS = tuple(field.name for field in fields(Source) if field.name not in ("index", "path"))
+_DEFAULTS = tuple(field.default for field in fields(Source) if field.name not in ("index", "path"))
+
+
+class RecordedSources(Sequence[Source]):
+    """Sources of a recorded listing, each parsed when it is taken: a part of a million takes only its own."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        letters, size = np.frombuffer(content, np.uint8), 2**24
+        starts = range(0, len(content), size)
+        self._ends = np.concatenate([np.flatnonzero(letters[i : i + size] == ord("\n")) + i for i in starts])
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    def __getitem__(self, item: Any) -> Any:
+        if isinstance(item, slice):
+            return tuple(self[index] for index in range(*item.indices(len(self))))
+        start = self._ends[item - 1] + 1 if item else 0
+        values = parse_record(self._content[start : self._ends[item]], list[Any])
+        source = dict(zip(_FIELDS, values, strict=False))
+        return check_record({"index": item, "path": decode_name(str(source["name"])), **source}, Source)
+
+
+def _values(source: Source) -> list[Any]:
+    """Values of a source, without those at the end that are defaults."""
+    values = [getattr(source, name) for name in _FIELDS]
+    while values[-1] == _DEFAULTS[len(values) - 1]:
+        values.pop()
+    return values
+
+
+# -------------------------------------------------------------------------------------------------------------- begun
+
+
+def read_run(folder: OutFolder) -> RunFile | None:
+    """Read what a run has recorded; None if none has begun."""
+    return folder.record(RUN, lambda content: parse_record(content, RunFile))
+
+
+def read_listing(folder: OutFolder, known: RunFile) -> RecordedSources | None:
+    """Read the listing of a run, None if it was lost; MachineError if it was edited."""
+
+    def parse(content: bytes) -> RecordedSources:
+        if hashlib.sha256(content).hexdigest() != known.listing_sha256:
+            raise ValueError(f"its SHA-256 differs from that in {RUN}")
+        return RecordedSources(content)
+
+    return folder.record(LISTING, parse, MOST_BYTES)
+
+
+def part_of_run(folder: OutFolder, config: Config, part: int, parts: int) -> tuple[Run, range]:
+    """Find the run of a part, whose listing is read if there is one, and the shards of the part.
+
+    ConfigError if the run was begun with other settings, parts, or by another version, or has fewer shards than parts.
+    """
+    settings, known = PairSettings.read(config), read_run(folder)
+    recorded = None
+    if known is not None:
+        check_settings(folder, dataset_yaml(settings.config), config.source.place)
+        _check_parts(folder, known, part, parts)
+        recorded = read_listing(folder, known)
+    if known is None or recorded is None:
+        run = Run(settings, list_photographs(config.source))
+    else:
+        run = Run(settings, Listing(recorded, known.skipped_links, {"": known.not_matched}))
+    if parts > run.shards:
+        raise ConfigError(
+            f"part {part}/{parts}: this dataset has {run.shards} shard{'s' * (run.shards != 1)}; expected N from 1 to "
+            f"{run.shards}; lower N or output.pairs_per_shard"
+        )
+    return run, range(part, run.shards, parts)
+
+
+def _check_parts(folder: OutFolder, known: RunFile, part: int, parts: int) -> None:
+    """Raise ConfigError if a run was begun by another version, or with another number of parts."""
+    own = version("unprocess_gen")
+    if known.version != own:
+        raise ConfigError(
+            f"out={folder}: was begun by unprocess_gen {known.version}, this is {own}; expected the same version; "
+            "install it, or choose another out"
+        )
+    if known.parts not in (None, parts):
+        raise ConfigError(
+            f"part {part}/{parts}: {folder} was begun with {known.parts} parts; expected K/{known.parts}; choose "
+            "another out"
+        )
+
+
+def check_begun(folder: OutFolder, run: Run) -> None:
+    """Raise ConfigError if ``out`` was begun with other settings or sources; name the differences."""
+    check_settings(folder, run.config_yaml, run.config.source.place)
+    known = read_run(folder)
+    if known is not None and known.listing_sha256 != hashlib.sha256(run.listing_text).hexdigest():
+        recorded = read_listing(folder, known) or ()
+        _check_sources(folder, lambda: iter(recorded), run.sources, _is_listed_alike)
+
+
+def begin(folder: OutFolder, run: Run, parts: int | None = None) -> RunFile:
+    """Record a run that has been checked, unless another process has; return the record.
+
+    ConfigError if the folder cannot be written, or another process has begun another run meanwhile; MachineError if
+    the disk is full.
+    """
+    try:
+        known = read_run(folder)
+        if known is None or not (folder / LISTING).is_listed():
+            known = _record(folder, run, parts)
+        if not folder.create("config.yaml", known.config.encode()):
+            check_settings(folder, run.config_yaml, run.config.source.place)
+        for name in ("shards", DEATHS):
+            (folder / name).mkdir(exist_ok=True)
+        folder.delete_unfinished()
+        for name in sorted((folder / "shards").entries()):
+            match = re.fullmatch(r"shard-(\d{5,})\.tar", name)
+            if match is None or int(match[1]) >= known.shards:
+                raise ConfigError(
+                    f"out={folder}: unexpected file {folder}/shards/{name}; expected only committed shards; remove it "
+                    "or choose another out"
+                )
+        _ = folder.scratch
+    except OSError as error:
+        raise folder.cannot_write(error) from error
+    return known
+
+
+def _record(folder: OutFolder, run: Run, parts: int | None) -> RunFile:
+    """Create listing and run.json; where another process was first, equal ones are used."""
+    own, other = (
+        run.file(parts),
+        ConfigError(
+            f"out={folder}: was begun with other sources ({LISTING} differs); choose another out, or remove it"
+        ),
+    )
+    if not folder.create(LISTING, run.listing_text) and folder.read(LISTING, MOST_BYTES) != run.listing_text:
+        raise other
+    folder.create(RUN, json.dumps(msgspec.to_builtins(own), indent=1).encode() + b"\n")
+    known = read_run(folder) or own
+    check_settings(folder, run.config_yaml, run.config.source.place)
+    if known.listing_sha256 != own.listing_sha256:
+        raise other
+    return known
+
+
+def check_finished(folder: OutFolder, run: Run, facts: dict[str, Any]) -> None:
+    """Raise ConfigError if a dataset was made from other settings or sources, DamageError if a tar has another size."""
+    if (folder / "config.yaml").size() is None:
+        raise DamageError(
+            f"{folder}/config.yaml: is missing from a finished dataset; gen-dataset verify {folder} --repair restores "
+            "it"
+        )
+    check_settings(folder, run.config_yaml)
+    _check_sources(folder, partial(_sources_of_rows, folder / "manifest.csv"), run.sources, _is_alike)
+    sizes = (folder / "shards").entries()
+    for shard, entry in enumerate(facts["shards"]):
+        size = sizes.get(tar_name(shard).partition("/")[2])
+        if entry["file"] is not None and size != entry["bytes"]:
+            problem = "is missing" if size is None else f"has {size} bytes"
+            raise DamageError(
+                f"{folder}/{entry['file']}: {problem}, expected {entry['bytes']} bytes; gen-dataset verify {folder} "
+                "--repair restores it"
+            )
+
+
+def check_settings(folder: OutFolder, config_yaml: str, place: str | None = None) -> None:
+    """Raise ConfigError if ``out`` was begun with another ``config.yaml``; ``place`` is that of the sources."""
+    known = read_run(folder)
+    differing: list[str] = []
+    try:
+        if known is not None and known.config != config_yaml:
+            differing = differences(config_yaml, known.config)
+        if not differing and (folder / "config.yaml").size() is not None:
+            differing = differences(config_yaml, folder.read("config.yaml").decode())
+    except (ValueError, YAMLError) as error:
+        raise DamageError(
+            f"{folder}/config.yaml: cannot be read ({error_in_one_line(error)}); choose another out"
+        ) from error
+    if differing:
+        remedy = "remove it"
+        if folder.finished() is None:
+            sources = f" source.root={shlex.quote(place)}" if isinstance(place, str) else ""
+            out = shlex.quote(str(folder))
+            remedy = f"finish it with its own settings: gen-dataset again {out} out={out}{sources}"
+        raise ConfigError(
+            f"out={folder}: was begun with other settings: {_first(differing)}; choose another out, or {remedy}"
+        )
+
+
+def _check_sources(
+    folder: OutFolder,
+    known: Callable[[], Iterator[Source]],
+    sources: Sequence[Source],
+    same: Callable[[Source, Source], bool],
+) -> None:
+    """Raise ConfigError if the sources are not those that are known; name the differences.
+
+    Both are in the order of the listing, so equal ones are compared without holding the known ones: a million take
+    0.4 GB.
+    """
+    pairs = itertools.zip_longest(known(), sources)
+    if all(old and new and old.name == new.name and same(old, new) for old, new in pairs):
+        return
+    files, listed = ({source.name: source for source in side} for side in (known(), sources))
+    changes = (_change(name, files.get(name), listed.get(name), same) for name in listed | files)
+    differing = [change for change in changes if change]
+    if differing:
+        raise ConfigError(
+            f"out={folder}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
+        )
+
+
+def _sources_of_rows(manifest: AnyPath) -> Iterator[Source]:
+    """Yield the source of every image, with name, size and digest only."""
+    for index, rows in enumerate(group_by_image(read_rows(manifest))):
+        size, name = rows[0]["source_bytes"], str(rows[0]["source"])
+        sha256 = str(rows[0]["source_sha256"])
+        yield Source(index, name, name, size if isinstance(size, int) else None, sha256=sha256)
+
+
+def _change(name: str, old: Source | None, new: Source | None, same: Callable[[Source, Source], bool]) -> str:
+    """Describe how a source differs from the known file of its name; empty if it does not."""
+    if old is None or new is None:
+        return f"{name} is new" if old is None else f"{name} was deleted"
+    if new.size_bytes != old.size_bytes:
+        return f"{name} has {new.size_bytes} bytes, had {old.size_bytes}"
+    return "" if same(old, new) else f"{name} has other bytes than it had"
+
+
+def _is_alike(old: Source, new: Source) -> bool:
+    """Check whether a source has the size of the one in the manifest, and its digest if the listing hashed it."""
+    return new.size_bytes == old.size_bytes and (not old.sha256 or new.sha256 in (None, old.sha256))
+
+
+def _is_listed_alike(old: Source, new: Source) -> bool:
+    """Check whether a source was listed before with the same size, digest and ETag.
+
+    A listing hashes the files that could be identical. If one of them has changed, another one can have another number
+    among identical files, and so other noise.
+    """
+    same_etag = not old.etag or new.etag in (None, old.etag)
+    return (new.size_bytes, new.sha256) == (old.size_bytes, old.sha256) and same_etag
+
+
+def _first(differing: Sequence[str]) -> str:
+    rest = len(differing) - DIFFERENCES_SHOWN
+    return "; ".join(itertools.islice(differing, DIFFERENCES_SHOWN)) + (f"; and {rest} more" if rest > 0 else "")

@@ -1,4 +1,4 @@
-"""Define what a coordinator and its workers exchange: context of a run; task, result, report and counts of a shard."""
+"""Records that a coordinator and its workers exchange: context of a run; task, result, report and counts of a shard."""
 
 from __future__ import annotations
 
@@ -26,13 +26,7 @@ FAILURES_SHOWN = 3
 
 @dataclass(slots=True)
 class StageTimes:
-    """Add up the processor time of the thread that makes pairs.
-
-    Attributes
-    ----------
-    decode_s, simulate_s : float
-        Seconds to read and decode sources, and to plan and simulate pairs.
-    """
+    """Processor time of the thread that makes pairs: to read and decode sources, and to plan and simulate pairs."""
 
     decode_s: float = 0.0
     simulate_s: float = 0.0
@@ -64,53 +58,17 @@ class StageTimes:
 
 
 @dataclass(frozen=True, slots=True)
-class ShardLog:
-    """Hold what a worker notes while it makes a shard.
-
-    Attributes
-    ----------
-    failures : dict of str to None
-        Failures of the self-test, each once, if ``self_test=go_on`` accepts them.
-    times : StageTimes
-        Processor time of the stages.
-    notes : list of str
-        Warnings about sources.
-    """
-
-    failures: dict[str, None] = field(default_factory=dict)
-    times: StageTimes = field(default_factory=StageTimes)
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def self_test(self) -> str | None:
-        """Failures of the self-test in one line, None without any."""
-        return "; ".join(self.failures) or None
-
-
-@dataclass(frozen=True, slots=True)
 class RunContext:
-    """Hold what all tasks of a run share.
+    """Settings and places that all tasks of a run share.
 
-    Attributes
-    ----------
-    settings : PairSettings
-        The settings; ``config.out`` is where shards are committed.
-    scratch : str
-        Local folder for unfinished files.
-    coordinator_pid : int or None
-        Process that started the workers, with which they end; None if they end on their own.
-    core_to_spare : bool
-        Whether each worker hashes and writes in a second thread (more cores than workers).
-    counts_deaths : bool
-        Whether the deaths of workers at a shard are counted below ``out`` (`run_records.Deaths`), because nothing else
-        sees them.
+    ``scratch`` is a local folder for unfinished files. Workers end with the process ``coordinator_pid``, unless it is
+    None. With ``core_to_spare``, each worker hashes and writes in a second thread.
     """
 
     settings: PairSettings
     scratch: str
     coordinator_pid: int | None
     core_to_spare: bool = False
-    counts_deaths: bool = False
 
     @property
     def config(self) -> Config:
@@ -122,8 +80,12 @@ class RunContext:
         """The file that a worker creates before it compiles kernels."""
         return Path(self.scratch) / "compiling"
 
+    def busy_path(self, shard: int) -> Path:
+        """The file that contains the index of the source in progress while a shard is made."""
+        return Path(self.scratch) / f"{shard}.busy"
+
     def images_in_progress(self) -> int:
-        """Count the images that workers have finished in shards that are not committed."""
+        """Number of images that workers have finished in shards that are not committed."""
         per_shard, count = self.config.output.pairs_per_shard, 0
         with suppress(OSError):  # the run has ended and deleted the folder
             for busy in Path(self.scratch).glob("*.busy"):
@@ -134,59 +96,47 @@ class RunContext:
 
 @dataclass(frozen=True, slots=True)
 class ShardTask:
-    """Hold the work of one shard: its number and its sources."""
+    """The work of one shard: its number and its sources."""
 
     shard: int
     sources: tuple[Source, ...]
 
-    def busy_path(self, context: RunContext) -> Path:
-        """Return the file that contains the index of the source in progress; it exists while the shard is made."""
-        return Path(context.scratch) / f"{self.shard}.busy"
 
-    def busy_source(self, context: RunContext) -> Source | None:
-        """Return the source at which the last worker of this shard ended, None if it was at none."""
-        try:
-            index = self.busy_path(context).read_text()
-        except OSError:
-            return None
-        return next((source for source in self.sources if str(source.index) == index), None)
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ShardResult:
-    """Hold a finished shard: its temporary file and its rows.
+    """A shard while it is made, and when it is finished.
 
     Attributes
     ----------
-    shard : int
-        Number of the shard.
     path : str or None
-        Temporary file; None if every source failed, because a shard without pairs has no file.
-    bytes : int
-        Size of the file; 0 without one.
-    sha256 : str or None
-        Hex digest of the file.
-    rows : tuple of Row
+        Temporary file; None without pairs, because such a shard has no file.
+    bytes, sha256
+        Size and hex digest of the file; 0 and None without one.
+    rows : list of Row
         Manifest rows, in source order.
-    killer : str or None
-        Source at which workers died, and how often. The rows are then provisional and there is no file.
-    log : ShardLog
-        What the worker noted.
+    killers : list of Source
+        Sources at which workers died; their rows are provisional.
+    self_test : dict of str to None
+        Failures of the self-test, each once, if ``self_test=go_on`` accepts them.
+    notes : list of str
+        Warnings about sources.
     """
 
     shard: int
-    path: str | None
-    bytes: int
-    sha256: str | None
-    rows: tuple[Row, ...]
-    killer: str | None = None
-    log: ShardLog = field(default_factory=ShardLog)
+    path: str | None = None
+    bytes: int = 0
+    sha256: str | None = None
+    rows: list[Row] = field(default_factory=list)
+    killers: list[Source] = field(default_factory=list)
+    self_test: dict[str, None] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    times: StageTimes = field(default_factory=StageTimes)
 
     def entry(self) -> dict[str, Any]:
-        """Return the shard's entry in ``dataset.json``."""
+        """Entry of the shard in ``dataset.json``."""
         return {
-            **({"provisional": True} if self.killer else {}),
-            **({"self_test": self.log.self_test} if self.log.self_test else {}),
+            **({"provisional": True} if any(row["reason"] == "worker_died" for row in self.rows) else {}),
+            **({"self_test": "; ".join(self.self_test)} if self.self_test else {}),
             "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
             "pairs": sum(row["status"] == "ok" for row in self.rows),
             "failed": sum(row["status"] == "failed" for row in self.rows),
@@ -198,35 +148,37 @@ class ShardResult:
         """Describe the shard for the coordinator."""
         images = [rows[0] for rows in group_by_image(self.rows)]
         failed = [row for row in images if row["status"] == "failed"]
-        details = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in failed[:FAILURES_SHOWN]]
-        failures = () if self.killer else (*details, *self.log.notes[:FAILURES_SHOWN])
-        counts = len(images), len(failed), len(self.rows)
-        return ShardReport(self.shard, *counts, self.killer, self.log, failures)
+        shown = [row for row in failed if row["reason"] != "worker_died"][:FAILURES_SHOWN]
+        warnings = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in shown]
+        return ShardReport(
+            self.shard, len(images), len(failed), len(self.rows), self.times, "; ".join(self.self_test),
+            tuple(source.name for source in self.killers), (*warnings, *self.notes[:FAILURES_SHOWN]),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class ShardReport:
-    """Describe a committed shard.
-
-    Attributes
-    ----------
-    shard : int
-        Number of the shard.
-    images, failed, rows : int
-        Number of its sources, of those that failed, and of its rows.
-    killer, log
-        As in `ShardResult`.
-    failures : tuple of str
-        The first sources that failed, and why.
-    """
+    """A committed shard: numbers of its sources, of those that failed, and of its rows; and warnings for the user."""
 
     shard: int
     images: int
     failed: int
     rows: int
-    killer: str | None = None
-    log: ShardLog = field(default_factory=ShardLog)
-    failures: tuple[str, ...] = ()
+    times: StageTimes = field(default_factory=StageTimes)
+    self_test: str = ""
+    killers: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class Made:
+    """Rows and shards that one call made, shards that it found done, processor time of the stages, and workers."""
+
+    rows: int = 0
+    shards: int = 0
+    done: int = 0
+    times: StageTimes = field(default_factory=StageTimes)
+    n_jobs: int = 1
 
 
 COUNTS = tuple(field.name for field in fields(Counts))
@@ -235,18 +187,9 @@ COUNTS = tuple(field.name for field in fields(Counts))
 
 @dataclass(slots=True)
 class Tally:
-    """Count the rows of a dataset.
+    """Counts of rows, as ``dataset.json`` has them.
 
-    Attributes
-    ----------
-    pairs : int
-        Rows with status ``ok``.
-    failed : dict of str to int
-        Failed rows by reason.
-    sites : dict of str to int
-        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
-    filtered : int
-        Rows with status ``filtered``; ``dataset.json`` omits 0.
+    ``sites`` are the sums over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
     """
 
     pairs: int = 0
@@ -259,11 +202,10 @@ class Tally:
         """Count rows."""
         tally = cls()
         for row in rows:
-            tally.add_row(row)
+            tally._add_row(row)
         return tally
 
-    def add_row(self, row: Row) -> None:
-        """Count one row."""
+    def _add_row(self, row: Row) -> None:
         if row["status"] == "filtered":
             self.filtered += 1
             return
@@ -271,11 +213,10 @@ class Tally:
             self.failed[str(row["reason"])] = self.failed.get(str(row["reason"]), 0) + 1
             return
         self.pairs += 1
-        if not has_frames(row):
-            return
-        self.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
-        for name in COUNTS:
-            self.sites[name] += int(row[name] or 0)
+        if has_frames(row):
+            self.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
+            for name in COUNTS:
+                self.sites[name] += int(row[name] or 0)
 
     def add(self, other: Tally) -> None:
         """Add the counts of other rows."""

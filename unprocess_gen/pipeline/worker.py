@@ -21,18 +21,18 @@ from pathlib import Path
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import RESUME, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error, machine_errors
-from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import columns_of
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, has_frames, pair_row, row_json
 from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
+from unprocess_gen.pipeline.deaths import counted_attempt
+from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels
-from unprocess_gen.pipeline.run_records import MAX_DEATHS, Deaths, commit_shard
-from unprocess_gen.pipeline.storage import Storage
+from unprocess_gen.pipeline.records import commit_shard
 from unprocess_gen.pipeline.targets import kernels_for, targets_of
-from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
+from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan
@@ -46,53 +46,27 @@ M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
 KEPT_BYTES = 2**29
 """Freed memory that a worker keeps: the working memory of one 50-megapixel image."""
 
-Mark = Callable[[Source], object]
-"""Function that a worker calls with each source before it reads the source."""
-
 
 def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
-    """Make one shard and commit it; raise MachineError if disk, memory or self-test fail.
-
-    If deaths are counted and `run_records.MAX_DEATHS` workers have died at the shard, commit provisional rows.
-    """
-    storage, columns = Storage(context.config.out), columns_of(context.config)
-    with machine_errors(any_path(context.config.out), RESUME):
-        if not context.counts_deaths:
-            return commit_shard(storage, make_shard(context, task), columns)
-        deaths = Deaths(storage, task.shard)
-        if deaths.count >= MAX_DEATHS:
-            report = commit_provisional(context, task, deaths.source(task.sources), MAX_DEATHS)
-        else:
-            with deaths.marked() as mark:
-                report = commit_shard(storage, make_shard(context, task, mark), columns)
-        deaths.forget()
-        return report
+    """Make one shard and commit it; raise MachineError if disk, memory or self-test fail."""
+    folder = OutFolder(context.config.out)
+    with machine_errors(folder.path, RESUME), counted_attempt(folder, task) as (deadly, mark):
+        return commit_shard(folder, make_shard(context, task, deadly, mark), columns_of(context.config))
 
 
-DEATH_WORDS = {2: ("two workers died", "its worker died twice"), 4: ("four workers died", "its worker died four times")}
-"""Words for the number of workers that a shard ended: for the manifest, and for the progress."""
-
-
-def commit_provisional(context: RunContext, task: ShardTask, source: Source, deaths: int) -> ShardReport:
-    """Commit rows with the reason ``worker_died`` for a shard that ended ``deaths`` workers, the last at ``source``."""
-    in_row, in_progress = DEATH_WORDS[deaths]
-    detail = f"{in_row} at {source.name}; its shard is retried by the next run"
-    seed = context.config.seed
-    rows = tuple(failed_row(lost, None, task.shard, seed, "worker_died", detail) for lost in task.sources)
-    result = ShardResult(task.shard, None, 0, None, rows, killer=f"{source.name}: {in_progress}")
-    with machine_errors(any_path(context.config.out), RESUME):
-        return commit_shard(Storage(context.config.out), result, columns_of(context.config))
-
-
-def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source: None) -> ShardResult:
+def make_shard(
+    context: RunContext,
+    task: ShardTask,
+    deadly: Sequence[Source] = (),
+    mark: Callable[[Source], None] = lambda source: None,
+) -> ShardResult:
     """Write one shard to a temporary file; raise MachineError if disk, memory or self-test fail.
 
-    ``mark`` is called with each source before it is read.
+    ``deadly`` sources are not read: they get the row ``worker_died``. ``mark`` is called with each other one before.
     """
     _prepare_process(context.coordinator_pid)
-    log, busy = ShardLog(), task.busy_path(context)
+    made, busy, source = ShardResult(task.shard, killers=list(deadly)), context.busy_path(task.shard), task.sources[0]
     path = Path(context.scratch) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
-    rows: list[Row] = []
     try:
         with (
             _one_opencv_thread(),
@@ -100,20 +74,23 @@ def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source:
             reading_ahead(context.config.source.place, read_bytes, task.sources) as read,
         ):
             for source in task.sources:
+                if source in deadly:
+                    detail = f"four workers died at {source.name}; its shard is retried by the next run"
+                    made.rows.append(failed_row(source, None, task.shard, context.config.seed, "worker_died", detail))
+                    continue
                 busy.write_text(str(source.index))
                 mark(source)
-                rows += make_image(context, task.shard, source, writer, log, read)
+                made.rows += make_image(context, made, source, writer, read)
         busy.unlink(missing_ok=True)
-        if any(map(has_frames, rows)):
-            return ShardResult(task.shard, str(path), writer.bytes, writer.sha256, tuple(rows), log=log)
-        path.unlink()
-        return ShardResult(task.shard, None, 0, None, tuple(rows), log=log)
+        if any(map(has_frames, made.rows)):
+            made.path, made.bytes, made.sha256 = str(path), writer.bytes, writer.sha256
+        else:
+            path.unlink()
+        return made
     except MemoryError as error:
         if os.getpid() != context.coordinator_pid:
             os._exit(1)  # same path as an OOM kill: the coordinator retries the shard alone
-        source_in_progress = task.busy_source(context)
-        name = source_in_progress.name if source_in_progress else task.shard
-        raise MachineError(f"source {name}: out of memory; {RESUME}") from error
+        raise MachineError(f"source {source.name}: out of memory; {RESUME}") from error
     except OSError as error:
         for unfinished in (path, busy):
             with suppress(OSError):
@@ -122,32 +99,32 @@ def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source:
 
 
 def make_image(
-    context: RunContext, shard: int, source: Source, writer: ShardWriter, log: ShardLog, read: ReadFile = read_bytes
+    context: RunContext, made: ShardResult, source: Source, writer: ShardWriter, read: ReadFile = read_bytes
 ) -> list[Row]:
-    """Append the samples of one image to a shard, and return its rows; failures and times go to ``log``."""
-    config = context.config
+    """Append the samples of one image to a shard, and return its rows; notes and times go to ``made``."""
+    config, shard = context.config, made.shard
     try:
-        with log.times.adding("decode_s"):
+        with made.times.adding("decode_s"):
             sha256, photograph = load_source(config.source, source, config.output.layout, read)
     except SourceError as error:
         _check_not_deleted(config, source, error)
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
     if photograph.note:
-        log.notes.append(f"{source.name} {photograph.note}")
-    with log.times.adding("simulate_s"):
+        made.notes.append(f"{source.name} {photograph.note}")
+    with made.times.adding("simulate_s"):
         image = plan_pixels(context.settings, photograph, source, sha256)
         noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
     if not config.output.frames:
         identity = sha256, photograph.orientation, shard
         return _planned_rows(image, source, identity, noise_dn, config.source.patch is not None)
-    log.failures.update(dict.fromkeys(_self_test(context, image.plans)))
+    made.self_test.update(dict.fromkeys(_self_test(context, image.plans)))
     rows: list[Row] = []
     sample: list[Row] = []
-    for patch, plan, pair in log.times.each_simulated(image.pairs()):
+    for patch, plan, pair in made.times.each_simulated(image.pairs()):
         key = patch_key(source.index, patch, several=config.source.patch is not None)
         if plan is image.plans[0]:
             sample, clean_xxh3 = [], array_xxh3(pair.clean)
-            with log.times.adding("simulate_s"):
+            with made.times.adding("simulate_s"):
                 targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
             stored_targets = targets_cell(targets)
         digests = clean_xxh3, array_xxh3(pair.noisy)

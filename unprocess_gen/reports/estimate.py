@@ -95,7 +95,7 @@ class RunEstimate:
 def estimate_run(config: Config, n_jobs: int, read_all: bool) -> RunEstimate:
     """Estimate a run by making the pairs of a sample of its sources, or of all; the time is divided by ``n_jobs``."""
     start_seconds, run = _import_seconds(), resolve(config)
-    sources, shards = run.sources, len(run.tasks())
+    sources, shards = run.sources, run.shards
     n_jobs = min(n_jobs, shards)
     sample = sources if read_all else evenly_spaced(sources, SAMPLE)
     estimates = tuple(estimate_source(run.settings, source) for source in with_bar(sample, "photograph"))

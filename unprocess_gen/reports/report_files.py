@@ -11,7 +11,7 @@ from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_file, check_output_folder
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.pipeline.workspace import REPORT
+from unprocess_gen.pipeline.folder import REPORT
 
 
 def require_libraries(verb: str) -> None:

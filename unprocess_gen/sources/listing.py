@@ -63,7 +63,7 @@ class Listing:
     by suffix in lower case (``""`` for none), most frequent first.
     """
 
-    sources: tuple[Source, ...]
+    sources: Sequence[Source]
     skipped_links: int = 0
     unmatched: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()

@@ -3,8 +3,7 @@
 A shard is a future, and a worker has at most `IN_FLIGHT` of them. Workers commit shards themselves, so a shard that is
 made twice costs time, but changes no byte. Dask gives the shards of lost workers to others and retries those that fail.
 
-* A shard that ends `DEATHS` workers is retried with no other one in progress. If it ends as many again, its rows get
-  the provisional reason ``worker_died``.
+* Workers count their deaths (`deaths`), so a shard that Dask gives up is submitted again, without its deadly sources.
 * There is no worker for ``executor.no_workers_s``, or the scheduler ends: MachineError. A rerun continues.
 """
 
@@ -16,7 +15,7 @@ import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from importlib.metadata import version
 
@@ -24,22 +23,23 @@ import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.versions import VersionMismatchWarning
 
-from unprocess_gen.config.schema import ExecutorConfig
+from unprocess_gen.config.schema import ExecutorConfig, replaced
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, MachineError
-from unprocess_gen.pipeline.executors.local import interrupts_ignored
-from unprocess_gen.pipeline.storage import Storage
-from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask
-from unprocess_gen.pipeline.worker import KEPT_BYTES, commit_provisional, make_and_commit
+from unprocess_gen.core.paths import absolute_text
+from unprocess_gen.pipeline.deaths import count_death, deadly_sources, read_deaths
+from unprocess_gen.pipeline.executors.local import effective_jobs, interrupts_ignored
+from unprocess_gen.pipeline.folder import OutFolder
+from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.pipeline.progress import Progress
+from unprocess_gen.pipeline.tasks import Made, RunContext, ShardReport, ShardTask
+from unprocess_gen.pipeline.worker import KEPT_BYTES, make_and_commit
 
 IN_FLIGHT = 2
 """Shards of a worker: one in progress, and the next one, so that no worker waits."""
 
 RETRIES = 2
 """Times that Dask repeats a shard that ended with an error."""
-
-DEATHS = 4
-"""Workers that a shard ends before Dask gives up."""
 
 POLL_S = 1.0
 """Longest time between two looks at the number of workers."""
@@ -56,6 +56,32 @@ LOGGERS = ("distributed", "distributed.client", "tornado", "tornado.application"
 """Loggers whose messages are hidden during a run; what they report becomes one sentence."""
 
 
+def make_shards(
+    folder: OutFolder, settings: PairSettings, tasks: Sequence[ShardTask], progress: Progress, made: Made
+) -> Iterator[ShardReport]:
+    """Make and commit shards; yield a report of each as soon as a worker has committed it.
+
+    MachineError if the scheduler or all workers are lost, or a shard fails repeatedly; ConfigError if a worker has
+    another version of unprocess_gen, or cannot import it.
+    """
+    config = settings.config
+    places = {"out": absolute_text(config.out), "noise.dark_frames": absolute_text(config.noise.dark_frames)}
+    places |= {"source.root": absolute_text(config.source.place)}
+    context = RunContext(PairSettings.read(replaced(config, places)), "", None)
+    address = f"executor.address={config.executor.address or 'null'}"
+    with connected(config.executor, effective_jobs(config.n_jobs, len(tasks))) as client:
+        try:
+            yield from _committed(client, folder, context, tasks)
+            made.n_jobs = client.scheduler_info(n_workers=0)["n_workers"]
+        except (CancelledError, OSError) as error:
+            raise MachineError(f"{address}: the Dask scheduler ended or cannot be reached; {RESUME}") from error
+        except ImportError as error:
+            raise ConfigError(
+                f"{address}: workers cannot run unprocess_gen ({error_in_one_line(error)}); expected the versions of "
+                "this host on scheduler and workers"
+            ) from error
+
+
 def make_on_worker(expected: str, context: RunContext, task: ShardTask) -> ShardReport:
     """Make and commit a shard in a Dask worker, which must have the expected version of unprocess_gen."""
     if version("unprocess_gen") != expected:
@@ -63,42 +89,17 @@ def make_on_worker(expected: str, context: RunContext, task: ShardTask) -> Shard
             f"executor=dask: a worker has unprocess_gen {version('unprocess_gen')}, this host {expected}; expected the "
             "same version on all hosts"
         )
-    with closing(Storage(context.config.out)) as storage:
-        return make_and_commit(replace(context, scratch=str(storage.scratch)), task)
+    with OutFolder(context.config.out) as folder:
+        return make_and_commit(replace(context, scratch=str(folder.scratch)), task)
 
 
-def make_shards(client: Client, context: RunContext, tasks: Sequence[ShardTask]) -> Iterator[ShardReport]:
-    """Yield a report of each shard as soon as a worker has committed it.
-
-    Raises MachineError if the scheduler or all workers are lost, or a shard fails repeatedly; ConfigError if a worker
-    has another version of unprocess_gen, or cannot import it.
-    """
-    place = f"executor.address={context.config.executor.address or 'null'}"
-    deadly: list[ShardTask] = []
-    try:
-        for task, report in _ended(client, context, tasks):
-            if report is None:
-                deadly.append(task)
-            else:
-                yield report
-        for task in deadly:
-            ((_, report),) = _ended(client, context, [task])
-            yield report or commit_provisional(context, task, task.sources[0], DEATHS)
-    except (CancelledError, OSError) as error:
-        raise MachineError(f"{place}: the Dask scheduler ended or cannot be reached; {RESUME}") from error
-    except ImportError as error:
-        raise ConfigError(
-            f"{place}: workers cannot run unprocess_gen ({error_in_one_line(error)}); expected the versions of this "
-            "host on scheduler and workers"
-        ) from error
-
-
-def _ended(
-    client: Client, context: RunContext, tasks: Sequence[ShardTask]
-) -> Iterator[tuple[ShardTask, ShardReport | None]]:
-    """Yield each shard with its report, None if it ended its workers."""
+def _committed(
+    client: Client, folder: OutFolder, context: RunContext, tasks: Sequence[ShardTask]
+) -> Iterator[ShardReport]:
+    """Yield the reports of shards; those that end their workers are submitted again, at the end."""
     limit_s, waiting = context.config.executor.no_workers_s, deque(tasks)
     running: dict[Future[ShardReport], ShardTask] = {}
+    deaths: dict[int, list[int]] = {}
     seen_s = time.monotonic()
     while waiting or running:
         workers = client.scheduler_info(n_workers=0)["n_workers"]
@@ -120,9 +121,14 @@ def _ended(
         for future in [future for future in running if future.done()]:
             task = running.pop(future)
             try:
-                yield task, future.result()
+                yield future.result()
             except KilledWorker:
-                yield task, None
+                count_death(folder, task, deaths.get(task.shard, []))
+                deaths[task.shard] = read_deaths(folder, task.shard)
+                if len(deadly_sources(task, deaths[task.shard])) == len(task.sources):
+                    yield make_on_worker(version("unprocess_gen"), context, task)  # reads no source
+                else:
+                    waiting.append(task)
 
 
 @contextmanager

@@ -1,16 +1,11 @@
-"""Run shard tasks in worker processes of this machine; the only module that uses joblib.
+"""Make shards in worker processes of this machine; the only module that uses joblib.
 
-What happens when a worker dies, usually because the system is out of memory:
-
-1. loky stops all workers of the pool within half a second and raises TerminatedWorkerError in `run_tasks`.
-2. `run_tasks` retries each shard that was in progress alone (`_run_alone`), then continues with a new pool.
-3. If the worker of such a shard dies again, the shard's rows get the provisional reason ``worker_died``; a later run
-   retries the shard.
+When a worker dies, usually because the system is out of memory, loky stops all workers of the pool within half a second
+and raises TerminatedWorkerError. The other shards continue in a new pool. Those that were in progress are made at the
+end, each with no other one: a source that kills four workers there gets the row ``worker_died`` (`deaths`).
 
 If the coordinator dies, its workers exit by themselves (`worker._exit_with_parent`). With ``n_jobs=1`` the coordinator
 does the work, so killing it ends the run; a rerun resumes.
-
-Workers commit their shards themselves and report counts, so a slow shard delays no other one.
 """
 
 from __future__ import annotations
@@ -23,61 +18,77 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
-from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask
-from unprocess_gen.pipeline.worker import commit_provisional, make_and_commit
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.pipeline.deaths import count_death, deadly_sources, read_deaths, shards_with_deaths, write_deaths
+from unprocess_gen.pipeline.folder import OutFolder
+from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.pipeline.progress import Progress
+from unprocess_gen.pipeline.tasks import Made, RunContext, ShardReport, ShardTask
+from unprocess_gen.pipeline.worker import make_and_commit
 
 
-def effective_jobs(n_jobs: int, tasks: int) -> int:
-    """Number of workers to start: -1 means all cores that this process may use, and there are no more than tasks."""
-    if tasks <= 1:
-        return 1  # without joblib, whose import takes 0.15 s
-    if n_jobs == -1:
-        from joblib import cpu_count
-
-        n_jobs = cpu_count()
-    return min(n_jobs, tasks)
-
-
-def own_cores() -> int:
-    """Return the number of cores this process may use, regardless of its container's share of CPU time."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def run_tasks(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardReport]:
-    """Make and commit the shards of all tasks; yield a report of each as soon as it is committed.
+def make_shards(
+    folder: OutFolder, settings: PairSettings, tasks: Sequence[ShardTask], progress: Progress, made: Made
+) -> Iterator[ShardReport]:
+    """Make and commit shards; yield a report of each as soon as it is committed.
 
     With one job joblib is not imported (0.1 s, 8 MB) and the coordinator makes the shards.
     """
+    made.n_jobs = n_jobs = effective_jobs(settings.config.n_jobs, len(tasks))
+    context = RunContext(settings, str(folder.scratch), os.getpid(), core_to_spare=n_jobs < own_cores())
+    progress.watch(context)
     if n_jobs == 1:
         yield from (make_and_commit(context, task) for task in tasks)
-        return
+    else:
+        yield from _make_in_pools(folder, context, tasks, n_jobs)
+
+
+def _make_in_pools(
+    folder: OutFolder, context: RunContext, tasks: Sequence[ShardTask], n_jobs: int
+) -> Iterator[ShardReport]:
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    waiting = list(tasks)
-    while waiting:
-        done: set[int] = set()
+    known = shards_with_deaths(folder)
+    waiting = {task.shard: task for task in tasks if task.shard not in known}
+    alone = [task for task in tasks if task.shard in known]
+    try:
+        while waiting:
+            try:
+                for report in _run_pool(context, [*waiting.values()], n_jobs):
+                    del waiting[report.shard]
+                    yield report
+            except TerminatedWorkerError:
+                in_progress = [shard for shard in waiting if read_deaths(folder, shard)] or [*waiting][:n_jobs]
+                for shard in in_progress:
+                    write_deaths(folder, shard, [])  # any of them may have ended the pool
+                    alone.append(waiting.pop(shard))
+    except BaseException:
+        with suppress(OSError, MachineError):  # this end of the workers is no death
+            for shard in shards_with_deaths(folder) & waiting.keys():
+                write_deaths(folder, shard, [])
+        raise
+    for task in alone:
+        yield from _make_alone(folder, context, task)
+
+
+def _make_alone(folder: OutFolder, context: RunContext, task: ShardTask) -> Iterator[ShardReport]:
+    """Make a shard with no other worker running, without the sources that kill their workers."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    while True:
+        deaths = read_deaths(folder, task.shard)
+        if len(deadly_sources(task, deaths)) == len(task.sources):
+            yield make_and_commit(context, task)  # reads no source
+            return
         try:
-            for result in _run_pool(context, waiting, n_jobs):
-                done.add(result.shard)
-                yield result
+            yield from _run_pool(context, [task], n_jobs=2)  # n_jobs=1 would make the coordinator do the work, and die
             return
         except TerminatedWorkerError:
-            waiting = [task for task in waiting if task.shard not in done]
-        in_progress = [task for task in waiting if task.busy_path(context).exists()]
-        for task in in_progress or waiting[:n_jobs]:
-            yield from _run_alone(context, task)
-            waiting.remove(task)
-
-
-def _run_alone(context: RunContext, task: ShardTask) -> Iterator[ShardReport]:
-    """Retry one shard with no other worker running; if the worker dies again, commit provisional rows."""
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    try:
-        yield from _run_pool(context, [task], n_jobs=2)  # n_jobs=1 would make the coordinator do the work, and die
-    except TerminatedWorkerError:
-        killer = task.busy_source(context) or task.sources[0]
-        yield commit_provisional(context, task, killer, deaths=2)
+            count_death(folder, task, deaths)
+        except BaseException:
+            with suppress(OSError, MachineError):
+                write_deaths(folder, task.shard, deaths)
+            raise
 
 
 def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardReport]:
@@ -133,3 +144,19 @@ def start_tracker() -> None:
             with Path(os.devnull).open("wb") as nothing:
                 os.dup2(nothing.fileno(), 2)
         ensure_running()
+
+
+def effective_jobs(n_jobs: int, tasks: int) -> int:
+    """Number of workers to start: -1 means all cores that this process may use, and there are no more than tasks."""
+    if tasks <= 1:
+        return 1  # without joblib, whose import takes 0.15 s
+    if n_jobs == -1:
+        from joblib import cpu_count
+
+        n_jobs = cpu_count()
+    return min(n_jobs, tasks)
+
+
+def own_cores() -> int:
+    """Number of cores this process may use, regardless of its container's share of CPU time."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -166,7 +166,7 @@ class Exploration:
 @functools.lru_cache(maxsize=4)
 def listed_sources(config: SourceConfig) -> tuple[Source, ...]:
     """List photographs, or repeat an earlier listing."""
-    return list_photographs(config).sources
+    return tuple(list_photographs(config).sources)
 
 
 @functools.lru_cache(maxsize=1)
