@@ -37,40 +37,14 @@ UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u
 
 NAMES: tuple[bytes, ...] = (
     # ends of lines, separators, quotes
-    *(
-        b"line\nfeed.jpg",
-        b"both\r\n.jpg",
-        b"tab\t.jpg",
-        b"\x0b\x0c\x1c\x1d\x1e.jpg",
-        b"com,ma.jpg",
-        b'quo"te.jpg',
-        b'"".jpg',
-    ),
-    *("next\u0085line.jpg".encode(), "line\u2028and\u2029paragraph.jpg".encode()),
+    *(b"line\nfeed.jpg", b"both\r\n.jpg", b"tab\t.jpg", b"\x0b\x0c\x1c\x1d\x1e.jpg", b"com,ma.jpg", b'quo"te.jpg'),
+    *(b'"".jpg', "next\u0085line.jpg".encode(), "line\u2028and\u2029paragraph.jpg".encode()),
     # formulas, and what a shell, Hydra or a glob would take for its own
-    *(
-        b"=1+1.jpg",
-        b"@SUM(1).jpg",
-        b"\t=1.jpg",
-        b"=cmd|' C'!A0.jpg",
-        b"-.jpg",
-        b"--help.jpg",
-        b"${x}.jpg",
-        b"$(id).jpg",
-    ),
+    *(b"=1+1.jpg", b"@SUM(1).jpg", b"\t=1.jpg", b"=cmd|' C'!A0.jpg", b"-.jpg", b"--help.jpg", b"${x}.jpg"),
     *(b"[x]*.jpg", b"{a,b}.jpg", b"back\\slash.jpg", b"a&b.jpg", b"#.jpg", b"null.jpg", b"a=b.jpg", b"<a>.jpg"),
     # dots, blanks, percent signs
-    *(
-        b"..jpg",
-        b". .jpg",
-        b" lead.jpg",
-        b"trail .jpg",
-        b"%.jpg",
-        b"%25.jpg",
-        b"%2F.jpg",
-        b"..%2f..%2fb.jpg",
-        b"%0A.jpg",
-    ),
+    *(b"..jpg", b". .jpg", b" lead.jpg", b"trail .jpg", b"%.jpg", b"%25.jpg", b"%2F.jpg", b"..%2f..%2fb.jpg"),
+    *(b"%0A.jpg", b"$(id).jpg"),
     # bytes that are not UTF-8, directions, widths
     *(b"\xff.jpg", b"\xc3(.jpg", b"\xed\xa0\x80.jpg", b"\xc0\xaf.jpg", b"\x80=.jpg", "\u202egpj.jpg".encode()),
     *("\u061c\u200e\u200f.jpg".encode(), "zero\u200bwidth.jpg".encode(), "\ufeffbom.jpg".encode(), b"bom.jpg"),
@@ -80,15 +54,8 @@ NAMES: tuple[bytes, ...] = (
     # control characters, and the longest there are
     *(b"\x1b[31m.jpg", b"\x1b]0;title\x07.jpg", b"\x7f.jpg", b"x" * 251 + b".jpg", b"\xff" * 251 + b".jpg"),
 )
-FOLDERS: tuple[bytes, ...] = (
-    b"=dir",
-    b"new\nline",
-    b"\xff",
-    b"...",
-    b"  ",
-    b"%2e%2e",
-    b"\xff" * 255 + b"/" + b"\xfe" * 255,
-)
+LONGEST = b"\xff" * 255 + b"/" + b"\xfe" * 255
+FOLDERS: tuple[bytes, ...] = (b"=dir", b"new\nline", b"\xff", b"...", b"  ", b"%2e%2e", LONGEST)
 
 
 def photograph(number: int) -> bytes:
@@ -100,7 +67,7 @@ def photograph(number: int) -> bytes:
 
 
 class HostileDataset(NamedTuple):
-    """Hold a dataset of hostile names: contents of the files by path, and every other path next to the dataset."""
+    """Dataset of hostile names: contents of the files by path, and every other path next to the dataset."""
 
     root: Path
     out: Path
@@ -135,11 +102,6 @@ def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> HostileDataset
     return HostileDataset(root, out, contents, before)
 
 
-def cells(out: Path) -> list[list[str]]:
-    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
-        return list(csv.reader(stream, strict=True))
-
-
 # In the manifest ------------------------------------------------------------------------------------------------------
 
 
@@ -152,20 +114,16 @@ def test_every_name_gives_a_pair_and_is_restored(made: HostileDataset, figure: F
     figure("hostile-names", f"{len(made.contents)} hostile names, all distinct and readable")
 
 
-def test_each_row_is_one_line_for_str_splitlines(made: HostileDataset) -> None:
+def test_cells_are_harmless(made: HostileDataset) -> None:
+    """Each row is one line, only numbers begin like a formula, and no cell has control or bidirectional characters."""
     text = (made.out / "manifest.csv").read_bytes().decode("utf-8")
     assert len(text.splitlines()) == len(made.contents) + 1
-
-
-def test_only_numbers_begin_like_a_formula(made: HostileDataset) -> None:
-    suspicious = [cell for row in cells(made.out) for cell in row if cell.startswith(FORMULA_STARTS)]
+    cells = list(itertools.chain.from_iterable(csv.reader(io.StringIO(text, newline=""), strict=True)))
+    assert [cell for cell in cells if UNSEEN.search(cell)] == []
+    suspicious = [cell for cell in cells if cell.startswith(FORMULA_STARTS)]
     assert suspicious, "some entries of rgb2cam are negative"
     for cell in suspicious:
         float(cell)
-
-
-def test_no_cell_has_control_or_bidirectional_characters(made: HostileDataset) -> None:
-    assert not [cell for row in cells(made.out) for cell in row if UNSEEN.search(cell)]
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
@@ -200,21 +158,13 @@ def test_verify_regenerates_every_pair(made: HostileDataset, run_main: RunMain) 
 # On the terminal ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def broken(tmp_path: Path) -> Path:
-    """Return a folder of files with hostile names that are no pictures."""
-    folder = tmp_path / "broken"
-    folder.mkdir()
+def test_control_characters_of_names_do_not_reach_the_terminal(run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "broken").mkdir()
     for name in NAMES:
-        Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).write_bytes(b"no picture")
-    return folder
-
-
-def test_control_characters_of_names_do_not_reach_the_terminal(broken: Path, run_main: RunMain) -> None:
-    done = run_main(f"source.root={broken}", "out=made", "n_jobs=1")
-    shown = (done.out + done.err).replace("\n", "")
+        (tmp_path / "broken" / os.fsdecode(name)).write_bytes(b"no picture")
+    done = run_main("source.root=broken", "out=made", "n_jobs=1")
     assert done.code in (0, 3)
-    assert UNSEEN.findall(shown) == []
+    assert UNSEEN.findall((done.out + done.err).replace("\n", "")) == []
 
 
 # Folders on the command line ------------------------------------------------------------------------------------------
@@ -295,21 +245,16 @@ PARTS = st.one_of(HARD_TEXT.map(str.encode), HARD_BYTES, TROUBLE.map("".join).ma
 PATHS = st.lists(PARTS, min_size=1, max_size=3).map(b"/".join).map(os.fsdecode)
 
 
-def check_spelling(path: str) -> None:
-    """Check that a name is encoded harmlessly, on one line of a CSV file, and decoded to the same bytes."""
+@given(PATHS)
+@settings(max_examples=200, deadline=None)
+def test_random_names_are_encoded_harmlessly_and_decoded(path: str) -> None:
+    """A name is on one line of a CSV file, and decoded to the same bytes."""
     name = encode_name(path)
     assert decode_name(name) == path
-    assert not name.startswith(FORMULA_STARTS)
-    assert not UNSEEN.search(name)
+    assert not name.startswith(FORMULA_STARTS) and not UNSEEN.search(name)
     stream = io.StringIO(newline="")
     csv.writer(stream, lineterminator="\n").writerow([name, "x"])
     line = stream.getvalue().encode("utf-8").decode("utf-8")
     assert len(line.splitlines()) == 1
     assert list(csv.reader([line], strict=True)) == [[name, "x"]]
     assert json.loads(json.dumps(name)) == name
-
-
-@given(PATHS)
-@settings(max_examples=200, deadline=None)
-def test_random_names_are_encoded_harmlessly_and_decoded(path: str) -> None:
-    check_spelling(path)
