@@ -1,6 +1,6 @@
 """Draw page.png, sweep.jpg, figure6.png and dng.png for the documentation: python .readme/draw_pages.py.
 
-They show the report of a dataset, that of a sweep, a figure of the article and DNG files, made from built-in scenes in
+They show the report of a dataset, that of a sweep, a figure of the article and DNG files, of synthetic pictures, in
 a temporary folder; the page of the sweep is written too. Requires the extras figures and dng, rawpy, and Chromium.
 """
 
@@ -48,7 +48,7 @@ def screenshot(page: Path, width: int, height: int, scale: float) -> np.ndarray:
 
 
 def draw_sweep() -> None:
-    """Generate a sweep of built-in scenes, and write its page, without links to datasets, and a picture of it."""
+    """Generate a sweep of synthetic pictures, and write its page, without links to datasets, and a picture of it."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "camera_by_iso"
         gen_dataset("+sweep=camera_by_iso", f"out={folder}", "source.limit=1", "source.downscale=2", "n_jobs=1")

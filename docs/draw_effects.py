@@ -36,7 +36,7 @@ def config_of(picture: Picture, switches: dict[str, str | None], *overrides: str
 
 
 def frames_dn(config: Config) -> tuple[Float, Float]:
-    """Return the clean and the noisy frame of a part of a built-in scene."""
+    """Return the clean and the noisy frame of a part of a synthetic picture."""
     pair = ug.make_pair(np.ascontiguousarray(synthetic.picture("dead_leaves-0")[:SIDE, :SIDE]), config)
     clean, noisy = (mosaic_dn(frame, pair.row).astype(np.float64) for frame in (pair.clean, pair.noisy))
     return clean, noisy

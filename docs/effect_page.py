@@ -60,7 +60,7 @@ INTRODUCTION = """\
 # Atlas of effects
 
 Each effect by itself, amplified, and in a scene that calls for it, in the order in which light meets them. The
-pictures show a part of a built-in scene, one pixel per site. `python docs/draw_effects.py` draws all of them.
+pictures show a part of a synthetic picture, one pixel per site. `python docs/draw_effects.py` draws all of them.
 
 - Left: the frame with the effect minus the frame without, and no other effect. Grey is no difference. The text states
   the DN that are drawn black and white, and the amplification compared with a frame drawn from black to white level.

@@ -225,7 +225,7 @@ def generate(config: Config) -> _generate.Summary:
 
     Examples
     --------
-    Two of the built-in scenes, in one process:
+    Two of the synthetic pictures, in one process:
 
     >>> import unprocess_gen as ug
     >>> summary = ug.generate(ug.load_config(["source.limit=2", "n_jobs=1", "out=ds"]))

@@ -213,7 +213,7 @@ def main() -> None:
     """Measure, write the results and print them."""
     parser = argparse.ArgumentParser(description="Measure what a training gains in time from live pairs.")
     parser.add_argument("--out", type=Path, required=True, help="folder for datasets, cache and results")
-    parser.add_argument("--photos", type=Path, help="folder of photographs; by default built-in scenes as JPEG files")
+    parser.add_argument("--photos", type=Path, help="folder of photographs; by default synthetic pictures as JPEG")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--only", choices=["goals"], help="leave out decoding and training")
     options = parser.parse_args()
@@ -226,7 +226,11 @@ def main() -> None:
         results["decode"] = measure_decoding(options.out, photos, options.rounds)
         results["training"] = measure_training(options.out, photos, cache, max(options.rounds // 2, 2))
     machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-    results |= {"sources": "photographs" if options.photos else "built-in scenes", "rounds": options.rounds, **machine}
+    results |= {
+        "sources": "photographs" if options.photos else "synthetic pictures",
+        "rounds": options.rounds,
+        **machine,
+    }
     results |= {"load": [round(value, 1) for value in os.getloadavg()], "numpy": np.__version__}
     (options.out / "live_pairs.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print(tables(results))

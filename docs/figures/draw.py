@@ -1,6 +1,6 @@
 """Draw Figures 1 to 7 of the article: ``python docs/figures/draw.py source.root=photos out=figs``.
 
-The figures show the first photograph that can be read, by default a built-in scene, and are computed with the code that
+The figures show the first photograph that can be read, by default a synthetic picture, computed with the code that
 makes datasets: ``fig1.png`` … ``fig7.png`` in ``out``. Other overrides, such as ``camera=sony_a7r``, work too. The
 article's photographs are not published. So the claims of its Figure 6 are counted on up to `PHOTOGRAPHS_COUNTED`
 photographs, and the counts are printed. ``docs/differences.md`` compares the article with this package.

@@ -222,7 +222,7 @@ SENSORS = ("imx385_12bit", "generic_14bit", "generic_16bit")
 
 @pytest.fixture(scope="module")
 def scenes() -> list[np.ndarray]:
-    """Return two built-in scenes at a third of their sides."""
+    """Return two synthetic pictures at a third of their sides."""
     return [synthetic.picture(name)[::3, ::3] for name in ("colour_chart-0", "dead_leaves-0")]
 
 

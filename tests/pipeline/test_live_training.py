@@ -46,7 +46,7 @@ Items = list[tuple[str, str, dict[str, Any], dict[str, str]]]
 
 @pytest.fixture(scope="module")
 def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A dataset of each kind of three photographs; also of clips, of built-in scenes and of dark frames."""
+    """A dataset of each kind of three photographs; also of clips, of synthetic pictures and of dark frames."""
     folder = tmp_path_factory.mktemp("kinds")
     fill(folder / "photos", 3)
     for clip, number in itertools.product(("a", "b"), range(2)):

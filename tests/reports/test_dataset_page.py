@@ -59,7 +59,7 @@ def text(made: Path) -> str:
 
 @pytest.fixture(scope="module")
 def scenes(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of two built-in scenes, large enough that their noise can be fitted."""
+    """A dataset of two synthetic pictures, large enough that their noise can be fitted."""
     out = tmp_path_factory.mktemp("scenes") / "ds"
     make(None, out, "source.limit=2")
     return out

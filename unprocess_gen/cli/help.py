@@ -20,7 +20,7 @@ INTRODUCTION = """\
 gen-dataset: pairs of clean and noisy raw images from ordinary photographs
 
   gen-dataset camera=convex noise=imx385_iso3200 source.root=photos out=ds     one dataset
-  gen-dataset                          a dataset of the built-in scenes, in ds
+  gen-dataset                          a dataset of the synthetic pictures, in ds
   gen-dataset -m camera=sony_a7r,nexus_6p noise=imx385_iso1600,imx385_iso3200 out=sweep
                                        a sweep: one dataset folder each, and sweep/sweep.csv
   gen-dataset VERB --help              the arguments of a verb

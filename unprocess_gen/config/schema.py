@@ -158,7 +158,7 @@ class SourceConfig(Group):
 
     @property
     def place(self) -> str | None:
-        """Folder that names of sources are relative to; None for the built-in scenes."""
+        """Folder that names of sources are relative to; None for the synthetic pictures."""
         if self.root is not None or self.list is None:
             return self.root
         return str(Path(self.list).parent)

@@ -125,7 +125,7 @@ def _check_environment(config: Config) -> None:
         _check_root(source.root)
     if source.kind == "raw":
         if source.place is None:
-            raise refusal("source.kind", "raw", "the built-in scenes are pictures; expected frames; give source.root=…")
+            raise refusal("source.kind", "raw", "synthetic pictures are no frames; expected frames; give source.root=…")
         for library in ("rawpy", "tifffile"):
             require(library, f"source.kind=raw: needs {library}", "raw")
     if config.executor.kind == "dask":
@@ -142,13 +142,13 @@ def _check_places(source: SourceConfig) -> None:
 
 def _check_root(root: str) -> None:
     if not root:
-        raise refusal("source.root", "''", "expected a folder or file; null selects the built-in scenes")
+        raise refusal("source.root", "''", "expected a folder or file; null selects the synthetic pictures")
     try:
         exists = any_path(root).exists()
     except StoreAccessError as error:
         raise ConfigError(f"source.root={error}") from None
     if not exists:
-        problem = "no such folder or file; expected photographs, or null for the built-in scenes"
+        problem = "no such folder or file; expected photographs, or null for the synthetic pictures"
         raise ConfigError(f"source.root={root}: {problem}")
 
 

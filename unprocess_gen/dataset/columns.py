@@ -168,7 +168,7 @@ DIVIDED_LIGHT = Condition(
     "scene.exposure_ratio is 1 or output.frames is false",
     lambda config: config.output.frames and config.scene.exposure_ratio != 1,
 )
-FOUND_FILES = Condition("the sources are built-in scenes", lambda config: config.source.place is not None)
+FOUND_FILES = Condition("the sources are synthetic pictures", lambda config: config.source.place is not None)
 RAW = Condition("source.kind is not raw", lambda config: config.source.kind == "raw", by_default=True)
 CLIPS = Condition("source.clips is false", lambda config: config.source.clips)
 PATCHES = Condition("source.patch is null", lambda config: config.source.patch is not None)
@@ -317,7 +317,7 @@ COLUMNS = (
     Column("source", "path below the source folder, percent-encoded where unsafe", RelativePath(), Source, "name",
            empty_if=""),
     Column("source_sha256", "SHA-256 of the source's bytes", HEX_256, empty_if="the source cannot be read"),
-    Column("source_bytes", "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes", unit="bytes",
+    Column("source_bytes", "size of the source; 0 for a synthetic picture", COUNT, Source, "size_bytes", unit="bytes",
            empty_if="there is no readable file"),
     Column("status", "ok, failed if the source could not be used, or filtered if source.min_side leaves it out (other "
            "cells are then as for failed)",

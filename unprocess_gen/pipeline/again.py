@@ -33,7 +33,7 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
 
 
 def _root(folder: AnyPath, kind: str, root: str | None) -> str | None:
-    """Return the root of the sources, given or recorded; None for the built-in scenes."""
+    """Return the root of the sources, given or recorded; None for the synthetic pictures."""
     if kind == "synthetic":
         if root is not None:
             raise ConfigError(

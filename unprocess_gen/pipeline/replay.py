@@ -130,7 +130,7 @@ def check_source_sizes(manifest: AnyPath, root: str) -> None:
     sizes = {entry.path: entry.size for entry in place.walk_entries()} if isinstance(place, ObjectPath) else None
     for row in read_rows(manifest):
         name, recorded = str(row["source"]), row["source_bytes"]
-        if name == last or not recorded:  # built-in scenes and unreadable files have no size
+        if name == last or not recorded:  # synthetic pictures and unreadable files have no size
             continue
         last = name
         path = decode_name(name)
@@ -203,7 +203,7 @@ def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayRe
 
 
 class PairRegenerator:
-    """Regenerate pairs from rows and the folder of their sources, ``root``; built-in scenes need none.
+    """Regenerate pairs from rows and the folder of their sources, ``root``; synthetic pictures need none.
 
     ``dark_frames`` is the folder of the dark frames that rows name. The last photograph stays decoded, because rows of
     one image are consecutive.
@@ -296,7 +296,7 @@ class PairRegenerator:
 
 def recorded_source(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
     """Return the settings with which the source of a row is decoded again."""
-    place = None if source.size_bytes == 0 else root  # built-in scenes have no bytes
+    place = None if source.size_bytes == 0 else root  # synthetic pictures have no bytes
     config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
     if not prepared.is_raw:
         return config

@@ -28,7 +28,7 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
     """Format an estimate for a terminal: lines without a final newline, with the sources of numbers on request."""
     run, read, config = estimate.run, estimate.source_estimates, estimate.run.config
     about = "" if estimate.exact else "about "
-    place = config.source.list or config.source.place or "the built-in scenes"
+    place = config.source.list or config.source.place or "the synthetic pictures"
     listed = f"{len(run.sources)} in {place}; {len(read)} of them read"
     per_shard = f"{counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}"
     size = f"about {estimate.bytes:,} in shards, {byte_size(estimate.bytes)}; {byte_size(estimate.free_bytes)} free"

@@ -161,7 +161,7 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
 
 
 def select_inputs(config: Config, folder: Path) -> Inputs:
-    """Select the first photographs; built-in scenes are written to ``folder`` as JPEG files, so that runs decode files.
+    """Select the first photographs; synthetic ones are written to ``folder`` as JPEG files, so that runs decode files.
 
     ConfigError if none can be read.
     """

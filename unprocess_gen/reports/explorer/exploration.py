@@ -1,4 +1,4 @@
-"""Open photographs, built-in scenes and rows of a dataset as settings of a page, and make their pair as datasets do."""
+"""Open photographs, synthetic pictures and rows of a dataset as settings of a page, and make their pair."""
 
 from __future__ import annotations
 
