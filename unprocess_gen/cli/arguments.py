@@ -9,8 +9,8 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from unprocess_gen.core.errors import ConfigError
@@ -90,8 +90,7 @@ class Place(NamedTuple):
     optional: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Verb:
+class Verb(NamedTuple):
     """A verb of the command line; ``run`` returns the exit code.
 
     ``composes`` verbs take the settings of a run and Hydra's flags. ``keys`` are settings of the verb itself with their
@@ -103,7 +102,7 @@ class Verb:
     run: Callable[[Call], int]
     place: Place | None = None
     flags: tuple[Flag, ...] = ()
-    keys: Mapping[str, str] = field(default_factory=dict)
+    keys: Mapping[str, str] = MappingProxyType({})
     composes: bool = False
     resumes: bool = False
     extra: str = ""

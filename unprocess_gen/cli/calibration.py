@@ -10,13 +10,13 @@ from pathlib import Path
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.paths import local_path
 from unprocess_gen.reports.formatting import counted, short_number
 
 
 def calibrate(call: Call) -> int:
     """Write a noise profile and the list of its estimates, from captures or from what DNG files state."""
     from unprocess_gen.calibration.profile import check_outputs
+    from unprocess_gen.core.paths import local_path
 
     assert call.place is not None
     folder = local_path(call.place, f"calibrate: {call.place} is in an object store; expected a local folder")

@@ -7,12 +7,12 @@ import shlex
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.paths import LocalPath, local_path
 
 
 def camera(call: Call) -> int:
     """Write the options, and print what was read from which tag."""
     from unprocess_gen.core.files import machine_errors
+    from unprocess_gen.core.paths import LocalPath, local_path
     from unprocess_gen.sources.raw.options import camera_options, check_options
 
     assert call.place is not None

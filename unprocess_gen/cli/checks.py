@@ -13,10 +13,10 @@ from unprocess_gen.cli.messages import print_results, report, report_error
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import worst
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
-from unprocess_gen.core.paths import AnyPath, local_path
 from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
+    from unprocess_gen.core.paths import AnyPath
     from unprocess_gen.dataset.row import Row
     from unprocess_gen.pipeline.replay import ReplayResult
 
@@ -71,6 +71,7 @@ def _finish(folder: AnyPath, damages: Iterable[object], call: Call) -> int:
 
 def _repair(folder: AnyPath, call: Call) -> list[int]:
     """Restore damaged files and report each step; the exit codes of the steps."""
+    from unprocess_gen.core.paths import local_path
     from unprocess_gen.pipeline.repair import repair
     from unprocess_gen.pipeline.replay import source_root
 

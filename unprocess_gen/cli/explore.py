@@ -7,7 +7,6 @@ from unprocess_gen.cli.jobs import option_folders
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
-from unprocess_gen.core.paths import any_path
 
 
 def explore(call: Call) -> int:
@@ -17,6 +16,7 @@ def explore(call: Call) -> int:
     if call.multirun or call.cfg or call.resolve:
         name = "--multirun" if call.multirun else "--cfg" if call.cfg else "--resolve"
         raise ConfigError(f"explore: {name}: a page shows one config; expected settings; leave it out")
+    from unprocess_gen.core.paths import any_path
     from unprocess_gen.reports.explorer import server
     from unprocess_gen.reports.explorer.exploration import open_place
 

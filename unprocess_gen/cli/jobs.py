@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,16 +10,14 @@ from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results, report_error
 from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.sweep import job_folder, named_overrides
-from unprocess_gen.config.option_files import OptionFolders, conf_dir
+from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.paths import local_path
 
 if TYPE_CHECKING:
     from unprocess_gen.config.composition import Composition
     from unprocess_gen.config.schema import Config
 
 
-@dataclass(slots=True)
 class Job:
     """A config to run; inside the context, an error of a job of a sweep becomes its exit code.
 
@@ -28,12 +25,10 @@ class Job:
     is shown with the progress, such as ``3/20 camera=sony_a7r``.
     """
 
-    config: Config
-    row: dict[str, str]
-    sweep: Path | None = None
-    label: str = ""
-    code: int = 0
-    result: Any = None
+    def __init__(self, config: Config, row: dict[str, str], sweep: Path | None = None) -> None:
+        self.config, self.row, self.sweep = config, row, sweep
+        self.label, self.code = "", 0
+        self.result: Any = None
 
     def __enter__(self) -> None:
         pass
@@ -62,12 +57,13 @@ def composed_jobs(call: Call) -> list[Job]:
 def option_folders(call: Call) -> OptionFolders:
     """Find the folders and the primary config that flags choose."""
     name = call.config_name and call.config_name.removesuffix(".yaml")
-    return OptionFolders(call.config_path or conf_dir(), name, call.config_dir)
+    return OptionFolders(call.config_dir, name, call.config_path)
 
 
 def checked_jobs(composed: Iterable[Composition], only_swept: bool = False) -> list[Job]:
     """Validate composed configs; with ``only_swept`` the folders of a sweep are named by their swept values alone."""
     from unprocess_gen.config.schema import replaced
+    from unprocess_gen.core.paths import local_path
 
     jobs = []
     for job in composed:

@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from unprocess_gen.core.errors import MachineError, UnprocessGenError
-from unprocess_gen.sources.image.codec_messages import REDIRECTED
 
 LOGGER = logging.getLogger("unprocess_gen")
 
@@ -40,6 +39,8 @@ def report_error(error: BaseException, job: str = "") -> int:
 
 def report(message: object) -> None:
     """Show a message on stderr, after the name of the program."""
+    from unprocess_gen.sources.image.codec_messages import REDIRECTED
+
     with REDIRECTED:
         print(f"gen-dataset: {message}", file=sys.stderr, flush=True)
 

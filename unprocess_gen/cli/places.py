@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.output_paths import DATASET_ENTRIES
-from unprocess_gen.core.paths import AnyPath, any_path
+
+if TYPE_CHECKING:
+    from unprocess_gen.core.paths import AnyPath
 
 
 def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
@@ -13,6 +16,9 @@ def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> 
 
     ``files`` accepts the file of a manifest too, ``sweeps`` the folder of a sweep.
     """
+    from unprocess_gen.core.output_paths import DATASET_ENTRIES
+    from unprocess_gen.core.paths import any_path
+
     verb, path, place = call.verb.name, call.place, call.verb.place
     assert path is not None and place is not None
     if not any_path(path).is_listed():

@@ -13,7 +13,6 @@ from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals, swept_keys, worst
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
-from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.reports.formatting import counted
 
 
@@ -38,6 +37,7 @@ def plan(call: Call) -> int:
 def accuracy(call: Call) -> int:
     """Measure error and time of every tier, stage by stage, and write a report, never into a dataset."""
     from unprocess_gen.config.raw_validation import require_photographs
+    from unprocess_gen.core.paths import local_path
     from unprocess_gen.reports.accuracy.measure import measure_accuracy
     from unprocess_gen.reports.accuracy.report import REPORT_FILES, report_text, write_accuracy
     from unprocess_gen.reports.report_files import check_report_folder
@@ -63,6 +63,7 @@ def accuracy(call: Call) -> int:
 
 def report(call: Call) -> int:
     """Write the HTML page of a dataset or a sweep."""
+    from unprocess_gen.core.paths import any_path
     from unprocess_gen.pipeline.verify import is_sweep
     from unprocess_gen.reports.dataset_page import write_dataset_report
     from unprocess_gen.sources.dark_frames import dark_folder
@@ -91,6 +92,7 @@ def _report_sweep(folder: Path, call: Call) -> int:
 
 def preview(call: Call) -> int:
     """Draw contact sheets of pairs."""
+    from unprocess_gen.core.paths import any_path
     from unprocess_gen.dataset.selection import select_pairs
     from unprocess_gen.pipeline.replay import source_root
     from unprocess_gen.reports.sheets import write_sheets
@@ -114,6 +116,8 @@ def preview(call: Call) -> int:
 
 def _check_not_among_photographs(to: Path, root: str | None) -> None:
     """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
+    from unprocess_gen.core.paths import any_path
+
     place = None if root is None else any_path(root).resolve()
     if not isinstance(place, Path) or not place.is_dir():
         return

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import io
 import os
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -55,6 +53,8 @@ def job_folder(overrides: Sequence[str], swept: Container[str] = ()) -> str:
 
     A name longer than `LONGEST_FOLDER_NAME` begins with the overrides of swept keys, is cut, and ends with a digest.
     """
+    import hashlib
+
     name = _encoded(overrides) or "default"
     if len(os.fsencode(name)) <= LONGEST_FOLDER_NAME:
         return name
@@ -93,6 +93,8 @@ def write_row(out: Path, row: Mapping[str, str]) -> None:
     A row of the same folder is replaced and keeps its place, so that the indices of `RawPairs` do not change. A job
     that found its dataset complete has no time; the earlier one remains.
     """
+    import csv
+
     from unprocess_gen.core.files import machine_errors
     from unprocess_gen.core.locks import LockFile
     from unprocess_gen.core.output_paths import enclosing_dataset

@@ -205,7 +205,8 @@ def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
     """Parse overrides with Hydra's grammar; a key that occurs twice has its last value, as in Hydra."""
     for text in overrides:
         check_override(text)
-    loader: Any = SimpleNamespace(get_group_options=lambda group, *_, **__: group_options(group, *folders.all))
+    own = [] if folders.own is None else [folders.own]
+    loader: Any = SimpleNamespace(get_group_options=lambda group, *_, **__: group_options(group, *own, folders.main))
     parser = OverridesParser.create(config_loader=loader)  # glob(…) asks for the options of a group
     choices: dict[str, _Choice] = {}
     try:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
 
@@ -31,18 +31,17 @@ def conf_dir() -> Path:
     return _shipped_folder("conf", "config.yaml")
 
 
-@dataclass(frozen=True, slots=True)
-class OptionFolders:
-    """The folder with the primary config, its name (None: ``config``), and the user's folder, searched last."""
+class OptionFolders(NamedTuple):
+    """The user's folder, the name of the primary config (None: ``config``) and its folder (None: `conf_dir`)."""
 
-    main: Path = field(default_factory=conf_dir)
-    name: str | None = None
     own: Path | None = None
+    name: str | None = None
+    given_main: Path | None = None
 
     @property
-    def all(self) -> list[Path]:
-        """Folders with options."""
-        return [self.main, *([] if self.own is None else [self.own])]
+    def main(self) -> Path:
+        """Folder of the primary config, which is searched first."""
+        return self.given_main or conf_dir()
 
 
 def manifests_dir() -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 CUTOFF = 0.6
@@ -11,6 +10,8 @@ CUTOFF = 0.6
 
 def suggest(word: str, options: Iterable[str]) -> str | None:
     """Option most similar to ``word``, case and leading hyphens aside; None if none is similar enough (`CUTOFF`)."""
+    import difflib  # --help needs no suggestions
+
     by_letters = {option.lstrip("-").casefold(): option for option in options}
     close = difflib.get_close_matches(word.lstrip("-").casefold(), by_letters, n=1, cutoff=CUTOFF)
     return by_letters[close[0]] if close else None
