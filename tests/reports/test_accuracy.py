@@ -18,7 +18,6 @@ from helpers.promise_report import Figure
 from unprocess_gen import RawPairs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError, MachineError
-from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.accuracy import measure, report
 from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
@@ -102,16 +101,14 @@ def test_every_stage_of_every_tier_has_time_and_error(
 
 def test_errors_are_those_of_the_frames_in_dn_and_in_standard_deviations(settings: Settings, tmp_path: Path) -> None:
     config = settings("source.limit=1", "sensor=generic_14bit")
-    read = PairSettings.read(config)
-    samples = measure.select_inputs(config, tmp_path).samples
-    images = [[measure.plan_sample(read, tier, sample) for sample in samples] for tier in (FAST, REFERENCE)]
+    inputs = measure.select_inputs(config, tmp_path)
+    images = [measure.plan_samples(config, tier, inputs) for tier in (FAST, REFERENCE)]
     (pair,), (exact,) = ([next(image.pairs())[2] for image in planned] for planned in images)
     plan = images[1][0].plans[0]
     std = np.sqrt(noise_variance(exact.clean.astype(float), plan) + 1 / 12)
-    for error, ours, theirs in zip(
-        measure.deviations([pair], [exact], [plan]), (pair.clean, pair.noisy), (exact.clean, exact.noisy), strict=True
-    ):
-        apart = ours.astype(float) - theirs
+    errors = measure.deviations([pair], [exact], [plan])
+    for stage, ours, theirs in (("clean", pair.clean, exact.clean), ("run", pair.noisy, exact.noisy)):
+        error, apart = errors[stage], ours.astype(float) - theirs
         in_std = apart / std
         expected = [np.mean(apart != 0), np.abs(apart).max(), np.sqrt(np.mean(apart**2)), np.abs(in_std).max()]
         np.testing.assert_allclose(error, [*expected, np.sqrt(np.mean(in_std**2))], rtol=1e-12)

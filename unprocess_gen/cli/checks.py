@@ -129,14 +129,13 @@ def _compare_frames(folder: AnyPath, frames: Path) -> list[str]:
     """Compare raw frames of a camera with the profile of a dataset; what differs."""
     from unprocess_gen.config.serialization import read_dataset_yaml
     from unprocess_gen.pipeline.progress import with_bar
-    from unprocess_gen.reports import against
+    from unprocess_gen.reports.against import compare_frames
 
     config, _ = read_dataset_yaml(folder / "config.yaml")
-    comparisons = against.compare_frames(config, frames, partial(with_bar, unit="frame"))
+    comparisons = compare_frames(config, frames, partial(with_bar, unit="frame"))
     for note in comparisons.notes:
         report(note)
-    compared = [comparison for comparison in comparisons.numbers if comparison.verdict != against.NOT_COMPARED]
-    numbers = f"{counted(len(compared), 'number')} compared with the profile {config.noise.name}"
+    numbers = f"{counted(len(comparisons.numbers), 'number')} compared with the profile {config.noise.name}"
     print_results(f"{frames}: {numbers}, {len(comparisons.differences)} wrong")
     return _reported(folder, comparisons.differences)
 

@@ -69,10 +69,6 @@ SAMPLES, SAMPLED_PIXELS = 8, 384 * 512
 """Photographs whose pairs are compared, and most pixels of each."""
 
 
-Deviation = tuple[float, float, float, float, float]
-"""Errors of frames: the last five values of a `Measurement`."""
-
-
 class Measurement(NamedTuple):
     """Time and error of a stage in a tier: one row of ``accuracy.csv``. None means that a time was not measured.
 
@@ -83,11 +79,11 @@ class Measurement(NamedTuple):
     stage: str
     ns_per_pixel: float | None
     ratio_to_exact: float | None
-    changed_share: float
-    max_dn: float
-    rms_dn: float
-    max_std: float
-    rms_std: float
+    changed_share: float = 0.0
+    max_dn: float = 0.0
+    rms_dn: float = 0.0
+    max_std: float = 0.0
+    rms_std: float = 0.0
 
 
 class RunTimes(NamedTuple):
@@ -109,22 +105,16 @@ class AccuracyReport:
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
-    """A photograph whose pairs are compared, subsampled to a regular grid: its centre would be brighter."""
-
-    source: Source
-    sha256: str
-    photograph: Photograph
-
-
-@dataclass(frozen=True, slots=True)
 class Inputs:
-    """Files of the runs, as a config of sources, with their number and pixels, and samples for the errors."""
+    """Files of the runs, as a config of sources, with their number and pixels.
+
+    ``samples`` are the photographs whose pairs are compared, subsampled to a grid: the centre would be brighter.
+    """
 
     source: SourceConfig
     count: int
     pixels: int
-    samples: tuple[Sample, ...]
+    samples: tuple[tuple[Photograph, Source, str], ...]
 
 
 def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
@@ -139,22 +129,25 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
     with temporary as name:
         inputs = select_inputs(config, Path(name))
         times = measure_runs(config, inputs, Path(name) / "dataset")
-    complete = replace(config.source, patch=None), replace(config.output, layout=MOSAIC)
-    settings = PairSettings.read(replace(config, source=complete[0], output=complete[1]))
-    images = {tier: [plan_sample(settings, tier, sample) for sample in inputs.samples] for tier in TIERS}
+    images = {tier: plan_samples(config, tier, inputs) for tier in TIERS}
     pairs = {tier: [next(image.pairs())[2] for image in planned] for tier, planned in images.items()}
-    plans = [image.plans[0] for image in images[REFERENCE]]
     stage_ns = {tier: stages_ns(runs, clean_share(images[tier])) for tier, runs in times.items() if runs}
     rows: list[Measurement] = []
     for tier in TIERS:
-        clean, noisy = deviations(pairs[tier], pairs[REFERENCE], plans)
-        errors = dict(zip(STAGES, ((0.0,) * 5, clean, noisy, (0.0,) * 5, noisy), strict=True))
+        errors = deviations(pairs[tier], pairs[REFERENCE], [image.plans[0] for image in images[REFERENCE]])
         for stage in STAGES:
             ns, exact_ns = (stage_ns[name][stage] if name in stage_ns else None for name in (tier, EXACT))
             ratio = ns / exact_ns if ns is not None and exact_ns else None  # a stage can be too short to be measured
-            rows.append(Measurement(tier, stage, ns, ratio, *errors[stage]))
+            rows.append(Measurement(tier, stage, ns, ratio, *errors.get(stage, ())))
+    conditions = {
+        "command": command,
+        "date": time.strftime("%Y-%m-%d %H:%M %Z"),
+        "machine": platform.platform(),
+        "versions": ", ".join(f"{name} {version(name)}" for name in ("unprocess_gen", "numpy", "numba", "llvmlite")),
+        "settings": f"{config.sensor.bits} bits, noise {config.noise.name}, scene {config.scene.name}",
+    }
     photographs = f"{counted(inputs.count, 'photograph')} ({inputs.pixels / 1e6:.1f} megapixels)"
-    return AccuracyReport(tuple(rows), photographs, config.noise.name, _conditions(config, command))
+    return AccuracyReport(tuple(rows), photographs, config.noise.name, conditions)
 
 
 # -------------------------------------------------------------------------------------------------------------- inputs
@@ -166,8 +159,8 @@ def select_inputs(config: Config, folder: Path) -> Inputs:
     ConfigError if none can be read.
     """
     place, scenes = config.source.place, folder / "photographs"
-    most_pixels = RUN_PIXELS // (len(noise_levels(config.noise)) * config.noise.draws)
-    samples, count, pixels, limit = list[Sample](), 0, 0, 0
+    most_pixels = RUN_PIXELS // frames_per_photograph(config)
+    samples, count, pixels, limit = list[tuple[Photograph, Source, str]](), 0, 0, 0
     for source in list_photographs(config.source).sources:
         limit += 1
         with suppress(SourceError):
@@ -183,7 +176,7 @@ def select_inputs(config: Config, folder: Path) -> Inputs:
             if count <= SAMPLES:
                 step = max(1, math.ceil(math.sqrt(size / SAMPLED_PIXELS)))
                 sampled = photograph.srgb[::step, ::step].copy()  # a view would keep all pixels in memory
-                samples.append(Sample(source, sha256, replace(photograph, srgb=sampled)))
+                samples.append((replace(photograph, srgb=sampled), source, sha256))
         if count == RUN_FILES:
             break
     if not count:
@@ -197,13 +190,18 @@ def select_inputs(config: Config, folder: Path) -> Inputs:
     return Inputs(files, count, pixels, tuple(samples))
 
 
+def frames_per_photograph(config: Config) -> int:
+    """Noisy frames that a run makes of a photograph."""
+    return len(noise_levels(config.noise)) * config.noise.draws
+
+
 # ---------------------------------------------------------------------------------------------------------------- times
 
 
 def measure_runs(config: Config, inputs: Inputs, out: Path) -> dict[str, list[RunTimes]]:
     """Times of the runs of every tier by round; of the reference one, or none if its run would be too long."""
-    frames = len(noise_levels(config.noise)) * config.noise.draws
-    rounds = dict.fromkeys(TIERS, ROUNDS) | {REFERENCE: int(inputs.pixels * frames <= MOST_REFERENCE_PIXELS)}
+    is_short = inputs.pixels * frames_per_photograph(config) <= MOST_REFERENCE_PIXELS
+    rounds = dict.fromkeys(TIERS, ROUNDS) | {REFERENCE: int(is_short)}
 
     def measure(tier: str, number: int) -> RunTimes | None:
         times = time_run(config, inputs, tier, out) if number <= rounds[tier] else None
@@ -242,34 +240,34 @@ def stages_ns(runs: Sequence[RunTimes], clean_share: float) -> dict[str, float]:
 def clean_share(images: Sequence[PlannedImage]) -> float:
     """Share of the clean frames in the time of the pairs of images, from the shortest times of three rounds."""
 
-    def clean(image: PlannedImage) -> object:
-        plan = image.plans[0]
-        if plan.accuracy == REFERENCE:
-            return make_pair(image.srgb, plan.replace(physics=None, effects=("quantise",)))
-        return render_clean(image.srgb, plan)
-
-    def pairs(image: PlannedImage) -> object:
-        return list(image.pairs())
-
-    def time(work: Callable[[PlannedImage], object], _: int) -> float:
+    def time_of(work: Callable[[PlannedImage], object], _: int) -> float:
         return sum(thread_ns(partial(work, image), 1) for image in images)
 
-    times = measure_in_turns({"clean": partial(time, clean), "pairs": partial(time, pairs)}, 3)
+    works = {"clean": _clean_frame, "pairs": lambda image: list(image.pairs())}
+    times = measure_in_turns({name: partial(time_of, work) for name, work in works.items()}, 3)
     return min(min(times["clean"]) / min(times["pairs"]), 1.0)
+
+
+def _clean_frame(image: PlannedImage) -> object:
+    plan = image.plans[0]
+    if plan.accuracy == REFERENCE:
+        return make_pair(image.srgb, plan.replace(physics=None, effects=("quantise",)))
+    return render_clean(image.srgb, plan)
 
 
 # --------------------------------------------------------------------------------------------------------------- errors
 
 
-def plan_sample(settings: PairSettings, tier: str, sample: Sample) -> PlannedImage:
-    """Plan a sample in a tier, with its first noise level and draw."""
-    in_tier = replace(settings, config=replace(settings.config, accuracy=tier))
-    image = plan_pixels(in_tier, sample.photograph, sample.source, sample.sha256)
-    return replace(image, plans=image.plans[:1])
+def plan_samples(config: Config, tier: str, inputs: Inputs) -> list[PlannedImage]:
+    """Plan the samples in a tier as complete mosaics, with their first noise level and draw."""
+    source, output = replace(config.source, patch=None), replace(config.output, layout=MOSAIC)
+    settings = PairSettings.read(replace(config, source=source, output=output, accuracy=tier))
+    images = [plan_pixels(settings, *sample) for sample in inputs.samples]
+    return [replace(image, plans=image.plans[:1]) for image in images]
 
 
-def deviations(pairs: Sequence[Pair], reference: Sequence[Pair], plans: Sequence[Plan]) -> tuple[Deviation, Deviation]:
-    """Errors of the clean and of the noisy frames; σ is that of shot, read and rounding noise at each site."""
+def deviations(pairs: Sequence[Pair], reference: Sequence[Pair], plans: Sequence[Plan]) -> dict[str, list[float]]:
+    """Errors by stage: last values of a `Measurement`; σ is that of shot, read and rounding noise at each site."""
     frames: tuple[list[Float], list[Float], list[Float]] = ([], [], [])
     for pair, exact, plan in zip(pairs, reference, plans, strict=True):
         levels_dn = plan.sensor.black_level_dn, plan.sensor.white_level_dn
@@ -278,24 +276,11 @@ def deviations(pairs: Sequence[Pair], reference: Sequence[Pair], plans: Sequence
         frames[1].append((in_dn(pair.noisy, levels_dn) - in_dn(exact.noisy, levels_dn)).ravel())
         frames[2].append(np.sqrt(noise_variance(clean_dn, plan) + 1 / 12).ravel())
     clean, noisy, std = map(np.concatenate, frames)
-    return _deviation(clean, clean / std), _deviation(noisy, noisy / std)
+    errors = _deviation(noisy, noisy / std)
+    return {"clean": _deviation(clean, clean / std), "noise": errors, "run": errors}
 
 
-def _deviation(in_dn: Float, in_std: Float) -> Deviation:
-    max_dn, max_std = (float(np.abs(errors).max()) for errors in (in_dn, in_std))
-    rms_dn, rms_std = (float(np.sqrt(np.mean(errors**2))) for errors in (in_dn, in_std))
-    return np.count_nonzero(in_dn) / in_dn.size, max_dn, rms_dn, max_std, rms_std
-
-
-# ----------------------------------------------------------------------------------------------------------- conditions
-
-
-def _conditions(config: Config, command: str) -> dict[str, str]:
-    """Facts about the measurement that differ between reports."""
-    return {
-        "command": command,
-        "date": time.strftime("%Y-%m-%d %H:%M %Z"),
-        "machine": platform.platform(),
-        "versions": ", ".join(f"{name} {version(name)}" for name in ("unprocess_gen", "numpy", "numba", "llvmlite")),
-        "settings": f"{config.sensor.bits} bits, noise {config.noise.name}, scene {config.scene.name}",
-    }
+def _deviation(*errors: Float) -> list[float]:
+    """The fraction of sites that differ, and the largest and RMS error, each in DN and in σ."""
+    sizes = [size for error in errors for size in (float(np.abs(error).max()), float(np.sqrt(np.mean(error**2))))]
+    return [np.count_nonzero(errors[0]) / errors[0].size, *sizes]
