@@ -152,8 +152,8 @@ def test_failed_source_has_no_bytes_and_a_reason(settings: Settings, tmp_path: P
     config = settings(f"source.root={tmp_path / 'p'}")
     estimate = estimate_run(config, 1, read_all=True)
     [source] = estimate.source_estimates
-    assert (estimate.bytes, source.reason, source.levels) == (0, "unsupported", ())
-    assert f"fails     000.png: unsupported\n          {source.detail}" in format_estimate(estimate)
+    assert (estimate.bytes, source.levels) == (0, ()) and source.failure is not None
+    assert f"fails     000.png: unsupported\n          {source.failure.text}" in format_estimate(estimate)
 
 
 def test_every_noise_level_is_listed(run_main: RunMain, tmp_path: Path) -> None:

@@ -9,15 +9,14 @@ import numpy as np
 
 from unprocess_gen.calibration.calibrate import Calibration
 from unprocess_gen.calibration.measure import IsoResult
-from unprocess_gen.calibration.profile import ENDS, NamedNumber, estimates, site_names
+from unprocess_gen.calibration.profile import ENDS, estimates, site_names
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
-from unprocess_gen.reports.pictures import figure_png
-from unprocess_gen.reports.report_files import require_libraries
+from unprocess_gen.reports.pictures import figure_png, new_figure
+from unprocess_gen.reports.report_files import require_libraries, write_files
 from unprocess_gen.statistics.scores import NORMAL_95
 
 if TYPE_CHECKING:
@@ -38,39 +37,29 @@ def check_page(page: Path) -> None:
 def write_page(calibration: Calibration, name: str, command: str, page: Path) -> None:
     """Write the page of a calibration."""
     sites = site_names(calibration.sensor)
-    figures = [(f"ISO {result.iso:g}", data_uri(_drawn(result, sites), "png")) for result in calibration.isos]
+    lines = []
+    for entry in (entry for entry in estimates(calibration) if entry.site is None):
+        ends = (short_number(getattr(entry.number, end, None), 4) for end in ENDS)
+        lines.append([entry.name, f"{entry.iso:g}" if entry.iso else "", *ends, entry.unit])
     text = render_page(
         "calibration.html",
         title=f"Calibration of {name}",
         command=command,
         frames=len(calibration.captures.captures),
         notes=calibration.notes,
-        figures=figures,
+        figures=[(f"ISO {result.iso:g}", data_uri(_drawn(result, sites))) for result in calibration.isos],
         against_iso=data_uri(_against_iso(calibration)) if len(calibration.isos) > 1 else "",
-        table=_table(estimates(calibration)),
+        table=PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4)),
     )
-    with machine_errors(page):
-        page.write_text(text, encoding="utf-8")
-
-
-def _table(named: list[NamedNumber]) -> PageTable:
-    """Return the estimates of all sites together as a table."""
-    lines = []
-    for entry in (entry for entry in named if entry.site is None):
-        ends = [short_number(getattr(entry.number, end), 4) if entry.number else "–" for end in ENDS]
-        lines.append((entry.name, f"{entry.iso:g}" if entry.iso else "", *ends, entry.unit))
-    return PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4))
+    write_files(page.parent, {page.name: text.encode()})
 
 
 # ------------------------------------------------------------------------------------------------------------- figures
 
 
 def _drawn(result: IsoResult, sites: list[str]) -> bytes:
-    """Draw the photon transfer curve with residuals, and the histogram of the darks, of one ISO."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(14, 4), layout="constrained")
-    transfer, residuals, histogram = figure.subplots(1, 3)
+    """The photon transfer curve with residuals, and the histogram of the darks, of one ISO."""
+    figure, (transfer, residuals, histogram) = new_figure(14, 4, columns=3)
     _draw_transfer(transfer, residuals, result, sites)
     _draw_histogram(histogram, result)
     return figure_png(figure, DPI)
@@ -119,10 +108,7 @@ AGAINST_ISO = {"dn_per_e": "DN per electron", "read_std_dn": "read noise (DN)", 
 
 def _against_iso(calibration: Calibration) -> bytes:
     """Draw gain, read noise and row noise against ISO, with intervals."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    axes = figure.subplots(1, len(AGAINST_ISO))
+    figure, axes = new_figure(9, 4, columns=len(AGAINST_ISO))
     for place, (name, label) in zip(axes, AGAINST_ISO.items(), strict=True):
         values, lows, highs = (np.array([getattr(result[name], end) for result in calibration.isos]) for end in ENDS)
         errors = np.maximum([values - lows, highs - values], 0)

@@ -38,7 +38,7 @@ SAMPLE = 8
 
 @dataclass(frozen=True, slots=True)
 class SourceEstimate:
-    """The pairs of a source, or why it has none: ``status`` is ``ok``, ``failed`` or ``filtered``.
+    """The pairs of a source, or why it has none.
 
     ``bytes`` is the size of its pairs in a shard, ``seconds`` the time it took to make them. ``levels`` and
     ``predictions`` have an item for each noise level. ``noise_ratio`` compares the noise of the source with the
@@ -46,12 +46,10 @@ class SourceEstimate:
     """
 
     source: Source
-    seconds: float
+    seconds: float = 0.0
+    failure: SourceError | None = None
     bytes: int = 0
     levels: tuple[Plan, ...] = ()
-    status: str = "ok"
-    reason: str | None = None
-    detail: str = ""
     predictions: tuple[tuple[Prediction, ...], ...] = ()
     patches: int = 0
     pairs: int = 0
@@ -126,8 +124,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     try:
         sha256, photograph = load_source(config.source, source, config.output.layout)
     except SourceError as error:
-        seconds = time.perf_counter() - started
-        return SourceEstimate(source, seconds, status=error.status, reason=error.reason, detail=error.text)
+        return SourceEstimate(source, time.perf_counter() - started, error)
     image = plan_pixels(settings, photograph, source, sha256)
     assert image.config is not None
     planned = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
@@ -142,9 +139,9 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
             hashlib.sha256(frame.data)
     return SourceEstimate(
         source,
-        seconds + (time.perf_counter() - started) * config.output.frames,
-        source_bytes(config, *photograph.srgb.shape[:2]),
-        levels,
+        seconds=seconds + (time.perf_counter() - started) * config.output.frames,
+        bytes=source_bytes(config, *photograph.srgb.shape[:2]),
+        levels=levels,
         predictions=predictions,
         patches=len(image.patches),
         pairs=len(image.patches) * len(image.plans),

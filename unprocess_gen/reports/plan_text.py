@@ -78,14 +78,14 @@ def _patch_sentence(config: Config, estimates: Estimates) -> str:
 
 
 def _failure_lines(config: Config, estimates: Estimates) -> list[str]:
-    failed = [source for source in estimates if source.status == "failed"]
-    lines = [f"fails     {source.source.name}: {source.reason}\n          {source.detail}" for source in failed]
-    if len(failed) > config.source.max_failed:
-        lines.append(f"          more than source.max_failed={config.source.max_failed}: the run will exit with 3")
-    if filtered := sum(source.status == "filtered" for source in estimates):
-        lines.append(
-            f"filtered  {filtered} of {len(estimates)} sources read, by source.min_side={config.source.min_side}"
-        )
+    settings = config.source
+    failures = {source.source.name: source.failure for source in estimates if source.failure is not None}
+    failed = {name: failure for name, failure in failures.items() if failure.status == "failed"}
+    lines = [f"fails     {name}: {failure.reason}\n          {failure.text}" for name, failure in failed.items()]
+    if len(failed) > settings.max_failed:
+        lines.append(f"          more than source.max_failed={settings.max_failed}: the run will exit with 3")
+    if filtered := len(failures) - len(failed):
+        lines.append(f"filtered  {filtered} of {len(estimates)} sources read, by source.min_side={settings.min_side}")
     return lines
 
 

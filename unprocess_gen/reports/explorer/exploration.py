@@ -146,7 +146,7 @@ class Exploration:
         saturated = pair.clean == plan.saturated_value
         assert image.config is not None
         levels = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
-        estimate = SourceEstimate(source, 0.0, levels=(plan,), predictions=(levels[plan.place.level][1],))
+        estimate = SourceEstimate(source, levels=(plan,), predictions=(levels[plan.place.level][1],))
         return Shown(
             config=config,
             choices=choices,
