@@ -12,7 +12,7 @@ import unprocess_gen
 
 RECORDS = (
     "simulation.frames.Counts",
-    "simulation.effects.Physics",
+    "simulation.plan.Physics",
     "pipeline.generate.Summary",
     "pipeline.replay.ReplayResult",
 )
