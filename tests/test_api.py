@@ -83,10 +83,12 @@ def test_row_is_a_manifest_row_of_the_pair(config: ug.Config) -> None:
     assert (pair.row["height"], pair.row["width"], pair.row["status"]) == (40, 50, "ok")
 
 
-def test_same_array_and_config_give_the_same_pair(config: ug.Config) -> None:
-    first, second = (ug.make_pair(array, config) for array in (SRGB, np.asfortranarray(SRGB.copy())))
-    assert np.array_equal(first.noisy, second.noisy)
-    assert first.row == second.row
+def test_layout_and_byte_order_in_memory_do_not_matter(config: ug.Config) -> None:
+    deep = SRGB.astype(np.uint16) * 257
+    for array, other in ((SRGB, np.asfortranarray(SRGB.copy())), (deep, deep.astype(">u2"))):
+        first, second = ug.make_pair(array, config), ug.make_pair(other, config)
+        assert np.array_equal(first.noisy, second.noisy)
+        assert first.row == second.row
 
 
 def test_other_pixels_shape_dtype_seed_or_key_give_other_streams(config: ug.Config) -> None:
@@ -102,12 +104,6 @@ def test_other_pixels_shape_dtype_seed_or_key_give_other_streams(config: ug.Conf
         ug.plan_image(SRGB, config, key=5),
     ]
     assert len({plan.stream_key for plan in plans}) == len(plans)
-
-
-def test_big_endian_arrays_have_the_identity_of_native_ones(config: ug.Config) -> None:
-    deep = SRGB.astype(np.uint16) * 257
-    assert ug.plan_image(deep.astype(">u2"), config) == ug.plan_image(deep, config)
-    assert np.array_equal(ug.make_pair(deep.astype(">u2"), config).noisy, ug.make_pair(deep, config).noisy)
 
 
 def test_digest_of_a_source_as_key_gives_its_pair(make: Make, tmp_path: Path) -> None:
@@ -152,11 +148,20 @@ def test_other_arrays_are_value_errors(srgb: Any, config: ug.Config) -> None:
         ug.make_pair(srgb, config)
 
 
-def test_patches_are_refused(config: ug.Config) -> None:
-    patched = dataclasses.replace(config, source=dataclasses.replace(config.source, patch=32))
+@pytest.mark.parametrize(
+    ("overrides", "problem"),
+    [
+        (["source.patch=32"], r"source\.patch=32: .*expected null"),
+        (["source.downscale=60"], r"srgb is \[.*expected at least"),
+        (["output.layout=packed", "source.downscale=40"], r"srgb is \[.*expected at least"),
+        (["noise=imx385", "noise.levels=[1600,6400]"], r"noise\.levels=.*: 2 pairs of an image; expected one; call"),
+        (["noise.draws=2"], r"noise\.draws=.*: 2 pairs of an image; expected one; call make_pair once"),
+    ],
+)
+def test_configs_that_do_not_give_one_pair_are_refused(overrides: list[str], problem: str) -> None:
     for function in (ug.make_pair, ug.plan_image):
-        with pytest.raises(ug.ConfigError, match=r"source\.patch=32: .*expected null"):
-            function(SRGB, patched)
+        with pytest.raises(ug.ConfigError, match=problem):
+            function(SRGB, ug.load_config(overrides))
 
 
 @pytest.mark.parametrize("call", [lambda config: ug.plan_image(SRGB, config), ug.generate])
@@ -169,12 +174,6 @@ def test_incomplete_config_is_refused_with_advice(call: Callable[[ug.Config], ob
 def test_seed_and_key_are_refused_with_a_plan(option: dict[str, Any], config: ug.Config) -> None:
     with pytest.raises(ug.ConfigError, match="a plan has its own seed and key"):
         ug.make_pair(SRGB, ug.plan_image(SRGB, config), **option)
-
-
-@pytest.mark.parametrize("overrides", [["source.downscale=60"], ["output.layout=packed", "source.downscale=40"]])
-def test_arrays_too_small_for_the_config_are_refused(overrides: list[str]) -> None:
-    with pytest.raises(ug.ConfigError, match=r"srgb is \[.*expected at least"):
-        ug.make_pair(SRGB, ug.load_config(overrides))
 
 
 # Develop --------------------------------------------------------------------------------------------------------------
@@ -191,15 +190,24 @@ def test_developed_clean_frame_resembles_the_photograph() -> None:
         assert np.abs(developed.astype(int) - srgb)[2:-2, 2:-2].max() <= 3
 
 
-def test_developing_a_failed_row_is_damage(config: ug.Config) -> None:
-    with pytest.raises(ug.DamageError, match="not a plan"):
-        ug.develop(np.zeros((4, 4), np.uint16), {"key": "00000000"})
+LIGHT = r"raw is float32; expected uint16, .* np\.rint\(light \* \(white - black\)"
 
 
-def test_developing_another_layout_is_a_value_error(config: ug.Config) -> None:
-    pair = ug.make_pair(SRGB, config)
-    with pytest.raises(ValueError, match="raw has 3 dimensions, expected 2 for layout=mosaic"):
-        ug.develop(SRGB, pair.row)
+@pytest.mark.parametrize(
+    ("call", "error", "problem"),
+    [
+        (lambda pair: ug.develop(pair.noisy, {"key": "00000000"}), ug.DamageError, "not a plan"),
+        (lambda pair: ug.develop(SRGB, pair.row), ValueError, "raw has 3 dimensions, expected 2 for layout=mosaic"),
+        (lambda pair: ug.develop(ug.to_light(pair.noisy, pair.row), pair.row), ValueError, LIGHT),
+        (lambda pair: ug.develop(pair.row, pair.noisy), TypeError, r"row is ndarray; .*: develop\(raw, row\)"),
+    ],
+    ids=["no row of a pair", "another layout", "light", "swapped"],
+)
+def test_wrong_frames_and_rows_are_refused(
+    call: Callable[[ug.RawPair], object], error: type[Exception], problem: str, config: ug.Config
+) -> None:
+    with pytest.raises(error, match=problem):
+        call(ug.make_pair(SRGB, config))
 
 
 # Datasets -------------------------------------------------------------------------------------------------------------
@@ -263,20 +271,3 @@ def test_everything_works_inside_a_hydra_application(tmp_path: Path) -> None:
     done = run_process(sys.executable, script, cwd=tmp_path, PYTHONPATH=str(ROOT))
     assert done.stdout.splitlines()[-1:] == ["sony_a7r 6 1 own"], done.stderr
     assert [row["status"] for row in read_rows(tmp_path / "ds" / "manifest.csv")] == ["ok"]
-
-
-@pytest.mark.parametrize(("setting", "value"), [("noise.levels", "[1600,6400]"), ("noise.draws", "2")])
-def test_several_pairs_of_an_array_are_refused(setting: str, value: str) -> None:
-    config = ug.load_config(["noise=imx385", "noise.iso=1600", f"{setting}={value}"])
-
-    with pytest.raises(ug.ConfigError, match=f"{setting}=.*: 2 pairs of an image; expected one; call make_pair once"):
-        ug.make_pair(np.zeros((4, 4, 3), np.uint8), config)
-
-
-def test_develop_states_how_light_is_converted_to_dn() -> None:
-    pair = ug.make_pair(np.zeros((4, 4, 3), np.uint8), ug.load_config())
-
-    with pytest.raises(ValueError, match=r"raw is float32; expected uint16, .* np\.rint\(light \* \(white - black\)"):
-        ug.develop(ug.to_light(pair.noisy, pair.row), pair.row)
-    with pytest.raises(TypeError, match=r"row is ndarray; expected a manifest row or a plan: develop\(raw, row\)"):
-        ug.develop(pair.row, pair.noisy)
