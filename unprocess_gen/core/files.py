@@ -30,7 +30,7 @@ def array_xxh3(array: Array) -> str:
 
 
 def little_endian(array: Array) -> Array:
-    """Return an array as contiguous little-endian numbers, without a copy if it is that already."""
+    """Contiguous little-endian numbers of an array, without a copy if it is that already."""
     import numpy as np  # takes longer than the start of a command may
 
     from unprocess_gen.core.arrays import DESCRIPTIONS
@@ -45,7 +45,7 @@ def file_sha256(path: Path | ObjectPath) -> str:
 
 
 def machine_error(error: OSError, path: Path | ObjectPath, advice: str = "") -> MachineError:
-    """Return a failed file operation as one sentence: path, reason, free space if it matters, and ``advice``.
+    """Describe a failed file operation in one sentence: path, reason, free space if it matters, and ``advice``.
 
     ``path`` is the file or folder in use, for errors that name none.
     """

@@ -300,7 +300,7 @@ def nearest_between(
 
 
 def _share(x: float, low: float, high: float) -> tuple[int, int]:
-    """Return ln(x / low) / ln(high / low), from 0 to 1, and its error.
+    """ln(x / low) / ln(high / low), from 0 to 1, and its error.
 
     The quotient is within its error times the reciprocal of the divisor, and one unit.
     """

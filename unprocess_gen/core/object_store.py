@@ -117,12 +117,12 @@ class ObjectPath:
 
     @property
     def name(self) -> str:
-        """Return the last part of the key, or the bucket's name without a key."""
+        """Last part of the key, or the bucket's name without a key."""
         return (self.key or self.bucket).rpartition("/")[2]
 
     @property
     def parent(self) -> ObjectPath:
-        """Return the URL without its last part."""
+        """URL without its last part."""
         return ObjectPath(f"{self.scheme}://{self.bucket}/{self.key.rpartition('/')[0]}")
 
     @property
@@ -131,7 +131,7 @@ class ObjectPath:
         return (self.parent, *self.parent.parents) if self.key else ()
 
     def resolve(self) -> ObjectPath:
-        """Return the URL itself; object stores have no links."""
+        """URL itself; object stores have no links."""
         return self
 
     # -------------------------------------------------------------------------------------------------- as a folder
@@ -190,7 +190,7 @@ class ObjectPath:
         return None
 
     def stat(self) -> SimpleNamespace:
-        """Return the size of the object as ``st_size``; FileNotFoundError if there is none."""
+        """Size of the object as ``st_size``; FileNotFoundError if there is none."""
         return SimpleNamespace(st_size=self._object().size)
 
     def _object(self) -> Entry:
@@ -220,12 +220,12 @@ class ObjectPath:
         yield io.BytesIO(content), size
 
     def read_bytes(self) -> bytes:
-        """Return the content of the object; raise FileNotFoundError or MachineError."""
+        """Content of the object; raises FileNotFoundError or MachineError."""
         with self.open_listed(0) as (file, _):
             return file.read()
 
     def read_text(self, encoding: str = "utf-8") -> str:
-        """Return the content of the object as text."""
+        """Content of the object as text."""
         return self.read_bytes().decode(encoding)
 
     def mapped(self, offset: int, size: int) -> tuple[bytearray, int]:
@@ -332,7 +332,7 @@ class _Reader(io.RawIOBase):
 
 @lru_cache(maxsize=64)
 def _store(scheme: str, bucket: str) -> Any:
-    """Return obstore's client of a bucket."""
+    """Client of obstore for a bucket."""
     from obstore.store import from_url
 
     return from_url(
@@ -364,7 +364,7 @@ def _request(path: ObjectPath) -> Iterator[tuple[Any, Any]]:
 
 
 def _error(path: ObjectPath, error: Exception, is_refused: bool = False) -> Exception:
-    """Return an error of obstore as one of this module's errors."""
+    """Turn an error of obstore into one of this module's."""
     reason = _reason(error)
     if any(code in reason for code in MISSING_BUCKET):
         return StoreAccessError(
@@ -381,7 +381,7 @@ def _error(path: ObjectPath, error: Exception, is_refused: bool = False) -> Exce
 
 
 def _reason(error: Exception) -> str:
-    """Return the short form of an error of obstore, whose message has some forty lines."""
+    """Short form of an error of obstore, whose message has some forty lines."""
     text = str(error)
     status, code, message = (
         re.search(pattern, text)

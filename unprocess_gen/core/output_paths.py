@@ -16,7 +16,7 @@ DATASET_ENTRIES = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".wo
 
 
 def enclosing_dataset(path: Path) -> Path | None:
-    """Return the nearest dataset, finished or begun, that is a path itself or a parent of it; None without one."""
+    """Nearest dataset, finished or begun, that is a path itself or a parent of it; None without one."""
     resolved = Path(os.path.realpath(path))
     return next((folder for folder in (resolved, *resolved.parents) if is_dataset(folder)), None)
 
@@ -67,7 +67,7 @@ def check_output_file(file: Path, option: str, expected: str, *marks: bytes) -> 
 
 
 def _first_bytes(file: Path, option: str) -> bytes:
-    """Return the first 1,024 bytes of a file; ConfigError if it cannot be read."""
+    """First 1,024 bytes of a file; ConfigError if it cannot be read."""
     try:
         with file.open("rb") as stream:
             return stream.read(1024)

@@ -56,7 +56,7 @@ class LocalPath(_NativePath):
             return open(self, mode, *arguments, opener=opener, **options)
 
     def resolve(self, strict: bool = False) -> LocalPath:
-        """Return the path without links; links that form a circle are kept."""
+        """Path without links; links that form a circle are kept."""
         return LocalPath(os.path.realpath(self, strict=strict))
 
     def is_listed(self) -> bool:
@@ -191,14 +191,14 @@ AnyPath = Path | ObjectPath
 
 
 def any_path(text: str | os.PathLike[str] | ObjectPath) -> LocalPath | ObjectPath:
-    """Return the path that a text names: an `ObjectPath` only for ``s3://…``, ``gs://…`` and ``az://…``."""
+    """Path that a text names: an `ObjectPath` only for ``s3://…``, ``gs://…`` and ``az://…``."""
     if isinstance(text, LocalPath | ObjectPath):
         return text
     return ObjectPath(text) if isinstance(text, str) and is_url(text) else LocalPath(text)
 
 
 def local_path(text: str | AnyPath, refusal: str) -> Path:
-    """Return the local path that a text names; raise ConfigError with a sentence if it is a URL."""
+    """Local path that a text names; ConfigError with a sentence if it is a URL."""
     path = any_path(text)
     if isinstance(path, ObjectPath):
         raise ConfigError(refusal)
@@ -206,7 +206,7 @@ def local_path(text: str | AnyPath, refusal: str) -> Path:
 
 
 def absolute_text(text: str | None) -> str | None:
-    """Return a place that does not depend on the current folder; a URL and None are returned as they are."""
+    """Place that does not depend on the current folder; a URL and None stay as they are."""
     return text if text is None or is_url(text) else os.path.abspath(text)
 
 

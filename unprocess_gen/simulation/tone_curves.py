@@ -43,6 +43,14 @@ DIFFERENCES = 4
 """Order of the stored differences. Neighbouring entries differ smoothly, so 512 kB per curve become 40 kB."""
 
 
+def gamma_text(gamma: float | str) -> str:
+    """Text of a gamma in the manifest: ``srgb``, or the shortest decimal number, such as ``1`` or ``2.2``."""
+    if gamma == "srgb":
+        return "srgb"
+    number = float(gamma)
+    return str(int(number)) if number.is_integer() else repr(number)
+
+
 def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
     """Curve from code to linear light: float64 [codes], from 0 to 1, correctly rounded, read-only.
 
@@ -123,22 +131,3 @@ def store_curves(path: Path) -> None:
 
 if __name__ == "__main__":
     store_curves(STORED_CURVES)
-
-
-def gamma_text(gamma: float | str) -> str:
-    """Return the text of a gamma in the manifest.
-
-    Parameters
-    ----------
-    gamma : float or str
-        Exponent, or ``"srgb"``.
-
-    Returns
-    -------
-    str
-        ``"srgb"``, or the shortest decimal number, such as ``"1"`` or ``"2.2"``.
-    """
-    if gamma == "srgb":
-        return "srgb"
-    number = float(gamma)
-    return str(int(number)) if number.is_integer() else repr(number)

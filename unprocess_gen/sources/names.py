@@ -14,7 +14,7 @@ _ESCAPED = re.compile(rb"%([0-9A-F]{2})")
 
 
 def encode_name(path: str) -> str:
-    """Return a path as the manifest spells it; `decode_name` reverses it.
+    """Spelling of a path in the manifest; `decode_name` reverses it.
 
     ``%``, control and bidirectional characters, bytes that are not UTF-8 and a leading ``= + - @`` become ``%XX``.
     """
@@ -25,7 +25,7 @@ def encode_name(path: str) -> str:
 
 
 def decode_name(name: str) -> str:
-    """Return the path of a name in the manifest as the operating system spells it."""
+    """Path of a name in the manifest as the operating system spells it."""
     data = name.encode("utf-8", "surrogateescape")
     return os.fsdecode(_ESCAPED.sub(lambda match: bytes((int(match[1], 16),)), data))
 

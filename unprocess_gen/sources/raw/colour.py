@@ -30,24 +30,11 @@ LIGHT_K = {
 
 @dataclass(frozen=True, slots=True)
 class DngColour:
-    """Colour tags of a DNG.
+    """Colour tags of a DNG: ColorMatrix1, and 2 if there is one, and CameraCalibration1 and 2.
 
-    Attributes
-    ----------
-    matrices : tuple of Matrix
-        ColorMatrix1, and ColorMatrix2 if there is one.
-    lights_k : tuple of float
-        Colour temperatures of their CalibrationIlluminants; 0 if unknown.
-    calibrations : tuple of Matrix
-        CameraCalibration1 and 2.
-    balance : tuple of three floats
-        AnalogBalance.
-    neutral : Neutral or None
-        AsShotNeutral.
-    white_xy : XY or None
-        AsShotWhiteXY.
-    has_third : bool
-        Whether there is a ColorMatrix3 (DNG 1.6), which is not used.
+    ``lights_k`` are the colour temperatures of the CalibrationIlluminants, 0 if unknown; ``balance`` is AnalogBalance,
+    ``neutral`` AsShotNeutral, ``white_xy`` AsShotWhiteXY. ``has_third``: there is a ColorMatrix3 (DNG 1.6), which is
+    not used.
     """
 
     matrices: tuple[Matrix, ...]
@@ -59,7 +46,7 @@ class DngColour:
     has_third: bool = False
 
     def matrix_at(self, white: XY) -> Matrix:
-        """Return the matrix from XYZ to the camera at a white point; the first one if only one light is known."""
+        """Matrix from XYZ to the camera at a white point; the first one if only one light is known."""
         if len(self.matrices) == 1 or not all(self.lights_k) or self.lights_k[0] == self.lights_k[1]:
             mixed, calibration = self.matrices[0], self.calibrations[0]
         else:
@@ -74,7 +61,7 @@ class DngColour:
         return matrix([self.balance[place // 3] * entry for place, entry in enumerate(calibrated)])
 
     def white(self) -> XY:
-        """Return the white point of the frame: AsShotWhiteXY, else from AsShotNeutral, else D50."""
+        """White point of the frame: AsShotWhiteXY, else from AsShotNeutral, else D50."""
         if self.white_xy is not None or self.neutral is None:
             return self.white_xy or D50
         last = before = D50
@@ -85,7 +72,7 @@ class DngColour:
         return (last[0] + before[0]) / 2, (last[1] + before[1]) / 2
 
     def gains(self) -> tuple[float, float] | None:
-        """Return the gains of red and blue that make the white point gray; None if no tag states it."""
+        """Gains of red and blue that make the white point gray; None if no tag states it."""
         if self.neutral is not None:
             red, green, blue = self.neutral
             return green / red, green / blue
@@ -93,7 +80,7 @@ class DngColour:
 
 
 def temperature(white: XY) -> float:
-    """Return the correlated colour temperature of a chromaticity, kelvin, between 1667 and 100,000 (McCamy 1992)."""
+    """Correlated colour temperature of a chromaticity, kelvin, between 1667 and 100,000 (McCamy 1992)."""
     n = (white[0] - 0.3320) / (0.1858 - white[1])
     return min(max(((449.0 * n + 3525.0) * n + 6823.3) * n + 5520.33, 1667.0), 100_000.0)
 
