@@ -9,6 +9,8 @@ from sphinx import addnodes
 from sphinx.application import Sphinx
 
 import unprocess_gen
+from unprocess_gen.core.fields import Field
+from unprocess_gen.simulation.plan import PlanRecord, fields_of
 
 RECORDS = (
     "simulation.frames.Counts",
@@ -81,6 +83,17 @@ def _ancestors(node: nodes.Node) -> Iterator[nodes.Element]:
         yield node
 
 
+def list_fields(app: Sphinx, what: str, name: str, record: object, options: object, lines: list[str]) -> None:
+    """List the fields of a record, whose meanings stand in their annotations, as the section Attributes."""
+    if what != "class" or not issubclass(record, PlanRecord):
+        return
+    lines += ["", "Attributes", "----------"]
+    for field, (kind, declared) in fields_of(record).items():
+        text = ", ".join(filter(None, (declared.meaning, declared.unit))) if isinstance(declared, Field) else "record"
+        lines += [f"{field} : {getattr(kind, '__name__', kind)}", f"    {text}"]
+
+
 def setup(app: Sphinx) -> None:
-    """Connect the index of keys."""
+    """Connect the index of keys, and the fields of records before numpydoc reads docstrings."""
     app.connect("doctree-read", index_keys)
+    app.connect("autodoc-process-docstring", list_fields, priority=100)

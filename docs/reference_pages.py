@@ -19,9 +19,10 @@ from unprocess_gen.config.interpretation import needed_numbers
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings, group_settings
 from unprocess_gen.config.settings import Setting, settings_of
-from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import REASONS
-from unprocess_gen.dataset.columns import COLUMNS
+from unprocess_gen.core.fields import value_text
+from unprocess_gen.dataset.columns import TYPE_NAMES
+from unprocess_gen.dataset.row import COLUMNS
 from unprocess_gen.simulation.effects import EFFECTS
 
 GENERATED_NOTE = "<!-- from the code: python docs/update_reference.py -->"
@@ -195,7 +196,7 @@ def columns_page() -> str:
         [
             code(column.name),
             column.meaning,
-            column.type_name,
+            TYPE_NAMES[column.type],
             column.unit,
             column.empty_if,
             column.needs.unless,

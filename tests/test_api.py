@@ -20,8 +20,8 @@ from PIL import Image
 
 import unprocess_gen as ug
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.dataset.columns import COLUMN_NAMES
-from unprocess_gen.dataset.manifest import plan_from_row, read_rows
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.row import COLUMN_NAMES, plan_from_row
 from unprocess_gen.simulation.pair import make_pair as make_inner_pair
 from unprocess_gen.sources.loader import downscaled
 

@@ -9,7 +9,7 @@ import pytest
 from helpers.cases import slow_except
 
 import unprocess_gen as ug
-from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS

@@ -28,10 +28,10 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.source import Source
+from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.keys import key_text
-from unprocess_gen.dataset.manifest import pair_row, plan_from_row
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.dataset.row import Row, Value
+from unprocess_gen.dataset.row import pair_row, plan_from_row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline import generate as _generate
 from unprocess_gen.pipeline import replay as _replay

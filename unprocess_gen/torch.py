@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unprocess_gen.dataset.manifest import plan_from_row
-from unprocess_gen.dataset.row import Value
+from unprocess_gen.dataset.columns import Value
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS, plane_sites, tile

@@ -31,7 +31,7 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.source import Source
-from unprocess_gen.dataset.manifest import pair_row
+from unprocess_gen.dataset.row import pair_row
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns

@@ -25,7 +25,6 @@ from unprocess_gen.config import distributions
 from unprocess_gen.config.composition import compose_node, load_config
 from unprocess_gen.config.distributions import parse_distribution
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS
-from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.config.schema import Config, all_settings, replaced
 from unprocess_gen.config.serialization import (
@@ -40,6 +39,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import parse_yaml_mapping
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import Choice
 from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.simulation import tone_curves
 from unprocess_gen.simulation.facts import Facts

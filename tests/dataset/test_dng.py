@@ -25,7 +25,7 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset import dng
-from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.colour import CAMERAS

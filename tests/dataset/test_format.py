@@ -13,9 +13,9 @@ from helpers.datasets import samples_json
 from helpers.photographs import fill
 
 import unprocess_gen as ug
-from unprocess_gen.dataset.columns import COLUMN_NAMES, columns_of
 from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import read_columns, read_rows
+from unprocess_gen.dataset.row import COLUMN_NAMES, columns_of
 
 
 @pytest.fixture(scope="module")

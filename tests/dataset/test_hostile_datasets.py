@@ -18,15 +18,9 @@ from helpers.photographs import fill
 
 from unprocess_gen import DamageError, RawPairs
 from unprocess_gen.dataset.dataset_json import check_dataset_json, dataset_text, fingerprint, read_dataset
-from unprocess_gen.dataset.manifest import (
-    MAX_DETAIL,
-    MAX_LINE_BYTES,
-    detail_text,
-    plan_from_row,
-    read_row,
-    read_rows,
-)
+from unprocess_gen.dataset.manifest import MAX_LINE_BYTES, read_row, read_rows
 from unprocess_gen.dataset.reader import sweep_folders
+from unprocess_gen.dataset.row import MAX_DETAIL, detail_text, plan_from_row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.dataset.shards import read_index
 from unprocess_gen.pipeline.replay import replay

@@ -17,19 +17,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import REASONS, DamageError
+from unprocess_gen.core.fields import Numbers
 from unprocess_gen.core.source import Source
-from unprocess_gen.dataset.columns import COLUMN_NAMES, COLUMNS, Range, columns_of
-from unprocess_gen.dataset.manifest import (
+from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.dataset.row import (
+    COLUMN_NAMES,
+    COLUMNS,
+    columns_of,
     failed_row,
     pair_row,
     patch_from_row,
     plan_from_row,
-    read_rows,
     row_json,
     without_empty,
-    write_rows,
 )
-from unprocess_gen.dataset.row import Row
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.plan import (
@@ -89,8 +91,8 @@ BY_NAME = {column.name: column for column in COLUMNS}
 
 def number(name: str) -> st.SearchStrategy[float]:
     """Return any number that a column allows."""
-    allowed = BY_NAME[name].allowed
-    assert isinstance(allowed, Range)
+    allowed = BY_NAME[name].limit
+    assert isinstance(allowed, Numbers)
     return st.floats(allowed.low, allowed.high).map(lambda value: value + 0.0)  # no -0.0, which reads as 0
 
 
@@ -157,7 +159,7 @@ plans = st.builds(
     split=st.sampled_from(["", "train", "fold-3"]),
 )
 names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40).filter(
-    BY_NAME["source"].allowed.__contains__
+    BY_NAME["source"].limit.allows
 )
 
 

@@ -10,9 +10,9 @@ from helpers.records import PAIR, PATCH, PLAN, SHA256, SOURCE
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.dataset.columns import COLUMN_NAMES
-from unprocess_gen.dataset.manifest import failed_row, pair_row, write_rows
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.manifest import write_rows
+from unprocess_gen.dataset.row import COLUMN_NAMES, failed_row, pair_row
 from unprocess_gen.dataset.selection import parse_keys, select_pairs, select_rows
 
 DIGESTS = "1" * 32, "2" * 32

@@ -22,7 +22,7 @@ from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.dataset import shards
-from unprocess_gen.dataset.manifest import without_empty
+from unprocess_gen.dataset.row import without_empty
 from unprocess_gen.dataset.shards import (
     ArrayFormat,
     Member,

@@ -10,11 +10,12 @@ from typing import Any
 from helpers.commands import run_process
 from unprocess_gen import RawPairs
 from unprocess_gen.core.files import file_sha256
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text
 from unprocess_gen.dataset.keys import key_text
-from unprocess_gen.dataset.manifest import read_columns, row_json, write_rows
+from unprocess_gen.dataset.manifest import read_columns, write_rows
 from unprocess_gen.dataset.reader import Sample
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import row_json
 from unprocess_gen.dataset.shards import ShardWriter, member_of, shard_name
 
 PEAK = """

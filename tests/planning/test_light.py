@@ -10,7 +10,8 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 
-from unprocess_gen.dataset.manifest import plan_from_row, read_rows
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.reference.light import LIGHTS, chromaticity
 

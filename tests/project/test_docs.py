@@ -18,12 +18,13 @@ from unprocess_gen.cli.help import global_help, synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
-from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import REASONS
-from unprocess_gen.dataset.columns import COLUMNS
+from unprocess_gen.core.fields import Choice
+from unprocess_gen.dataset.columns import TYPE_NAMES
+from unprocess_gen.dataset.row import COLUMNS
 
 HELP = global_help(VERBS)
 ROOT = Path(__file__).parents[2]
@@ -146,7 +147,7 @@ def test_every_column_is_explained() -> None:
     for column in COLUMNS:
         assert column.meaning and not column.meaning.endswith("."), column.name
         assert column.unit.startswith(promised_unit(column.name)), column.name
-        row = rf"^\| `{column.name}`(\\\*)? \| {re.escape(column.meaning)} \| {column.type_name} \|"
+        row = rf"^\| `{column.name}`(\\\*)? \| {re.escape(column.meaning)} \| {TYPE_NAMES[column.type]} \|"
         assert re.search(row, page, re.MULTILINE), column.name
 
 
@@ -164,7 +165,7 @@ def test_every_verb_and_flag_is_explained() -> None:
 
 
 def test_columns_allow_every_value_that_settings_allow() -> None:
-    columns = {column.name: column.allowed for column in COLUMNS}
+    columns = {column.name: column.limit for column in COLUMNS}
     pairs = {"isp.tone": "tone", "gains.highlight": "highlight", "noise.law": "noise_law", "sensor.pattern": "pattern"}
     pairs |= {"sensor.saturated": "saturated_as", "sensor.dark_offset": "dark_offset", "sensor.clip": "sensor_clip"}
     pairs |= {"source.dequantize": "dequantize", "output.dtype": "dtype", "output.layout": "layout"}
@@ -173,7 +174,7 @@ def test_columns_allow_every_value_that_settings_allow() -> None:
     for setting, column in pairs.items():
         limit = limits[setting]
         assert isinstance(limit, Choice), setting
-        assert all(word in columns[column] for word in {*limit.words} - resolved.get(setting, set())), setting
+        assert all(columns[column].allows(word) for word in {*limit.words} - resolved.get(setting, set())), setting
 
 
 # Pages ----------------------------------------------------------------------------------------------------------------

@@ -23,8 +23,8 @@ from unprocess_gen import RawPairs, make_pair
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.dataset.manifest import plan_from_row
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.reports.noise_check import repeat
 from unprocess_gen.reports.noise_check.checks import (
     LEAST_SITES,

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.reports import panels, sheets
 from unprocess_gen.simulation.reference import isp as process
 from unprocess_gen.simulation.reference import unprocess

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import astuple
 
+import msgspec
 import numpy as np
 import pytest
 from helpers.promise_report import Figure
@@ -261,7 +261,7 @@ def test_float32_noisy_frames_and_counts_are_near_the_reference(
     moved_dn = COARSE_ERROR * np.sqrt(variance_dn2) + (0.01 if bits == 16 else 0.002)
     assert apart.max() <= 1
     assert (apart > 0).mean() <= moved_dn.mean()  # what moves a value by so much moves it over an edge so often
-    for one, other in zip(astuple(single.counts), astuple(exact.counts), strict=True):
+    for one, other in zip(msgspec.structs.astuple(single.counts), msgspec.structs.astuple(exact.counts), strict=True):
         assert abs((one or 0) - (other or 0)) <= 0.002 * apart.size
 
 

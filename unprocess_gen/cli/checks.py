@@ -17,7 +17,7 @@ from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
     from unprocess_gen.core.paths import AnyPath
-    from unprocess_gen.dataset.row import Row
+    from unprocess_gen.dataset.columns import Row
     from unprocess_gen.pipeline.replay import ReplayResult
 
 

@@ -101,7 +101,7 @@ def group_help(group: str) -> str:
     """Help of one group of settings: its options and its keys."""
     from unprocess_gen.config.defaults import default_options, default_values
     from unprocess_gen.config.schema import GROUPS, group_settings
-    from unprocess_gen.config.values import value_text
+    from unprocess_gen.core.fields import value_text
 
     parts = []
     if options := [option for option in group_options(group) if option != "default"]:

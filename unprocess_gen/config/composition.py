@@ -45,9 +45,9 @@ from unprocess_gen.config.raw_validation import check_raw_overrides
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.config.values import value_text
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import value_text
 
 SCHEMA_NAME = "gen_dataset_schema"
 """Name of the schema in Hydra's ConfigStore; first entry of the defaults list in ``conf/config.yaml``."""

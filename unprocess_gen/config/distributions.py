@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, spelled
 from unprocess_gen.config.limits import Drawn
-from unprocess_gen.config.values import is_number, refusal
+from unprocess_gen.config.values import refusal
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_quantile
+from unprocess_gen.core.fields import is_number
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,9 @@ from unprocess_gen.config.schema import (
     ProvenanceConfig,
     SourceConfig,
 )
-from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
+from unprocess_gen.config.values import refusal
 from unprocess_gen.core.arrays import FLOAT32
+from unprocess_gen.core.fields import is_integer, is_number, value_text
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.dark_current import HEAT
 

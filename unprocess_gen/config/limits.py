@@ -1,8 +1,4 @@
-"""Define which values a setting allows. Checks, messages and documentation use the same objects.
-
-Each limit names the allowed values in words: ``str(limit)`` follows "expected" in messages and fills the column
-"allowed" of ``docs/reference/settings.md``. Importing this module imports nothing slow, because ``--help`` needs it.
-"""
+"""Limits of settings that several modules use, and limits of values that no field of a plan has (`core.fields`)."""
 
 from __future__ import annotations
 
@@ -11,36 +7,11 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
+from unprocess_gen.config.values import refusal
+from unprocess_gen.core.fields import Choice, Limit, is_number, value_text
 from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.simulation.reference.light import LIGHTS
-
-Test = Callable[[Any], bool]
-
-
-class Limit:
-    """Allowed values of one setting.
-
-    ``text`` names them, ``allows`` tests a value by itself, ``shown`` is the value in messages. Without ``allows``, a
-    value is checked together with other settings, or by the function that parses it. ``is_float`` limits
-    are for numbers that are written as floats.
-    """
-
-    def __init__(self, text: str, allows: Test = lambda value: True, shown: Callable[[Any], str] = value_text) -> None:
-        self.text, self.allows, self.shown, self.is_float = text, allows, shown, False
-
-    def __str__(self) -> str:
-        return self.text
-
-
-class Choice(Limit):
-    """One of a few words."""
-
-    def __init__(self, *words: str) -> None:
-        self.words = words
-        super().__init__(f"one of {', '.join(words)}", lambda value: value in words)
-
 
 YAML_SWITCHES = {"True": "on", "False": "off"}
 """Text of the booleans that YAML reads from on and off without quotes."""
@@ -48,51 +19,6 @@ YAML_SWITCHES = {"True": "on", "False": "off"}
 
 class Switch(Choice):
     """One of a few words, of which YAML may have read on or off as a boolean; `schema.Group` restores them."""
-
-
-class Integers(Limit):
-    """An integer from ``low`` to ``high``, or the one in ``other``, whose meaning is ``remark``."""
-
-    def __init__(self, low: int, high: int, other: int | None = None, remark: str = "") -> None:
-        super().__init__(
-            f"{low} to {high}{remark}",
-            lambda value: is_integer(value) and (low <= value <= high or value == other),
-        )
-
-
-class Numbers(Limit):
-    """A finite number from ``low`` to ``high``; ``open_low`` and ``open_high`` exclude the ends."""
-
-    def __init__(self, low: float, high: float = math.inf, open_low: bool = False, open_high: bool = False) -> None:
-        if open_high:
-            text = f"{low:g} up to, but not including, {high:g}"
-        elif open_low:
-            text = f"more than {low:g}, up to {high:g}"
-        else:
-            text = f"a number of {low:g} or more" if high == math.inf else f"{low:g} to {high:g}"
-        first, last = math.nextafter(low, math.inf) if open_low else low, math.nextafter(high, 0) if open_high else high
-        super().__init__(text, lambda value: is_number(value) and first <= value <= last)
-        self.is_float = True
-
-
-class NumberList(Limit):
-    """A list of ``count`` numbers, each within ``numbers``."""
-
-    def __init__(self, count: int, numbers: Numbers) -> None:
-        super().__init__(
-            f"a list of {count} numbers, each {numbers}",
-            lambda value: len(value) == count and all(map(numbers.allows, value)),
-        )
-
-
-class NumberOrWord(Limit):
-    """A number, or one word; ``text`` contains ``{word}`` and ``{numbers}``."""
-
-    def __init__(self, word: str, numbers: Numbers | Integers, text: str) -> None:
-        super().__init__(
-            text.format(word=word, numbers=numbers), lambda value: bool(value == word) or numbers.allows(value)
-        )
-        self.is_float = numbers.is_float
 
 
 def text(what: str) -> Limit:

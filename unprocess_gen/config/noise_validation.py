@@ -24,7 +24,8 @@ from unprocess_gen.config.schema import (
     SceneConfig,
 )
 from unprocess_gen.config.settings import settings_of
-from unprocess_gen.config.values import is_number, one_of, refusal, value_text
+from unprocess_gen.config.values import one_of, refusal
+from unprocess_gen.core.fields import is_number, value_text
 from unprocess_gen.simulation.effects.lens_shading import illumination_at
 
 MAX_ELECTRONS = 1e9

@@ -11,8 +11,8 @@ from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.serialization import recorded
-from unprocess_gen.config.values import is_number
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import is_number
 
 NAMED_GROUPS = ("camera", "noise", "scene")
 """Groups whose config contains the name of its option."""

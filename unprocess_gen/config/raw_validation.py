@@ -8,8 +8,9 @@ from collections.abc import Iterable
 from unprocess_gen.config.interpretation import is_physical, uses_dark_frames
 from unprocess_gen.config.schema import Config, RawConfig, SourceConfig
 from unprocess_gen.config.settings import settings_of
-from unprocess_gen.config.values import refusal, value_text
+from unprocess_gen.config.values import refusal
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import value_text
 from unprocess_gen.simulation.reference.cfa import MONO
 
 PHOTOGRAPH_SETTINGS = {"downscale": 1, "dequantize": "off", "icc": "ignore"}

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional, TypeVar
 
 from unprocess_gen.config import limits
-from unprocess_gen.config.limits import Choice, Integers, IsoForm, Limit, NumberList, NumberOrWord, Numbers
+from unprocess_gen.config.limits import IsoForm
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
-from unprocess_gen.config.values import is_number
+from unprocess_gen.core.fields import Choice, Integers, Limit, NumberList, NumberOrWord, Numbers, is_number
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.numbers import SHAPE, SITES, Number
@@ -321,7 +321,7 @@ def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
         null = number.optional or f"not known, so the effect {effect.name} cannot be simulated"
         kind = Optional[float] if number.count == 1 else Optional[tuple[float, ...]]
     if number.in_branch:
-        kind = str if number.words else Any
+        kind = str if isinstance(number.limit, Choice) else Any
     section, meaning = "" if number.in_branch else PHYSICAL, number.key_meaning or number.meaning
     unit = number.key_unit or ("DN of the profile" if number.unit == "DN" else number.unit)
     return kind, key(number.key_default, limit, section, meaning=meaning, unit=unit, null=null)
@@ -331,10 +331,12 @@ def _limit(number: Number) -> Limit:
     """Return the values that the key of a number allows."""
     if number.kind in (SHAPE, SITES):
         return limits.READ_SHAPE if number.kind == SHAPE else limits.BLACK_ERROR
+    if isinstance(number.limit, Choice):
+        return number.limit
     if number.in_branch:
-        return Choice(*number.words) if number.words else IsoForm()
-    numbers = Numbers(number.low, number.high)
-    return numbers if number.count == 1 else NumberList(number.count, numbers)
+        return IsoForm()
+    numbers = number.key_limit or number.limit
+    return NumberList(number.count, numbers) if isinstance(numbers, Numbers) and number.count > 1 else numbers
 
 
 def _number_fields(in_branch: bool) -> Fields:

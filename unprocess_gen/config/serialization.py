@@ -25,9 +25,10 @@ from unprocess_gen.config.schema import (
 )
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
-from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
+from unprocess_gen.config.values import error_in_one_line, one_of
 from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_mapping, read_yaml_text
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import is_number, value_text
 from unprocess_gen.core.paths import AnyPath
 
 if TYPE_CHECKING:

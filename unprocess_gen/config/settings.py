@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from unprocess_gen.config.limits import Limit
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import Limit
 
 METADATA = "setting"
 """Key of a field's metadata that holds its `Setting`."""

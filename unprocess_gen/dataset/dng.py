@@ -38,9 +38,9 @@ from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath, LocalPath
-from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.plan import Plan

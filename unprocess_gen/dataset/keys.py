@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.plan import Plan
 

@@ -17,9 +17,10 @@ from unprocess_gen.core.arrays import FLOAT32, PACKED, UINT16, Float, Frame
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
+from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.keys import sample_key
-from unprocess_gen.dataset.manifest import has_frames, read_columns, read_row, rows_with_offsets
-from unprocess_gen.dataset.row import Row, Value
+from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
+from unprocess_gen.dataset.row import has_frames
 from unprocess_gen.dataset.shards import (
     ArrayFormat,
     Member,

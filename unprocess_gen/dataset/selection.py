@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.dataset.columns import KEY_TEXT
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import image_key, key_text, sample_key
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import KEY_TEXT
 
 KEYS_FORM = (
     "expected source indices and ranges such as 3,7-9, or keys: 00000003 names all pairs of an image, "
@@ -90,7 +90,7 @@ def parse_keys(text: str) -> KeySelection:
             if last < first:
                 raise ConfigError(f"--keys {item}: ends before it begins; expected {last}-{first}")
             ranges[item] = range(first, last + 1)
-        elif item in KEY_TEXT:
+        elif KEY_TEXT.allows(item):
             names[item] = item
         else:
             raise ConfigError(f"--keys {text[:60]}: {item[:40]!r} is no key; {KEYS_FORM}")

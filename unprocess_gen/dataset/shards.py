@@ -31,7 +31,7 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3, little_endian
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.columns import Row
 
 RECORD_BYTES = 512
 END = b"\0" * (2 * RECORD_BYTES)

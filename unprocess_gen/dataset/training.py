@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from unprocess_gen.core.arrays import Frame
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.simulation.reference import cfa
 
 

@@ -23,8 +23,8 @@ from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.records import check_record
 from unprocess_gen.core.suggestions import did_you_mean
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.row import Row
 from unprocess_gen.pipeline.folder import REPORT
 from unprocess_gen.pipeline.verify import Damage, verify
 

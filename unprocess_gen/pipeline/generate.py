@@ -21,9 +21,9 @@ from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.dataset.columns import columns_of
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text
 from unprocess_gen.dataset.manifest import header_text
+from unprocess_gen.dataset.row import columns_of
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress

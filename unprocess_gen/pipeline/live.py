@@ -18,14 +18,15 @@ from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.arrays import Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.targets import TARGETS
-from unprocess_gen.dataset.columns import COLUMNS, number_or_text
+from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_folders, name_apart
-from unprocess_gen.dataset.row import Value
+from unprocess_gen.dataset.row import COLUMNS
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
 from unprocess_gen.pipeline.pairs import PairSettings

@@ -18,17 +18,11 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.source import Source
+from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import pair_key, patch_key
-from unprocess_gen.dataset.manifest import (
-    pair_row,
-    patch_from_row,
-    plan_from_row,
-    read_columns,
-    read_row,
-    rows_with_offsets,
-)
-from unprocess_gen.dataset.row import Value
+from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
+from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import PairRegenerator, dark_frames_root, source_of, source_root
 from unprocess_gen.pipeline.run import resolve

@@ -20,11 +20,11 @@ from unprocess_gen.core.arrays import Array
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
-from unprocess_gen.dataset.columns import columns_of
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import check_format, dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.dataset.keys import group_by_sample
-from unprocess_gen.dataset.manifest import has_frames, read_rows, write_rows
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.dataset.row import columns_of, has_frames
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, check_members, shard_name
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.records import tar_name

@@ -25,17 +25,11 @@ from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
-from unprocess_gen.dataset.manifest import (
-    has_frames,
-    patch_from_row,
-    plan_from_row,
-    read_row,
-    read_rows,
-    rows_with_offsets,
-)
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.manifest import read_row, read_rows, rows_with_offsets
+from unprocess_gen.dataset.row import has_frames, patch_from_row, plan_from_row
 from unprocess_gen.dataset.shards import arrays_of
 from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import FLOAT32, Array, Frame, Srgb
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.dataset.row import Value
+from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.training import noise_std
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.effects import dark_variance_dn2

@@ -5,15 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.source import Source
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import group_by_image
-from unprocess_gen.dataset.manifest import has_frames
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import has_frames
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.simulation.frames import Counts
@@ -181,7 +181,7 @@ class Made:
     n_jobs: int = 1
 
 
-COUNTS = tuple(field.name for field in fields(Counts))
+COUNTS = Counts.__struct_fields__
 """Columns of the manifest that count sites."""
 
 

@@ -21,11 +21,12 @@ from typing import Any, NamedTuple
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.dataset_json import check_format, read_dataset
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
-from unprocess_gen.dataset.manifest import has_frames, read_rows, row_json, without_empty
+from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
-from unprocess_gen.dataset.row import Row, Value
+from unprocess_gen.dataset.row import has_frames, row_json, without_empty
 from unprocess_gen.dataset.shards import (
     ExpectedFrame,
     ExpectedSample,

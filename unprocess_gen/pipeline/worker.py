@@ -22,10 +22,9 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import RESUME, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error, machine_errors
 from unprocess_gen.core.source import Source
-from unprocess_gen.dataset.columns import columns_of
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import pair_key, patch_key
-from unprocess_gen.dataset.manifest import failed_row, has_frames, pair_row, row_json
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import columns_of, failed_row, has_frames, pair_row, row_json
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.deaths import counted_attempt
 from unprocess_gen.pipeline.folder import OutFolder

@@ -16,11 +16,11 @@ from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import read_dataset
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
-from unprocess_gen.dataset.row import Row
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.formatting import byte_size, short_number

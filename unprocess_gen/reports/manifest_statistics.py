@@ -7,9 +7,9 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from unprocess_gen.dataset.columns import COLUMNS
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import image_key
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import COLUMNS
 
 FAILURES_LISTED, VALUES_LISTED = 50, 16
 """Failed rows, and values of a text column, that are listed."""

@@ -26,9 +26,9 @@ from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
-from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import patch_from_row, plan_from_row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.replay import ADVICE, recorded_source, source_of, source_root

@@ -14,8 +14,8 @@ from urllib.parse import quote
 import numpy as np
 
 from unprocess_gen.core.errors import UnprocessGenError
-from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.dataset_page import write_dataset_report
 from unprocess_gen.reports.html_pages import data_uri, render_page

@@ -1,10 +1,16 @@
 """Results of a simulation: a pair of frames, counts of its sites, and the part of an image that it shows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 from unprocess_gen.core.arrays import Frame
+from unprocess_gen.core.fields import FAILED, Condition, Field
+from unprocess_gen.simulation.plan import COUNT, PlanRecord
+
+DIVIDED_LIGHT = Condition(
+    "scene.exposure_ratio is 1 or output.frames is false",
+    lambda config: config.output.frames and config.scene.exposure_ratio != 1,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,31 +32,31 @@ class Patch:
         return self.y, self.x
 
 
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """Numbers of sites at a limit.
+def _sites(meaning: str, **details: Any) -> Field:
+    return Field(meaning, COUNT, "sites", **details)
 
-    Attributes
-    ----------
-    clean_clipped_low, clean_clipped_high : int
-        Clean values below black and above white, before clipping.
-    noisy_clipped_low, noisy_clipped_high : int
-        Noisy values outside the sensor's range, after rounding (without rounding for float32 frames).
-    saturated : int
-        Sites of the clean frame at the white level.
-    zero_variance : int
-        Sites whose noise variance is 0, because a fitted b is negative or no noise is simulated.
-    light_clipped_high : int or None
-        Sites whose light is above white before the exposure ratio divides it; None without a ratio.
+
+class Counts(PlanRecord, frozen=True):
+    """Numbers of sites at a limit; for float32 frames, clipped noisy values are counted without rounding.
+
+    Variance is zero where a fitted b is negative, or if no noise is simulated. ``light_clipped_high`` is None without
+    an exposure ratio.
     """
 
-    clean_clipped_low: int
-    clean_clipped_high: int
-    noisy_clipped_low: int
-    noisy_clipped_high: int
-    saturated: int
-    zero_variance: int
-    light_clipped_high: int | None = None
+    clean_clipped_low: Annotated[int, _sites("clean sites below black before clipping")]
+    clean_clipped_high: Annotated[int, _sites("clean sites above white before clipping")]
+    noisy_clipped_low: Annotated[int, _sites("noisy sites below the lowest DN before clipping")]
+    noisy_clipped_high: Annotated[int, _sites("noisy sites above the highest DN before clipping")]
+    saturated: Annotated[int, _sites("clean sites at the white level")]
+    zero_variance: Annotated[int, _sites("sites at which the noise has no variance")]
+    light_clipped_high: Annotated[
+        int | None,
+        _sites(
+            "sites whose light is above white before the exposure ratio divides it",
+            needs=DIVIDED_LIGHT,
+            empty_if=f"{FAILED}, or exposure_ratio is 1",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,24 +1,104 @@
-"""Define the records that decide a pair: with the pixels, a `Plan` determines both frames completely."""
+"""The records that decide a pair: with the pixels, a `Plan` determines both frames completely.
 
-from __future__ import annotations
+A plan is what planning draws, what effects and kernels are given, and what a manifest row is flattened from
+(`dataset.row`): a column has the name of its field, and the order of the fields. A field declares meaning, unit and
+allowed values of its number; keys of the settings, columns, checks and reference pages follow from them. A new
+parameter is a new field.
+"""
 
-from typing import Annotated, Any, NamedTuple, Self, get_args, get_type_hints
+import functools
+from typing import Annotated, Any, NamedTuple, Self, get_type_hints
 
 import msgspec
 import numpy as np
 
-from unprocess_gen.core.arrays import FLOAT32, MOSAIC, UINT16
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16
+from unprocess_gen.core.fields import (
+    FAILED,
+    LARGEST,
+    Choice,
+    Condition,
+    Field,
+    Integers,
+    Limit,
+    NumberOrWord,
+    Numbers,
+    Text,
+    number_or_text,
+)
 from unprocess_gen.core.random_streams import frame_word
-from unprocess_gen.simulation.numbers import DN, LARGEST, SHAPE, SITES, Number, number_in_dn, rate
+from unprocess_gen.simulation.numbers import DN, SHAPE, SITES, Number, number_in_dn, rate
+from unprocess_gen.simulation.tone_curves import gamma_text
 
 TIERS = REFERENCE, EXACT, FAST = "reference", "exact", "fast"
 """Accuracy tiers: the NumPy reference, kernels with the same DN, and kernels in float32 where the noise allows it."""
 
 Levels = tuple[float, ...]
 """A level in DN for each packed plane: R, G of the red rows, G of the blue rows, B."""
+_FILE_LEVELS = "{} levels of the raw file: R, G of the red rows, G of the blue rows, B, separated by ;"
 
 CODE_RANGE = 65535.0
 """Largest code of a raw source."""
+
+
+# ---------------------------------------------------------------------------------------- allowed values and conditions
+
+ANY_TEXT = Text("[^\x00-\x1f\x7f\ud800-\udfff]*", "text without control characters")
+LIST = Text(
+    "[^\x00-\x1f\x7f\ud800-\udfff]*",
+    "text without control characters",
+    write=";".join,
+    read=lambda text: tuple(text.split(";")),
+)
+HEX_KEY = Text("([0-9a-f]{16})?|none", "16 hexadecimal digits", write="{:016x}".format, read=lambda text: int(text, 16))
+HEX_128, HEX_256 = (Text(f"([0-9a-f]{{{n}}})?", f"{n} hexadecimal digits") for n in (32, 64))
+_LEVEL = r"\d{1,5}(\.\d{1,17})?(e-\d\d)?"
+LEVELS = Text(
+    rf"({_LEVEL}(;{_LEVEL}){{3}})?",
+    "four numbers, separated by ;",
+    write=lambda levels: ";".join(map(repr, levels)),
+    read=lambda text: tuple(map(float, text.split(";"))),
+)
+GAMMA = NumberOrWord(
+    "srgb",
+    Numbers(0.1, 10),
+    "a number from {numbers}, or {word}",
+    write=lambda gamma: number_or_text(gamma_text(gamma)),
+    read=lambda value: value if value == "srgb" else float(value),
+)
+FLAG = Integers(0, 1, write=int, read=bool)
+COUNT = Integers(0, 2**63 - 1)
+SHARE = Numbers(0, 1)
+GAIN = Numbers(1e-4, 1e4)
+FINITE = Numbers(-LARGEST, LARGEST)
+COORDINATE = Integers(0, 2**32 - 1)
+"""Pixel coordinates and frame numbers are 32-bit counters of the random streams."""
+BAYER = "RGGB", "BGGR", "GRBG", "GBRG"
+
+RAW = Condition("source.kind is not raw", lambda config: config.source.kind == "raw")
+CLIPS = Condition("source.clips is false", lambda config: config.source.clips)
+SPLITS = Condition("split is null", lambda config: config.split is not None)
+LIGHTS = Condition("gains.light is null", lambda config: config.gains.light is not None)
+PHYSICAL = Condition("the noise profile is not physical", lambda config: bool(config.noise.branches))
+SHADING = Condition("the noise profile has no lens_shading", lambda config: config.noise.lens_shading is not None)
+DARK_FRAMES = Condition(
+    "noise.dark_frames is null", lambda config: config.noise.dark_frames or config.noise.dark_frames_sha256
+)
+FLOAT_CLEAN = Condition(
+    "clean and noisy frames have one dtype", lambda config: config.output.clean_dtype == FLOAT32 != config.output.dtype
+)
+
+
+def _noisy_frames(config: Any) -> int:
+    """Number of noisy frames of each clean frame."""
+    levels = config.noise.levels
+    return int(config.noise.draws * (1 if levels is None else levels if isinstance(levels, int) else len(levels)))
+
+
+NOISY_FRAMES = Condition("each image has one noisy frame", lambda config: _noisy_frames(config) > 1)
+
+
+# ------------------------------------------------------------------------------------------------------------- records
 
 
 class PlanRecord(msgspec.Struct, frozen=True):
@@ -51,21 +131,11 @@ def _known(record: PlanRecord, values: dict[str, Any]) -> dict[str, Any]:
 
 
 class Place(PlanRecord, frozen=True):
-    """Numbers that select the random values of a frame of an image.
+    """Numbers that select the random values of a frame of an image; ``epoch`` numbers those of live pairs."""
 
-    Attributes
-    ----------
-    frame : int
-        Number of the frame in its clip.
-    level, draw : int
-        Numbers of the noise level, and of the draw at this level.
-    epoch : int
-        Number of the epoch of live pairs; 0 in datasets.
-    """
-
-    frame: int = 0
-    level: int = 0
-    draw: int = 0
+    frame: Annotated[int, Field("number of the frame in its clip, from 0", COORDINATE, needs=CLIPS)] = 0
+    level: Annotated[int, Field("number of the noise level, from 0", Integers(0, 99), needs=NOISY_FRAMES)] = 0
+    draw: Annotated[int, Field("number of the draw at this level, from 0", Integers(0, 99), needs=NOISY_FRAMES)] = 0
     epoch: int = 0
 
     @property
@@ -75,30 +145,42 @@ class Place(PlanRecord, frozen=True):
 
 
 class CameraPlan(PlanRecord, frozen=True, kw_only=True):
-    """Colours and gains of the camera.
+    """Colours and gains of the camera."""
 
-    Attributes
-    ----------
-    camera : str
-        Name of the camera option.
-    weights : tuple of four floats
-        Weights of the mixed cameras, in the order of `colour.CAMERAS`.
-    rgb2cam : tuple of nine floats
-        Matrix from linear sRGB to camera RGB, row by row; each row sums to 1.
-    light, cct_k : str, float
-        Light from which the gains follow, and its correlated colour temperature; empty and 0 without one.
-    red_gain, blue_gain, inverse_rgb_gain : float
-        White-balance gains of red and blue, and inverse of the brightness gain.
-    """
-
-    camera: str
-    weights: tuple[float, float, float, float]
-    rgb2cam: tuple[float, float, float, float, float, float, float, float, float]
-    light: str = ""
-    cct_k: float = 0.0
-    red_gain: float
-    blue_gain: float
-    inverse_rgb_gain: float
+    camera: Annotated[str, Field("convex, or the name of the camera", ANY_TEXT)]
+    weights: Annotated[
+        tuple[float, float, float, float],
+        Field(
+            "weights of the cameras in the mix",
+            SHARE,
+            columns={
+                f"w_{camera}": "weight of this camera in the mix; 0 if it is not part of it"
+                for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
+            },
+        ),
+    ]
+    rgb2cam: Annotated[
+        tuple[float, float, float, float, float, float, float, float, float],
+        Field(
+            "matrix from linear sRGB to the camera, whose rows sum to 1",
+            Numbers(-1e10, 1e10),
+            columns={
+                f"rgb2cam_{i}{j}": f"matrix from linear sRGB to the camera, row {i}, column {j}"
+                for i in range(3)
+                for j in range(3)
+            },
+        ),
+    ]
+    light: Annotated[str, Field("light from which the white-balance gains follow", ANY_TEXT, needs=LIGHTS)] = ""
+    cct_k: Annotated[
+        float,
+        Field("correlated colour temperature of the light", Numbers(1000, 25000), "K", needs=LIGHTS, blank=True),
+    ] = 0.0
+    red_gain: Annotated[float, Field("forward white-balance gain of red", GAIN)]
+    blue_gain: Annotated[float, Field("forward white-balance gain of blue", GAIN)]
+    inverse_rgb_gain: Annotated[
+        float, Field("inverse of the brightening gain; all channels are multiplied by it", GAIN)
+    ]
 
     @property
     def inverse_gains(self) -> tuple[float, float, float]:
@@ -107,57 +189,64 @@ class CameraPlan(PlanRecord, frozen=True, kw_only=True):
 
 
 class IspPlan(PlanRecord, frozen=True):
-    """Processing that is inverted.
+    """Processing that is inverted."""
 
-    Attributes
-    ----------
-    tone, gamma : str, float or str
-        Tone curve and gamma (`tone_curves.linear_table`).
-    highlight, highlight_threshold : str, float
-        Method for highlights (`unprocess.INVERSE_HIGHLIGHTS`), and the intensity from which it acts, in [0, 1).
-    """
+    tone: Annotated[str, Field("inverted tone curve: smoothstep or none", Choice("smoothstep", "none"))]
+    gamma: Annotated[float | str, Field("inverted gamma: a number or srgb", GAMMA)]
+    highlight: Annotated[
+        str,
+        Field("preservation of highlights: per_channel, gray_mean or none", Choice("per_channel", "gray_mean", "none")),
+    ] = "per_channel"
+    highlight_threshold: Annotated[
+        float,
+        Field("linear signal above which highlights are preserved, 1 is white", Numbers(0, 1, open_high=True)),
+    ] = 0.9
 
-    tone: str
-    gamma: float | str
-    highlight: str = "per_channel"
-    highlight_threshold: float = 0.9
+
+def _of_raw(meaning: str, limit: Limit, unit: str = "", stated: bool = False) -> Field:
+    """Field of a raw source, of what its file ``stated`` or of how it was read."""
+    empty_if = f"{FAILED}, or the file does not state it" if stated else FAILED
+    return Field(meaning, limit, unit, needs=RAW, blank=True, empty_if=empty_if)
 
 
 class SourcePlan(PlanRecord, frozen=True):
-    """Preparation of the source's pixels.
+    """Preparation of the source's pixels; the fields of raw sources have their defaults for photographs."""
 
-    Attributes
-    ----------
-    downscale : int
-        Side of the squares of source pixels that were averaged.
-    dequantize : str
-        ``"off"``, or how 8-bit codes are dithered.
-    shrink : int
-        Of a raw source, side of the cells whose sites of one colour were averaged, 1 for the mosaic itself; 0 for
-        photographs.
-    raw_pattern : str
-        CFA pattern of the file of a raw source.
-    raw_black_dn, raw_white_dn : Levels
-        Levels of that file.
-    mosaic_xxh3 : str
-        XXH3-128 of its decoded mosaic.
-    source_iso, source_exposure_s : float
-        ISO and exposure time that it states; 0 if it does not.
-    own_a_dn, own_b_dn2 : float
-        Noise variance of the source itself in the clean frame, own_a_dn (x - black) + own_b_dn2; 0 if it is not stated.
-    """
-
-    downscale: int
-    dequantize: str
-    shrink: int = 0
-    raw_pattern: str = ""
-    raw_black_dn: Levels = ()
-    raw_white_dn: Levels = ()
-    mosaic_xxh3: str = ""
-    source_iso: float = 0.0
-    source_exposure_s: float = 0.0
-    own_a_dn: float = 0.0
-    own_b_dn2: float = 0.0
+    downscale: Annotated[
+        int, Field("side of the squares of source pixels that were averaged", Integers(1, 64), "pixels")
+    ]
+    dequantize: Annotated[
+        str,
+        Field("dequantization of 8-bit codes: off, dither or dither_all", Choice("off", "dither", "dither_all")),
+    ]
+    shrink: Annotated[
+        int,
+        _of_raw(
+            "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
+            Integers(1, 2),
+        ),
+    ] = 0
+    raw_pattern: Annotated[str, _of_raw("CFA pattern of the raw file", Choice(*BAYER))] = ""
+    raw_black_dn: Annotated[Levels, _of_raw(_FILE_LEVELS.format("black"), LEVELS, "DN of the file")] = ()
+    raw_white_dn: Annotated[Levels, _of_raw(_FILE_LEVELS.format("white"), LEVELS, "DN of the file")] = ()
+    mosaic_xxh3: Annotated[str, _of_raw("XXH3-128 of the mosaic that the raw file was decoded to", HEX_128)] = ""
+    source_iso: Annotated[float, _of_raw("ISO of the raw file", Numbers(0, 1e9), stated=True)] = 0.0
+    source_exposure_s: Annotated[
+        float, _of_raw("exposure time of the raw file", Numbers(0, 1e7), "seconds", stated=True)
+    ] = 0.0
+    own_a_dn: Annotated[
+        float,
+        _of_raw(
+            "noise of the raw source itself in the clean frame, whose variance is own_a_dn (x - black) + own_b_dn2",
+            Numbers(0),
+            "DN",
+            stated=True,
+        ),
+    ] = 0.0
+    own_b_dn2: Annotated[
+        float,
+        _of_raw("variance at black of the raw source itself in the clean frame", Numbers(0), "DN²", stated=True),
+    ] = 0.0
 
     @property
     def is_raw(self) -> bool:
@@ -185,27 +274,23 @@ class SourcePlan(PlanRecord, frozen=True):
 class SensorPlan(PlanRecord, frozen=True):
     """Digital output of the sensor.
 
-    Attributes
-    ----------
-    pattern : str
-        CFA pattern, one of `cfa.PATTERNS`.
-    bits : int
-        Bits per sample.
-    black_level_dn, white_level_dn : int
-        Levels, DN.
-    sensor_clip : str
-        Clipping of the noisy frame (`sensor.noisy_limits`).
-    saturated_as : str
-        Noisy value at sites where the clean frame is saturated: ``"noisy"``, or ``"white"``
-        if the converter ends there; sites at a full well keep the noise behind it, and count as saturated.
+    Sites at a full well keep the noise behind it with ``saturated_as="white"``, and count as saturated.
     """
 
-    pattern: str
-    bits: int
-    black_level_dn: int
-    white_level_dn: int
-    sensor_clip: str = "sensor"
-    saturated_as: str = "noisy"
+    pattern: Annotated[str, Field("CFA pattern of the top-left 2x2 sites, or MONO", Choice(*BAYER, "MONO"))]
+    bits: Annotated[int, Field("bits per sample of the sensor", Integers(1, 16))]
+    black_level_dn: Annotated[int, Field("black level", Integers(0, 65534), "DN")]
+    white_level_dn: Annotated[int, Field("white level (saturation)", Integers(1, 65535), "DN")]
+    sensor_clip: Annotated[
+        str, Field("clipping of the noisy frame: sensor, black or none", Choice("sensor", "black", "none"))
+    ] = "sensor"
+    saturated_as: Annotated[
+        str,
+        Field(
+            "noisy sites whose clean site is saturated: noisy, or white where the converter ends",
+            Choice("noisy", "white"),
+        ),
+    ] = "noisy"
 
     @property
     def span_dn(self) -> int:
@@ -214,10 +299,10 @@ class SensorPlan(PlanRecord, frozen=True):
 
 
 class ScenePlan(PlanRecord, frozen=True):
-    """Light of the scene: its name, and the factor ``exposure_ratio`` by which the photograph is darkened."""
+    """Light of the scene."""
 
-    scene: str
-    exposure_ratio: float
+    scene: Annotated[str, Field("name of the scene", ANY_TEXT)]
+    exposure_ratio: Annotated[float, Field("divisor of the light in the photograph", Numbers(1e-4, 1e7))]
 
     @property
     def exposure(self) -> float:
@@ -226,27 +311,48 @@ class ScenePlan(PlanRecord, frozen=True):
 
 
 class NoisePlan(PlanRecord, frozen=True):
-    """Noise profile, its variance, and the effects that are simulated.
+    """Noise profile, its variance, and the effects that are simulated."""
 
-    Attributes
-    ----------
-    noise, noise_law : str
-        Name of the noise profile, and for two-parameter profiles its distribution: ``"gaussian"`` or ``"poisson"``.
-    a_dn, b_dn2 : float
-        Slope (DN) and intercept (DN²) of the noise variance above black.
-    effects, skipped : tuple of str
-        Simulated effects, and the omitted ones with their reasons.
-    assumed : tuple of str
-        Assumed numbers of the noise profile that the simulated effects use.
-    """
-
-    noise: str
-    noise_law: str
-    a_dn: float
-    b_dn2: float
-    effects: tuple[str, ...]
-    skipped: tuple[str, ...]
-    assumed: tuple[str, ...] = ()
+    noise: Annotated[str, Field("name of the noise profile", ANY_TEXT)]
+    noise_law: Annotated[
+        str, Field("distribution of a two-parameter profile: gaussian or poisson", Choice("gaussian", "poisson"))
+    ]
+    a_dn: Annotated[
+        float,
+        Field("slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Numbers(-1e30, 1e30), "DN"),
+    ]
+    b_dn2: Annotated[
+        float,
+        Field("noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE, "DN²"),
+    ]
+    effects: Annotated[
+        tuple[str, ...],
+        Field(
+            "simulated effects, in order, separated by ;",
+            LIST,
+            blank=True,
+            empty_if=f"{FAILED}, or no effect was simulated",
+        ),
+    ] = ()
+    skipped: Annotated[
+        tuple[str, ...],
+        Field(
+            "skipped effects, each with its reason, separated by ;",
+            LIST,
+            blank=True,
+            empty_if=f"{FAILED}, or no effect was skipped",
+        ),
+    ] = ()
+    assumed: Annotated[
+        tuple[str, ...],
+        Field(
+            "assumed numbers of the profile that the simulated effects use, separated by ;",
+            LIST,
+            needs=PHYSICAL,
+            blank=True,
+            empty_if=f"{FAILED}, or no effect uses one",
+        ),
+    ] = ()
 
     @property
     def variance_line(self) -> tuple[float, float]:
@@ -261,50 +367,32 @@ class Physics(PlanRecord, frozen=True, kw_only=True):
     """Numbers of a physical noise profile for one scene and sensor.
 
     The numbers of effects are in the order in which light meets the effects; a number without its effect has the
-    default.
-
-    Attributes
-    ----------
-    iso, exposure_s, temperature_c : float
-        The scene: ISO, exposure time (s) and sensor temperature (°C).
-    dark_offset : str
-        ``"removed"`` if the camera subtracts the mean dark signal, else ``"kept"``.
-    sensor_unit : str
-        Name of the camera body.
-    body_key : int
-        Key of the body's fixed patterns (`random_streams.body_key`).
-    fixed_pattern_in_clean : bool
-        Whether the clean frame contains the fixed patterns too.
-    frame_size : (int, int)
-        Height and width of the full frame if its lens shading is known, else 0; pixels.
+    default. ``body_key`` keys the fixed patterns of a camera body (`random_streams.body_key`).
     """
 
-    iso: float
-    exposure_s: float
-    temperature_c: float
+    iso: Annotated[float, Field("ISO of a physical profile", Numbers(0, 1e9))]
+    exposure_s: Annotated[float, Field("exposure time", Numbers(0, 1e7), "seconds")]
+    temperature_c: Annotated[float, Field("temperature of the sensor", Numbers(-300, 1000), "degrees Celsius")]
     lens_shading: Annotated[
         tuple[float, float, float],
         Number(
             "relative illumination 1 + k1 r² + k2 r⁴ + k3 r⁶ as [k1, k2, k3]; r is the distance from the centre of the "
             "full frame, 1 in the corners",
-            low=-10.0,
-            high=10.0,
+            Numbers(-10, 10),
             count=3,
-            columns={
-                f"lens_shading_{power}": f"coefficient of r^{power} in the relative illumination" for power in (2, 4, 6)
-            },
-            lowest=-10.0,
-            highest=10.0,
+            columns={f"lens_shading_{n}": f"coefficient of r^{n} in the relative illumination" for n in (2, 4, 6)},
         ),
     ] = (0.0, 0.0, 0.0)
     prnu_std: Annotated[
         float,
         Number(
-            "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1", high=0.5, highest=1.0
+            "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1",
+            Numbers(0, 1),
+            key_limit=Numbers(0, 0.5),
         ),
     ] = 0.0
     dn_per_e: Annotated[
-        float, Number("system gain K", "DN per electron", kind=DN, by_iso=True, required=True, highest=1e20)
+        float, Number("system gain K", Numbers(0, 1e20), "DN per electron", kind=DN, by_iso=True, required=True)
     ] = 1.0
     dark_e: Annotated[
         float,
@@ -314,7 +402,7 @@ class Physics(PlanRecord, frozen=True, kw_only=True):
             key_meaning="mean dark current at dark_reference_c",
         ),
     ] = 0.0
-    hot_pixel_share: Annotated[float, Number("fraction of hot pixels", high=1.0, highest=1.0)] = 0.0
+    hot_pixel_share: Annotated[float, Number("fraction of hot pixels", SHARE)] = 0.0
     hot_pixel_e: Annotated[
         float,
         rate(
@@ -323,68 +411,54 @@ class Physics(PlanRecord, frozen=True, kw_only=True):
             key_meaning="mean of the exponentially distributed current of hot pixels at dark_reference_c",
         ),
     ] = 0.0
-    full_well_e: Annotated[float, Number("saturation capacity", "electrons", low=1.0, high=1e9, highest=1e9)] = 0.0
+    full_well_e: Annotated[
+        float, Number("saturation capacity", Numbers(0, 1e9), "electrons", key_limit=Numbers(1, 1e9))
+    ] = 0.0
     gain_by_colour: Annotated[
         tuple[float, float, float],
         Number(
             "system gain of red, green and blue, relative to dn_per_e",
-            low=0.1,
-            high=10.0,
+            Numbers(0.1, 10),
             count=3,
             columns={
                 f"gain_{colour[0]}": f"system gain of {colour}, relative to dn_per_e"
                 for colour in ("red", "green", "blue")
             },
-            lowest=0.1,
-            highest=10.0,
         ),
     ] = (1.0, 1.0, 1.0)
     read_law: Annotated[
         str,
         Number(
             "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45",
-            words=("gaussian", "tukey_lambda"),
+            Choice("gaussian", "tukey_lambda"),
             key_default="gaussian",
         ),
     ] = "gaussian"
     read_shape: Annotated[
         float,
-        Number(
-            "shape of Tukey's lambda distribution",
-            kind=SHAPE,
-            by_iso=True,
-            key_default=0.0,
-            lowest=-0.5,
-            highest=10.0,
-        ),
+        Number("shape of Tukey's lambda distribution", Numbers(-0.5, 10), kind=SHAPE, by_iso=True, key_default=0.0),
     ] = 0.0
-    read_std_dn: Annotated[
-        float, number_in_dn("standard deviation of the read noise", by_iso=True, required=True, counter=1)
-    ] = 0.0
-    row_std_dn: Annotated[float, number_in_dn("standard deviation of row offsets", by_iso=True, counter=2)] = 0.0
+    read_std_dn: Annotated[float, number_in_dn("standard deviation of the read noise", required=True, counter=1)] = 0.0
+    row_std_dn: Annotated[float, number_in_dn("standard deviation of row offsets", counter=2)] = 0.0
     row_correlation: Annotated[
         float,
         Number(
             "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the "
             "effect row",
-            low=-0.999,
-            high=0.999,
+            Numbers(-0.999, 0.999),
             optional="independent rows",
-            lowest=-0.999,
-            highest=0.999,
         ),
     ] = 0.0
-    column_std_dn: Annotated[float, number_in_dn("standard deviation of column offsets", by_iso=True, counter=3)] = 0.0
+    column_std_dn: Annotated[float, number_in_dn("standard deviation of column offsets", counter=3)] = 0.0
     column_temporal_std_dn: Annotated[
         float,
-        number_in_dn(
-            "standard deviation of the part of column offsets that is new in every frame", by_iso=True, counter=4
-        ),
+        number_in_dn("standard deviation of the part of column offsets that is new in every frame", counter=4),
     ] = 0.0
     black_error_dn: Annotated[
         tuple[float, float, float, float],
         Number(
             "error of the black level",
+            FINITE,
             "DN",
             kind=SITES,
             by_iso=True,
@@ -394,68 +468,86 @@ class Physics(PlanRecord, frozen=True, kw_only=True):
                 for i in range(2)
                 for j in range(2)
             },
-            lowest=-LARGEST,
         ),
     ] = (0.0, 0.0, 0.0, 0.0)
     dsnu_std_e: Annotated[
         float,
         Number(
             "standard deviation of the dark-signal non-uniformity (DSNU), whose mean is 0",
+            Numbers(0, 1e9),
             "electrons",
-            high=1e6,
-            highest=1e9,
+            key_limit=Numbers(0, 1e6),
         ),
     ] = 0.0
-    dead_pixel_share: Annotated[float, Number("fraction of dead pixels", high=1.0, highest=1.0)] = 0.0
+    dead_pixel_share: Annotated[float, Number("fraction of dead pixels", SHARE)] = 0.0
     dead_pixel_level: Annotated[
         float,
         Number(
             "value of dead pixels as a fraction of the black level; part of the effect dead_pixels",
-            high=1.0,
+            SHARE,
             optional="0 DN",
-            highest=1.0,
         ),
     ] = 0.0
-    dark_offset: str
-    sensor_unit: str
-    body_key: int
-    fixed_pattern_in_clean: bool
-    frame_size: tuple[int, int] = (0, 0)
-
-
-NUMBERS: dict[str, Number] = {
-    name: kind.__metadata__[0]
-    for name, kind in get_type_hints(Physics, include_extras=True).items()
-    if get_args(kind) and isinstance(getattr(kind, "__metadata__", [None])[0], Number)
-}
-"""Numbers of all effects by the names of their fields."""
+    dark_offset: Annotated[str, Field("mean dark current: removed or kept", Choice("removed", "kept"))]
+    sensor_unit: Annotated[str, Field("camera body", ANY_TEXT)]
+    body_key: Annotated[int, Field("key of the fixed patterns, 16 hex digits", HEX_KEY)]
+    fixed_pattern_in_clean: Annotated[bool, Field("1 if the clean frame has the fixed patterns too", FLAG)]
+    frame_size: Annotated[
+        tuple[int, int],
+        Field(
+            "size of the full frame, to which the lens shading belongs",
+            COORDINATE,
+            "pixels",
+            needs=SHADING,
+            blank=True,
+            columns={
+                f"frame_{side}": f"{side} of the full frame, to which the lens shading belongs"
+                for side in ("height", "width")
+            },
+        ),
+    ] = (0, 0)
 
 
 class DarkFramePlan(PlanRecord, frozen=True):
-    """Dark frame whose noise replaces that of the read-out.
+    """Dark frame whose noise replaces that of the read-out."""
 
-    Attributes
-    ----------
-    dark_frame : str
-        SHA-256 of the frame.
-    shift : (int, int)
-        Even row and column of the dark frame at row 0, column 0 of the full frame.
-    dark_black_dn, dark_scale : float
-        Black level of the dark frame, DN of the dark frame, and DN of the sensor per DN of it.
-    """
-
-    dark_frame: str
-    shift: tuple[int, int]
-    dark_black_dn: float
-    dark_scale: float
+    dark_frame: Annotated[
+        str, Field("SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256)
+    ]
+    shift: Annotated[
+        tuple[int, int],
+        Field(
+            "first row and column of the dark frame that the full frame uses; even",
+            COORDINATE,
+            "pixels",
+            columns={
+                f"dark_frame_{axis}": f"first {side} of the dark frame that the full frame uses; even"
+                for axis, side in (("y", "row"), ("x", "column"))
+            },
+        ),
+    ]
+    dark_black_dn: Annotated[float, Field("black level of the dark frame", Numbers(0, 65535), "DN of the dark frame")]
+    dark_scale: Annotated[float, Field("DN of the sensor per DN of the dark frame", Numbers(1e-9, 1e9))]
 
 
 class OutputPlan(PlanRecord, frozen=True):
-    """Format of the frames: dtype and layout of both, and dtype of the clean frame if it differs, else empty."""
+    """Format of the frames."""
 
-    dtype: str = UINT16
-    layout: str = MOSAIC
-    clean_dtype: str = ""
+    dtype: Annotated[
+        str,
+        Field("dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", Choice(UINT16, FLOAT32)),
+    ] = UINT16
+    layout: Annotated[str, Field("layout of the arrays: mosaic, or packed planes", Choice(MOSAIC, PACKED))] = MOSAIC
+    clean_dtype: Annotated[
+        str,
+        Field(
+            "dtype of the clean array, if it is not that of dtype",
+            Choice(FLOAT32),
+            needs=FLOAT_CLEAN,
+            blank=True,
+            empty_if=f"{FAILED}, or the clean array has the dtype of the noisy one",
+        ),
+    ] = ""
 
     @property
     def normalised(self) -> bool:
@@ -503,35 +595,20 @@ class CleanPlan(NamedTuple):
 class Plan(PlanRecord, frozen=True, kw_only=True):
     """All parameters of a pair; with the pixels it determines the pair completely.
 
-    A plan is drawn once (`unprocess_gen.plan_image`) or read from a manifest row.
-
-    Attributes
-    ----------
-    seed : int
-        Seed of the dataset.
-    stream_key : int
-        Key of the image's random streams (`random_streams.stream_key`).
-    split : str
-        Part of the dataset that the image belongs to; empty without splits. It decides no pixel.
-    place : Place
-        Numbers of frame, level, draw and epoch.
-    camera, isp, source, sensor, scene : CameraPlan, IspPlan, SourcePlan, SensorPlan, ScenePlan
-        Colours and gains, processing, preparation of the pixels, levels, and light.
-    noise : NoisePlan
-        Noise profile and effects.
-    accuracy : str
-        Accuracy tier, one of `TIERS`.
-    physics : Physics or None
-        Numbers of a physical profile. None for two-parameter profiles, whose one effect is ``heteroscedastic``.
-    dark : DarkFramePlan or None
-        Dark frame whose noise replaces that of the read-out.
-    output : OutputPlan
-        Format of the frames.
+    A plan is drawn once (`unprocess_gen.plan_image`) or read from a manifest row. ``split`` decides no pixel;
+    ``physics`` is None for two-parameter profiles, whose one effect is ``heteroscedastic``.
     """
 
-    seed: int
-    stream_key: int
-    split: str = ""
+    seed: Annotated[int, Field("seed of the run", COUNT, empty_if="")]
+    stream_key: Annotated[int, Field("key of the image's random streams, 16 hex digits", HEX_KEY)]
+    split: Annotated[
+        str,
+        Field(
+            "part of the dataset that the image belongs to",
+            Text(r"[\w-]{1,32}", "up to 32 letters, digits, _ and -"),
+            needs=SPLITS,
+        ),
+    ] = ""
     place: Place = Place()
     camera: CameraPlan
     isp: IspPlan
@@ -539,9 +616,9 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
     sensor: SensorPlan
     scene: ScenePlan
     noise: NoisePlan
-    accuracy: str
-    physics: Physics | None = None
-    dark: DarkFramePlan | None = None
+    accuracy: Annotated[str, Field("accuracy tier", Choice(*TIERS))]
+    physics: Annotated[Physics | None, PHYSICAL] = None
+    dark: Annotated[DarkFramePlan | None, DARK_FRAMES] = None
     output: OutputPlan = OutputPlan()
 
     @property
@@ -616,3 +693,21 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         if not self.output.clean_normalised:
             return float(round(value_dn))
         return float(np.float32((value_dn - sensor.black_level_dn) / sensor.span_dn))
+
+
+@functools.cache
+def fields_of(record: type[msgspec.Struct]) -> dict[str, tuple[Any, Any]]:
+    """Type and declaration of each field of a record: a `Field`, a `Condition` of a part, or None."""
+    hints = get_type_hints(record, include_extras=True)
+    return {
+        name: (hints[name].__origin__, hints[name].__metadata__[0])
+        if hasattr(hints[name], "__metadata__")
+        else (hints[name], None)
+        for name in record.__struct_fields__
+    }
+
+
+NUMBERS: dict[str, Number] = {
+    name: declared for name, (_, declared) in fields_of(Physics).items() if isinstance(declared, Number)
+}
+"""Numbers of all effects by the names of their fields."""

@@ -23,10 +23,10 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.source import NO_CLIP, Source
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import image_key, pair_key, patch_key
-from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import pair_row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_root

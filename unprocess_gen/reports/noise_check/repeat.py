@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Float, Frame
-from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.dataset.row import Row
+from unprocess_gen.dataset.row import patch_from_row, plan_from_row
 from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.effects.hot_pixels import HotPixels
 from unprocess_gen.simulation.facts import DarkPixels

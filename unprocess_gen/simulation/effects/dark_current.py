@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.fields import Numbers
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.numbers import Number
@@ -14,18 +15,10 @@ from unprocess_gen.simulation.slots import UniformCounts
 
 HEAT = {
     "dark_reference_c": Number(
-        "temperature at which the dark currents were measured",
-        unit="degrees Celsius",
-        low=-273.0,
-        high=200.0,
-        key_default=25.0,
+        "temperature at which the dark currents were measured", Numbers(-273, 200), "degrees Celsius", key_default=25.0
     ),
     "dark_doubling_c": Number(
-        "rise of the temperature that doubles the dark currents",
-        unit="degrees Celsius",
-        low=0.1,
-        high=100.0,
-        key_default=7.0,
+        "rise of the temperature that doubles the dark currents", Numbers(0.1, 100), "degrees Celsius", key_default=7.0
     ),
 }
 """Keys of the profile from which the warmth of the sensor follows."""
