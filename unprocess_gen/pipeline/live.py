@@ -155,7 +155,7 @@ class LivePairs:
         self._redraw, self._patch, self._patches, self._as_float = redraw, patch, patches, as_float
         self._targets, self._arrays_only = tuple(targets), arrays_only
         most = (NEW_CROPS if redraw == "all" else KEPT_CROPS), NEW_CROPS
-        self._kept: list[Recent[tuple[int, int], tuple[Plan, Patch, CropMaker]]] = [*map(Recent, most)]
+        self._kept: list[Recent[tuple[Any, ...], tuple[Plan, CropMaker]]] = [*map(Recent, most)]
         self._facts: Recent[int, Facts | None] = Recent(KEPT)  # they read all pixels of a photograph
 
     def __len__(self) -> int:
@@ -175,7 +175,7 @@ class LivePairs:
         image = source.image(number - (self._ends[place - 1] if place else 0))
         epoch = epoch if self._redraw != "none" else 0
         srgb = source.pixels(image)
-        plan, patch, make = self._prepared(source.settings, image, srgb, epoch, number)
+        plan, patch, make = self._prepared(place, image, srgb, epoch, number)
         if self._patch is not None:
             patch = _crop(plan, epoch, patch, self._patch, crop)
         clean, noisy, counts = make(crop_patch(srgb, patch), patch.origin, epoch)
@@ -205,38 +205,39 @@ class LivePairs:
         ]
 
     def _prepared(
-        self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int
+        self, place: int, image: LiveImage, srgb: Srgb, epoch: int, number: int
     ) -> tuple[Plan, Patch, CropMaker]:
-        """Return the plan of an epoch, without its number, the patch, and what makes crops of it."""
-        plan_epoch = epoch if self._redraw == "all" or image.plan.dark else 0
-        is_wide = srgb.itemsize > 1 or image.plan.source.dequantize != "off"
-        prepared = self._kept[is_wide].get((number, plan_epoch))
+        """Return the plan of an epoch, without its number, the patch, and what makes crops of the image."""
+        redraws = self._redraw == "all"
+        plan_epoch = epoch if redraws or image.plan.dark else 0
+        settings, patch, frame = self._sources[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
+        kept = self._kept[srgb.itemsize > 1 or image.plan.source.dequantize != "off"]
+        shape = (self._patch, self._patch) if self._patch else (patch.height, patch.width)
+        key = place, image.plan.stream_key, image.plan.place, plan_epoch, shape
+        prepared = kept.get(key)
         if prepared is None:
-            plan, patch = self._redrawn(settings, image, srgb, epoch, number)
+            plan = self._redrawn(settings, image, srgb, plan_epoch, number) if plan_epoch else image.plan
             for kernels in kernels_for(self._targets, plan):
                 self_test.check(kernels)
-            shape = (self._patch, self._patch) if self._patch else (patch.height, patch.width)
-            make = crop_maker(plan, shape, patch.origin, 256**srgb.itemsize, settings.dark_folder)
-            prepared = self._kept[is_wide].keep((number, plan_epoch), (plan, patch, make))
-        return prepared
+            make = crop_maker(plan, shape, frame, patch.origin, 256**srgb.itemsize, settings.dark_folder)
+            prepared = kept.keep(key, (plan, make))
+        if plan_epoch and redraws and (rule := patch_rule(settings.config.source)) is not None:
+            plan = image.plan
+            patch = list_patches(rule, plan.stream_key, *frame, plan.output.layout, epoch)[patch.number]
+        return prepared[0], patch, prepared[1]
 
-    def _redrawn(
-        self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int
-    ) -> tuple[Plan, Patch]:
-        """Return the plan of an epoch, without its number, and the patch."""
-        plan, patch = image.plan, image.patch
-        if epoch and self._redraw == "all":
-            config, (height, width) = settings.config, srgb.shape[:2]
+    def _redrawn(self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int) -> Plan:
+        """Return the plan of an epoch, without its number."""
+        plan = image.plan
+        if self._redraw == "all":
             facts = self._facts.get(number)
             if facts is None:
-                facts = facts_for(config, srgb, image.source.frames, parts_of(plan))
+                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan))
                 self._facts.keep(number, facts)
-            plan = redraw_plan(config, plan, facts, settings.dark_frames, epoch)
-            rule = patch_rule(config.source)
-            patch = list_patches(rule, plan.stream_key, height, width, plan.output.layout, epoch)[patch.number]
-        if epoch and plan.dark and settings.dark_frames is not None:
+            plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
+        if plan.dark and settings.dark_frames is not None:
             plan = next_dark_frame(plan, settings.dark_frames, epoch)
-        return plan, patch
+        return plan
 
     def _frame(self, frame: Frame, plan: Plan) -> Frame:
         """Return a frame as light."""

@@ -121,7 +121,12 @@ noisy frame, and a function that returns their counts."""
 
 
 def crop_maker(
-    plan: Plan, shape: tuple[int, int], corner: tuple[int, int], codes: int, dark_pixels: DarkPixels | None = None
+    plan: Plan,
+    shape: tuple[int, int],
+    frame: tuple[int, int],
+    corner: tuple[int, int],
+    codes: int,
+    dark_pixels: DarkPixels | None = None,
 ) -> CropMaker:
     """Return a function that simulates crops of one image in any epoch, with little fixed cost for each.
 
@@ -131,6 +136,8 @@ def crop_maker(
         All parameters of the pairs but their epoch.
     shape : (int, int)
         Height and width of all crops.
+    frame : (int, int)
+        Height and width of the image.
     corner : (int, int)
         Row and column of any crop; all others have the same parities.
     codes : int
@@ -151,7 +158,7 @@ def crop_maker(
 
         return make
     is_dithered = plan.source.dequantize != "off" and codes == CODES[0]
-    render = CropRenderer(plan, shape, (corner[0] % 2, corner[1] % 2), CODES[1] if is_dithered else codes)
+    render = CropRenderer(plan, shape, frame, (corner[0] % 2, corner[1] % 2), CODES[1] if is_dithered else codes)
     if not is_dithered:
         return render
     return lambda srgb, origin, epoch: render(_dequantise(srgb, plan, origin), origin, epoch)

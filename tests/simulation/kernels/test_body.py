@@ -98,7 +98,8 @@ def test_patterns_of_live_crops_equal_those_of_other_crops(
         monkeypatch.setattr(body, name, limit)
     patterns, _ = patterns_of("prnu", *DEFECTS, hot_pixel_share=share, dead_pixel_share=share)
     for shape, origin in CROPS:
-        expected, live = (body_of(patterns, shape, origin, is_live=is_live) for is_live in (False, True))
+        frame = origin[0] + shape[0], origin[1] + shape[1]
+        expected, live = (body_of(patterns, shape, origin, sides) for sides in (None, frame))
         first = origin[1] % BLOCK
         for ours, theirs in zip(live[:3], expected[:3], strict=True):
             np.testing.assert_array_equal(sites(ours, shape, first), sites(theirs, shape, first))

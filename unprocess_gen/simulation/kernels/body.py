@@ -54,12 +54,18 @@ EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS = equal_sites(1.0), equal_sites(0.0), equ
 WITHOUT_PATTERNS = Body(EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS, np.zeros(1))
 
 
-def body_of(patterns: Patterns, shape: Shape, origin: Shape, is_live: bool = False) -> Body:
-    """Return the fixed patterns of a body for a crop of ``shape`` at ``origin``, without the factor on the light."""
+def body_of(patterns: Patterns, shape: Shape, origin: Shape, frame: Shape | None = None) -> Body:
+    """Return the fixed patterns of a body for a crop of ``shape`` at ``origin``, without the factor on the light.
+
+    ``frame`` are the height and width of the complete frame from which live crops are cut.
+    """
     electrons, sites, bright, dead = patterns.electrons, patterns.sites_dn, patterns.bright, patterns.dead
-    kept = _live_patterns if is_live else _kept
-    response_of = _cut_response if is_live and not patterns.light else functools.partial(kept, _normal_pattern)
-    defects_of = _cut_defects if is_live else functools.partial(kept, _defect_map)
+    kept = _live_patterns if frame else _kept
+    response_of, defects_of = functools.partial(kept, _normal_pattern), functools.partial(kept, _defect_map)
+    if frame and not patterns.light:
+        response_of = functools.partial(_cut_response, frame)
+    if frame:
+        defects_of = functools.partial(_cut_defects, frame)
     return Body(
         response_of(electrons, shape, origin) if electrons else EQUAL_RESPONSE,
         kept(_normal_pattern, sites, shape, origin) if sites else NO_OFFSETS,
@@ -234,24 +240,24 @@ class _Frame(NamedTuple):
 
 
 _frames: dict[Any, _Frame] = {}
-"""Frames by slot. They grow to contain all crops."""
+"""Frames by slot. They grow where a picture is larger than those before it."""
 
 
-def _frame_of(compute: Any, slot: Any, shape: Shape, origin: Shape) -> _Frame:
-    """Return the frame of a slot, which contains a crop."""
-    frame, ends = _frames.get(slot), (origin[0] + shape[0], origin[1] + shape[1])
+def _frame_of(compute: Any, slot: Any, sides: Shape) -> _Frame:
+    """Return the frame of a slot, which contains one of some ``sides``."""
+    frame = _frames.get(slot)
     if frame is None and len(_frames) >= MOST_FRAMES:
-        return _Frame(ends, None)
-    if frame is None or ends[0] > frame.sides[0] or ends[1] > frame.sides[1]:
+        return _Frame(sides, None)
+    if frame is None or sides[0] > frame.sides[0] or sides[1] > frame.sides[1]:
         known = frame.sides if frame else (0, 0)
-        height, width = (max(-(-end // FRAME_STEP) * FRAME_STEP, side) for end, side in zip(ends, known, strict=True))
+        height, width = (max(-(-new // FRAME_STEP) * FRAME_STEP, old) for new, old in zip(sides, known, strict=True))
         frame = _frames[slot] = _Frame((height, width), compute(slot, (height, width)))
     return frame
 
 
-def _cut_response(slot: NormalPattern, shape: Shape, origin: Shape) -> SiteMap:
+def _cut_response(sides: Shape, slot: NormalPattern, shape: Shape, origin: Shape) -> SiteMap:
     """Return the response of a live crop as a view of that of the frame."""
-    (_, width), values = _frame_of(_frame_response, slot, shape, origin)
+    (_, width), values = _frame_of(_frame_response, slot, sides)
     if values is None:
         crop: SiteMap = _live_patterns(_normal_pattern, slot, shape, origin)
         return crop
@@ -266,9 +272,9 @@ def _frame_response(slot: NormalPattern, sides: Shape) -> NDArray[np.float32] | 
     return _normal_pattern(slot, sides, (0, 0)).values.reshape(sides)
 
 
-def _cut_defects(slots: DefectSlots, shape: Shape, origin: Shape) -> SiteMap:
+def _cut_defects(sides: Shape, slots: DefectSlots, shape: Shape, origin: Shape) -> SiteMap:
     """Return the defects of a live crop; most crops have none."""
-    defects = _frame_of(_frame_defects, slots, shape, origin).values
+    defects = _frame_of(_frame_defects, slots, sides).values
     if defects is None:
         crop: SiteMap = _live_patterns(_defect_map, slots, shape, origin)
         return crop
@@ -288,12 +294,15 @@ def _frame_defects(slots: DefectSlots, sides: Shape) -> list[list[int]] | None:
     """Return the defects of a frame, row by row; computed in parts, because the map of a frame is large."""
     if sum(slot.share for slot in slots if slot) * sides[0] * sides[1] > MOST_DEFECTS:
         return None
-    parts = [np.zeros((3, 0), dtype=np.int64)]
+    rows: list[int] = []
+    columns: list[int] = []
+    numbers: list[int] = []
     for top in range(0, sides[0], FRAME_STEP):
-        numbers = _defect_map(slots, (FRAME_STEP, sides[1]), (top, 0))
-        if numbers.steps[0]:
-            part = numbers.values.reshape(FRAME_STEP, sides[1])
-            rows, columns = part.nonzero()
-            parts.append(np.stack([rows + top, columns, part[rows, columns]]))
-    defects: list[list[int]] = np.concatenate(parts, axis=1).tolist()
-    return defects
+        values = _defect_map(slots, (FRAME_STEP, sides[1]), (top, 0)).values
+        for four in np.flatnonzero(values.view(np.uint64)).tolist():  # a quarter of the time of all sites
+            for site in range(4 * four, 4 * four + 4):
+                if values[site]:
+                    rows.append(top + site // sides[1])
+                    columns.append(site % sides[1])
+                    numbers.append(int(values[site]))
+    return [rows, columns, numbers]

@@ -99,34 +99,34 @@ class Scene32(Scene):
 
 def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] = Scene) -> Scene:
     """Return the parameters of a plan for sources of ``codes`` codes; ``kind`` is `Scene` or `Scene32`."""
-    compute: Any = _scenes[codes > 256]
-    scene: Scene = compute(plan, codes, origin, kind)
-    return scene
-
-
-def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -> Scene:
-    in_float32, is_raw = kind is Scene32, plan.source.is_raw
+    in_float32, is_raw, camera = kind is Scene32, plan.source.is_raw, plan.camera
     channels = _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2, is_raw)
-    f: Any = np.float32 if in_float32 else np.float64
-    camera, exposure, brightest = plan.camera, plan.scene.exposure, plan.brightest
+    f: Any = np.float32 if in_float32 else float
+    exposure, brightest, threshold = plan.scene.exposure, plan.brightest, plan.isp.highlight_threshold
     black_dn, span_dn = plan.sensor.black_level_dn, float(plan.sensor.span_dn)
-    gray_mean, gains, limit = _uses_gray_mean(plan), _site_gains(plan), _linear_limit(plan)
-    scale = tuple(gain * exposure * span_dn if in_float32 else 1.0 for gain in gains)
-    numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
-    limits, light_per_signal, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
-    divisor = 1 - plan.isp.highlight_threshold
+    gray_mean, inverse_gains = plan.isp.highlight == "gray_mean" and not is_raw, camera.inverse_gains
+    # of the channels that remain: `_fill_gray_mean_signal` has inverted the gains already
+    gains = (1.0, 1.0, 1.0, 1.0) if is_raw else (1.0, 1.0, 1.0) if gray_mean else inverse_gains
+    has_term = plan.isp.highlight == "per_channel"
+    headroom = [max(1 - gain, 0.0) if has_term else 0.0 for gain in gains]
+    limit = _linear_limit(plan, brightest, exposure, max(gains))
+    if any(headroom):
+        limit = min(limit, threshold)
+    scale = [gain * exposure * span_dn if in_float32 else 1.0 for gain in gains]
+    numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, headroom
+    limits, light_per_signal, site_gains, site_headroom = np.array(numbers, dtype=f).take(channels, axis=1)
     products = _raw_products(plan, codes) if is_raw else _products(plan, codes)
     if in_float32 and not gray_mean:
         products *= np.array(scale)[:, None, None]
     return kind(
-        products=products.astype(f),
+        products=products.astype(f, copy=False),
         code_count=codes,
         site_channels=channels,
-        inverse_gains=np.array(camera.inverse_gains, dtype=f),
+        inverse_gains=np.array(inverse_gains, dtype=f),
         gray_mean=gray_mean,
-        highlight_threshold=f(plan.isp.highlight_threshold),
-        divisor=f(1 if in_float32 else divisor),
-        steepness=f(1 / divisor if in_float32 else 1),
+        highlight_threshold=f(threshold),
+        divisor=f(1 if in_float32 else 1 - threshold),
+        steepness=f(1 / (1 - threshold) if in_float32 else 1),
         one=f(1),
         three=f(3),
         exposure=f(exposure),
@@ -139,15 +139,21 @@ def _scene(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene]) -
         limits=limits,
         light_per_signal=light_per_signal,
         gains=site_gains,
-        headroom=headroom,
+        headroom=site_headroom,
         response=EQUAL_RESPONSE,
     )
 
 
+def _linear_limit(plan: Plan, brightest: float, exposure: float, gain: float) -> float:
+    """Return a signal up to which no site is clipped or saturated, with a margin for rounding errors."""
+    light = min(brightest * 0.999, brightest - 1 / plan.sensor.span_dn)
+    if light < 0:  # black rounds to the DN of the full well, so all sites count as saturated
+        return -np.inf
+    return min(1.0, light / exposure) / gain * 0.999
+
+
 KEPT_SCENES = 1024, 4
 """Numbers of scenes of 256 codes (18 kB each) and of 65,536 codes (5 MB each) that are kept."""
-
-_scenes = [functools.lru_cache(maxsize=count)(_scene) for count in KEPT_SCENES]
 
 
 def _products(plan: Plan, codes: int) -> NDArray[np.float64]:
@@ -168,32 +174,6 @@ def with_response(scene: Scene, response: SiteMap) -> Scene:
     """Return the scene of a clean frame whose light is multiplied by a response."""
     # the second pass computes every vector, because only it applies the response
     return scene._replace(response=response, limits=np.full_like(scene.limits, -np.inf))
-
-
-def _site_gains(plan: Plan) -> tuple[float, ...]:
-    """Return the factors of the channels that remain: `_fill_gray_mean_signal` has inverted the gains already."""
-    if plan.source.is_raw:
-        return 1.0, 1.0, 1.0, 1.0
-    return (1.0, 1.0, 1.0) if _uses_gray_mean(plan) else plan.camera.inverse_gains
-
-
-def _uses_gray_mean(plan: Plan) -> bool:
-    return plan.isp.highlight == "gray_mean" and not plan.source.is_raw
-
-
-def _headroom(plan: Plan) -> list[float]:
-    """Return the factor of the per-channel highlight term by channel; 0 without the term."""
-    has_term = plan.isp.highlight == "per_channel"
-    return [max(1 - gain, 0.0) if has_term else 0.0 for gain in _site_gains(plan)]
-
-
-def _linear_limit(plan: Plan) -> float:
-    """Return a signal up to which no site is a highlight, clipped or saturated, with a margin for rounding errors."""
-    light = min(plan.brightest * 0.999, plan.brightest - 1 / plan.sensor.span_dn)
-    if light < 0:  # black rounds to the DN of the full well, so all sites count as saturated
-        return -np.inf
-    unclipped = min(1.0, light / plan.scene.exposure) / max(_site_gains(plan)) * 0.999
-    return min(unclipped, plan.isp.highlight_threshold) if any(_headroom(plan)) else unclipped
 
 
 @functools.lru_cache(maxsize=16)

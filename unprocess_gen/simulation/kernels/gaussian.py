@@ -54,8 +54,11 @@ class Gaussian32(NamedTuple):
 
 def variance_lines(plans: tuple[Plan, ...], dtype: Any = np.float64) -> NDArray[Any]:
     """Return the variance lines of the plans' frames, [N, 2]."""
+    lines = np.array([plan.noise.variance_line for plan in plans])
+    if dtype is np.float64:
+        return lines
     with np.errstate(over="ignore"):  # a variance beyond float32 becomes infinite, and the site is clipped
-        return np.array([plan.noise.variance_line for plan in plans]).astype(dtype)
+        return lines.astype(dtype)
 
 
 def gaussian_noise(plans: tuple[Plan, ...]) -> Gaussian:

@@ -50,6 +50,7 @@ from unprocess_gen.simulation.plan import FAST, Plan
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.slots import Slots
 
+Shape = tuple[int, int]
 CODES = 256, 65536
 """Numbers of codes of images of 8 bits and of 16 bits."""
 
@@ -86,18 +87,18 @@ def render_pairs(
 class CropRenderer:
     """Render crops of a plan in its epochs, all of ``shape``, without a dark frame.
 
-    What crops share is prepared once, which takes longer than a crop of 128 x 128. ``corner`` is the place of their
-    first site in the tile, and ``codes`` the number of codes of their image.
+    What crops share is prepared once, which takes longer than a crop of 128 x 128. ``frame`` are the sides of their
+    image, ``corner`` the place of their first site in the tile, and ``codes`` the number of codes of the image.
     """
 
-    def __init__(self, plan: Plan, shape: tuple[int, int], corner: tuple[int, int], codes: int) -> None:
-        self._plan, self._plans, self._shape = plan, (plan,), shape
+    def __init__(self, plan: Plan, shape: Shape, frame: Shape, corner: Shape, codes: int) -> None:
+        self._plan, self._plans, self._shape, self._frame = plan, (plan,), shape, frame
         self._form = _form(self._plans, shape, corner, codes)
 
     def __call__(self, srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
         """Return the clean frame, the noisy frame and a function that returns their counts, which takes 5 µs."""
         form = self._form
-        scene, noise = _records(form, self._plans, self._shape, origin, epoch=epoch)
+        scene, noise = _records(form, self._plans, self._shape, origin, epoch=epoch, frame=self._frame)
         keys = form.keys.copy()
         keys[0, 3] = frame_word(self._plan.place.frame, epoch)
         clean, noisy, numbers = _fill_frames(srgb, form, scene, noise, keys, origin)
@@ -193,7 +194,8 @@ def _records(
     shape: tuple[int, int],
     origin: tuple[int, int],
     dark_pixels: DarkPixels | None = None,
-    epoch: int | None = None,
+    epoch: int = 0,
+    frame: Shape | None = None,
 ) -> tuple[Scene, Noise]:
     """Return the scene and the noise at a place, whose classes select the compiled code."""
     first, scene = plans[0], form.scene
@@ -202,7 +204,7 @@ def _records(
     frames = form.frames
     if epoch and any(slots.columns or (slots.rows and slots.rows.correlation) for slots in frames):
         frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in plans)  # offsets of lines have words of an epoch
-    body = body_of(frames[0].patterns, shape, origin, is_live=epoch is not None)
+    body = body_of(frames[0].patterns, shape, origin, frame)
     factor = light_factor(frames[0].patterns, body, shape, origin, first.averaged)
     if factor is not None:
         scene = with_response(scene, factor)
