@@ -23,8 +23,8 @@ from skimage.metrics import structural_similarity
 from skimage.restoration import denoise_nl_means
 
 import unprocess_gen as ug
-from unprocess_gen.cli.builds import make_build
 from unprocess_gen.cli.main import run
+from unprocess_gen.cli.runs import make_build
 from unprocess_gen.config.option_files import build_names
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.files import file_sha256

@@ -46,7 +46,7 @@ REFUSED = [
     (["verify", "ds", "--regenerate"], r"verify: --regenerate: expected one argument"),
     (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate: -2: expected an integer of 0 or more"),
     (["replay", "ds", "--keys="], r"replay: --keys: a value is missing"),
-    (["verify"], r"verify: expected the folder of a dataset or of a sweep"),
+    (["verify"], r"verify: expected DIR, the folder of a dataset or of a sweep"),
     (["--config-dir", "/no/such"], r"--config-dir /no/such: no such folder"),
     (["--config-name", "other"], r".*'other'"),
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),

@@ -283,8 +283,7 @@ def test_finished_dataset_needs_no_part(part: Part, run_main: RunMain, tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("part", *SETTINGS), "part: K/N is missing: expected K/N, part K (from 0) of N, or /N with K in one of "
-         "SLURM_ARRAY_TASK_ID, PBS_ARRAY_INDEX, JOB_COMPLETION_INDEX"),
+        (("part", *SETTINGS), "part: expected K/N, part K (from 0) of N; or /N in a job of an array"),
         (("part", "x/6", *SETTINGS), "part: x/6: expected K/N, part K (from 0) of N, or /N with K in one of "
          "SLURM_ARRAY_TASK_ID, PBS_ARRAY_INDEX, JOB_COMPLETION_INDEX"),
         (("part", "/6", *SETTINGS), "part: its number is missing; expected K/N, or one of SLURM_ARRAY_TASK_ID, "

@@ -277,7 +277,7 @@ def test_report_is_written_to_another_file_unless_it_is_no_page(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((), "report: expected the folder of a dataset"),
+        ((), "report: expected DIR"),
         (("ds", "--too", "x"), "report: --too: no such flag; expected --to, "),
         (("ds", "--to", "."), "--to .: is a folder; expected the name of a file"),
         (

@@ -17,7 +17,8 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.suggestions import did_you_mean
 
 if TYPE_CHECKING:
-    from unprocess_gen.core.paths import AnyPath
+    from unprocess_gen.core.object_store import ObjectPath
+    from unprocess_gen.core.paths import LocalPath
 
 
 def text(value: str) -> str:
@@ -94,7 +95,7 @@ class Verb(NamedTuple):
     """A verb of the command line; ``run`` returns the exit code.
 
     ``composes`` verbs take the settings of a run and Hydra's flags. ``keys`` are settings of the verb itself with their
-    help, such as ``source.root=ROOT``. ``resumes``: a rerun continues interrupted work.
+    help, such as ``source.root=ROOT``.
     """
 
     name: str
@@ -104,8 +105,6 @@ class Verb(NamedTuple):
     flags: tuple[Flag, ...] = ()
     keys: Mapping[str, str] = MappingProxyType({})
     composes: bool = False
-    resumes: bool = False
-    extra: str = ""
 
     @property
     def all_flags(self) -> tuple[Flag, ...]:
@@ -127,7 +126,7 @@ class Call(argparse.Namespace):
 
     verb: Verb
     words: list[str]
-    place: AnyPath | None
+    place: LocalPath | ObjectPath | None
     settings: dict[str, str]
     overrides: list[str]
 
@@ -165,8 +164,6 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
             if key in call.settings or not value:
                 raise ConfigError(f"{verb.name}: {word}: {f'{key} is given twice' if value else 'a value is missing'}")
             call.settings[key] = os.path.expanduser(value)
-        elif verb.extra and not equals and verb.extra not in call.settings:
-            call.settings[verb.extra] = word
         elif verb.composes and (equals or word.startswith("~")):
             call.overrides.append(word)
         elif verb.composes:
@@ -187,7 +184,7 @@ def _take_place(verb: Verb, words: list[str]) -> str | None:
     if place is not None:
         words.remove(place)
     elif not verb.place.optional:
-        raise ConfigError(f"{verb.name}: expected {verb.place.expected}")
+        raise ConfigError(f"{verb.name}: expected {verb.place.metavar}, {verb.place.expected}")
     return place
 
 

@@ -24,6 +24,9 @@ from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.core.errors import RESUME, ConfigError, UnprocessGenError
 from unprocess_gen.core.suggestions import did_you_mean
 
+RESUMING = ("generate", "manifest", "part", "again", "build")
+"""Verbs that continue interrupted work when they are run again."""
+
 OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
 """OpenCV refuses pictures above these limits if the environment sets them; here `source.max_pixels` decides."""
 
@@ -82,7 +85,7 @@ def _report_end(error: BaseException, arguments: Sequence[str]) -> int:
         # OmegaConf and LLVM may fail in their own way when they are interrupted
         number = SIGNALS.received or signal.SIGINT
         try:
-            resumes = find_verb(arguments)[0].resumes
+            resumes = find_verb(arguments)[0].name in RESUMING
         except ConfigError:
             resumes = False
         what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"

@@ -17,11 +17,10 @@ def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> 
     ``files`` accepts the file of a manifest too, ``sweeps`` the folder of a sweep.
     """
     from unprocess_gen.core.output_paths import DATASET_ENTRIES
-    from unprocess_gen.core.paths import any_path
 
     verb, path, place = call.verb.name, call.place, call.verb.place
     assert path is not None and place is not None
-    if not any_path(path).is_listed():
+    if not path.is_listed():
         kind = "file or folder" if files else "folder"
         raise ConfigError(f"{verb}: {path}: no such {kind}; expected {place.expected}")
     if not path.is_dir():

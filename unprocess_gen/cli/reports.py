@@ -1,4 +1,4 @@
-"""Run the verbs that report on settings or on a dataset: plan, accuracy, report, preview and dng."""
+"""Run the verbs that show settings or a dataset: plan, accuracy, report, preview, dng and explore."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import shlex
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.jobs import composed_jobs
+from unprocess_gen.cli.jobs import composed_jobs, option_folders
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
-from unprocess_gen.cli.sweep import plan_totals, swept_keys, worst
+from unprocess_gen.cli.sweep import swept_keys, worst
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
+from unprocess_gen.core.libraries import require
 from unprocess_gen.reports.formatting import counted
 
 
@@ -20,7 +21,7 @@ def plan(call: Call) -> int:
     """Estimate pairs, bytes and time of a run, and explain which effects it simulates."""
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run
-    from unprocess_gen.reports.plan_text import format_estimate
+    from unprocess_gen.reports.plan_text import format_estimate, totals_line
 
     jobs, text = composed_jobs(call), ""
     for job in jobs:
@@ -30,7 +31,7 @@ def plan(call: Call) -> int:
         if job.result is not None:
             print_results(*([] if job is jobs[0] else [""]), f"out       {job.config.out}", text)
     estimates = [job.result for job in jobs if job.sweep is not None and job.result is not None]
-    print_results(*([plan_totals(estimates)] if estimates else []))
+    print_results(*([totals_line(estimates)] if estimates else []))
     return worst(job.code for job in jobs)
 
 
@@ -116,16 +117,10 @@ def preview(call: Call) -> int:
 
 def _check_not_among_photographs(to: Path, root: str | None) -> None:
     """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
-    from unprocess_gen.core.paths import any_path
-
-    place = None if root is None else any_path(root).resolve()
-    if not isinstance(place, Path) or not place.is_dir():
-        return
-    if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
-        raise ConfigError(
-            f"--to {to}: is inside the folder of the photographs, {root}; expected a folder outside of it, "
-            "because runs would read the pictures; choose another folder"
-        )
+    place, resolved = os.path.realpath(root or ""), Path(os.path.realpath(to))
+    if root is not None and Path(place).is_dir() and Path(place) in (resolved, *resolved.parents):
+        expected = "expected a folder outside of it, because runs would read the pictures; choose another folder"
+        raise ConfigError(f"--to {to}: is inside the folder of the photographs, {root}; {expected}")
 
 
 def dng(call: Call) -> int:
@@ -146,3 +141,29 @@ def dng(call: Call) -> int:
     )
     print_results(f"{call.to}: " + "; ".join(text for count, text in counts if count))
     return 0
+
+
+def explore(call: Call) -> int:
+    """Serve a page on this machine until it is interrupted."""
+    for library in ("bokeh", "jinja2"):
+        require(library, f"explore: the page needs {library}", "explore")
+    if call.multirun or call.cfg or call.resolve:
+        name = "--multirun" if call.multirun else "--cfg" if call.cfg else "--resolve"
+        raise ConfigError(f"explore: {name}: a page shows one config; expected settings; leave it out")
+    from unprocess_gen.reports.explorer import server
+    from unprocess_gen.reports.explorer.exploration import open_place
+
+    place = call.place
+    if place is not None and not place.is_listed():
+        raise ConfigError(f"explore: {place}: no such file or folder; expected a photograph, a folder or a dataset")
+    if place is not None and place.is_dir() and (place / "sweep.csv").is_file():
+        raise ConfigError(f"explore: {place}: is the folder of a sweep; expected one of its datasets")
+    given = {"--config-dir": call.config_dir, "--config-name": call.config_name, "--config-path": call.config_path}
+    flags = [word for name, value in given.items() if value is not None for word in (name, str(value))]
+    choices = open_place(place, call.keys, call.overrides, flags, option_folders(call))
+    server.serve(choices, call.port, not call.no_browser, _print_address)
+    return 0
+
+
+def _print_address(address: str) -> None:
+    print_results(f"{address} shows the page on this machine; stop with Ctrl-C")

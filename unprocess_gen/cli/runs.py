@@ -1,22 +1,37 @@
-"""Run the verbs that generate a dataset: generate, manifest and again."""
+"""Run the verbs that generate datasets: generate, manifest, part, merge, again and build."""
 
 from __future__ import annotations
 
+import itertools
+import os
+import re
 from collections.abc import Mapping
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
-from unprocess_gen.cli.jobs import Job, composed_jobs
-from unprocess_gen.cli.messages import print_results
+from unprocess_gen.cli.jobs import Job, checked_jobs, composed_jobs
+from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import result_cells, worst, write_row
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.config.option_files import OptionFolders, build_names
+from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from unprocess_gen.config.schema import Config
+    from unprocess_gen.pipeline.builds import Build
     from unprocess_gen.pipeline.generate import Summary
+
+
+PART_VARIABLES = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDEX")
+"""Variables in which SLURM, PBS and Kubernetes give a job of an array its number."""
+
+DIFFERENCES_LISTED = 20
+"""Differences from a build that are listed; the others are counted."""
 
 
 def generate(call: Call, changes: Mapping[str, Any] | None = None) -> int:
@@ -59,6 +74,58 @@ def outcome(config: Config, summary: Summary) -> tuple[int, list[str]]:
     return TOO_MANY_FAILED if too_many else DONE, lines
 
 
+def part(call: Call) -> int:
+    """Generate one part of a dataset, or of each dataset of a sweep."""
+    from unprocess_gen.pipeline.generate import make_part
+
+    number, parts = _part(str(call.place or ""))
+    jobs = composed_jobs(call)
+    for job in jobs:
+        out, texts = job.config.out, []
+        with job:
+            if (made := make_part(job.config, number, parts, job.label)) is None:
+                texts = [f"{out} is complete; nothing to do"]
+            else:
+                shards = counted(made.done + made.shards, "shard")
+                made_now = f"{made.shards} of them ({counted(made.rows, 'row')}) in this run"
+                texts = [f"{out}: part {number} of {parts}: {shards} committed, {made_now}"]
+        print_results(*texts)
+    return worst(job.code for job in jobs)
+
+
+def _part(text: str) -> tuple[int, int]:
+    """Read ``K/N``, or ``/N`` with K from the batch system."""
+    written = re.fullmatch(r"(\d*)/(\d+)", text)
+    if written is None:
+        raise ConfigError(
+            f"part: {text or 'K/N is missing'}: expected K/N, part K (from 0) of N, or /N with K in one of "
+            f"{', '.join(PART_VARIABLES)}"
+        )
+    number, parts = int(written[1] or _number_of_environment()), int(written[2])
+    if number >= parts:
+        raise ConfigError(f"part: {number}/{parts}: out of range; expected K from 0 to N - 1")
+    return number, parts
+
+
+def _number_of_environment() -> str:
+    """Number of the part that a batch system gives."""
+    for variable in PART_VARIABLES:
+        if (text := os.environ.get(variable)) is not None:
+            if not text.isdecimal():
+                raise ConfigError(f"part: {variable}={text}: expected an integer from 0")
+            return text
+    raise ConfigError(f"part: its number is missing; expected K/N, or one of {', '.join(PART_VARIABLES)}")
+
+
+def merge(call: Call) -> int:
+    """Write manifest and ``dataset.json`` of a run whose parts are done."""
+    from unprocess_gen.pipeline.generate import merge
+
+    summary, max_failed = merge(str(call.place))
+    print_results(summary.sentence(max_failed))
+    return TOO_MANY_FAILED if sum(summary.failed.values()) > max_failed else DONE
+
+
 def again(call: Call) -> int:
     """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
     from unprocess_gen.config.composition import load_config
@@ -81,3 +148,46 @@ def again(call: Call) -> int:
     print_results(*lines)
     print_results(compare(folder, any_path(config.out)))
     return code
+
+
+def build(call: Call) -> int:
+    """Make a benchmark build, or compare an existing one; list all builds."""
+    from unprocess_gen.pipeline.builds import read_build
+
+    if call.list:
+        if call.place or call.to:
+            raise ConfigError("build: --list: lists all builds; expected neither NAME nor --to; leave them out")
+        for entry in map(read_build, build_names()):
+            print_results(f"{entry.name:<28} {len(entry.rows()):>3} pairs  {entry.recipe.title}")
+        return 0
+    if call.place is None or call.to is None:
+        missing = "NAME" if call.place is None else "--to"
+        raise ConfigError(f"build: {missing} is missing; expected gen-dataset build NAME --to DIR, or --list")
+    made, folder = read_build(str(call.place)), call.to
+    made.check_folder(folder, f"--to {folder}")
+    if code := make_build(made, folder, call.settings.get("n_jobs", "-1")):
+        return code
+    differences = made.differences(folder)
+    shown = [str(damage) for damage in itertools.islice(differences, DIFFERENCES_LISTED)]
+    more = sum(1 for _ in differences)
+    for text in [*shown, *([f"and {more} more differences"] if more else [])]:
+        report(f"{folder}: {text}")
+    if shown:
+        return DamageError.exit_code
+    print_results(f"{folder} is the build {made.name}, bit for bit")
+    return 0
+
+
+def make_build(build: Build, folder: Path, n_jobs: str = "-1") -> int:
+    """Generate a build; the worst exit code. Folders of a sweep have the names of their swept settings."""
+    from unprocess_gen.config.composition import compose_jobs
+    from unprocess_gen.pipeline.generate import generate
+
+    settings = [*build.overrides(folder, build.photographs_folder()), f"n_jobs={n_jobs}"]
+    composed = compose_jobs(settings, OptionFolders(), multirun=bool(build.recipe.sweep))
+    jobs = checked_jobs(composed, only_swept=True)
+    for job in jobs:
+        with job:
+            job.result = generate(job.config, job.label)
+        finish(job, has_advice=False)
+    return worst(job.code for job in jobs)

@@ -12,7 +12,6 @@ from unprocess_gen.core.errors import RESUME
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
-    from unprocess_gen.reports.estimate import RunEstimate
 
 SEVERITY = (0, 3, 11, 4, 2, 5, 1)
 """Exit codes from good to bad; a sweep exits with the worst code of its jobs."""
@@ -123,15 +122,3 @@ def write_row(out: Path, row: Mapping[str, str]) -> None:
 def swept_keys(rows: Iterable[Mapping[str, str]]) -> list[str]:
     """Keys that a sweep varies: the columns of its table between the columns of every sweep."""
     return list(dict.fromkeys(key for row in rows for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS}))
-
-
-def plan_totals(estimates: Sequence[RunEstimate]) -> str:
-    """Totals of a planned sweep, whose jobs run one after the other, in one line."""
-    pairs = sum(job.pairs for job in estimates)
-    about = "" if all(job.exact for job in estimates) else "about "
-    seconds = sum(job.seconds for job in estimates)
-    return (
-        f"totals    {len(estimates)} jobs: {about}{pairs:,} pairs in {sum(job.shards for job in estimates):,} shards, "
-        f"{about}{sum(job.bytes for job in estimates):,} bytes, about "
-        + (f"{seconds:,.1f} s" if seconds < 90 else f"{seconds / 60:,.0f} min")
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from unprocess_gen.cli import builds, calibration, camera, checks, explore, parts, reports, runs
+from unprocess_gen.cli import cameras, checks, reports, runs
 from unprocess_gen.cli.arguments import Place, Verb, count, flag, local, switch
 
 DATASET = Place("DIR", "the folder of a dataset")
@@ -17,24 +17,16 @@ ROWS = "rows by source index, range or key, such as 3,7-9,00000012-p0007"
 KEYS = flag("--keys", "KEYS", ROWS)
 
 _VERBS = (
-    Verb("generate", "generate a dataset; the default verb", runs.generate, composes=True, resumes=True),
-    Verb(
-        "manifest",
-        "write the manifest of a dataset without its frames, for ug.LivePairs",
-        runs.manifest,
-        composes=True,
-        resumes=True,
-    ),
+    Verb("generate", "generate a dataset; the default verb", runs.generate, composes=True),
+    Verb("manifest", "write the manifest of a dataset without frames, for ug.LivePairs", runs.manifest, composes=True),
     Verb(
         "part",
         "generate part K (from 0) of N of a dataset, for separate jobs; merge finishes it",
-        parts.part,
-        keys={"part=K/N": "the part; /N: K is the number of the array job"},
+        runs.part,
+        Place("K/N", "part K (from 0) of N; or /N in a job of an array"),
         composes=True,
-        resumes=True,
-        extra="part",
     ),
-    Verb("merge", "write manifest.csv and dataset.json when all parts are finished", parts.merge, BEGUN),
+    Verb("merge", "write manifest.csv and dataset.json when all parts are finished", runs.merge, BEGUN),
     Verb(
         "plan",
         "estimate pairs, bytes and time, and explain the effects; write nothing",
@@ -45,12 +37,7 @@ _VERBS = (
         ),
         composes=True,
     ),
-    Verb(
-        "accuracy",
-        "measure time and error of each tier, stage by stage; default out: accuracy",
-        reports.accuracy,
-        composes=True,
-    ),
+    Verb("accuracy", "measure time and error of each tier; default out: accuracy", reports.accuracy, composes=True),
     Verb(
         "verify",
         "check every byte of a dataset or sweep; repair, regenerate, check noise",
@@ -83,7 +70,7 @@ _VERBS = (
     Verb(
         "explore",
         "try settings on a photograph or a row, in a page of the browser on this machine",
-        explore.explore,
+        reports.explore,
         Place("PHOTO", "a photograph, a folder of photographs, or a dataset", optional=True),
         (
             KEYS,
@@ -131,21 +118,19 @@ _VERBS = (
             "output.frames=true": "make the frames of a manifest without frames",
             "source.max_failed=N": "largest number of failed sources with exit code 0",
         },
-        resumes=True,
     ),
     Verb(
         "build",
         "make a benchmark build and compare every byte with its recorded digests",
-        builds.build,
+        runs.build,
         Place("NAME", "the name of a build", optional=True),
         (flag("--to", "DIR", "write the build to DIR", local), switch("--list", "list all builds")),
         N_JOBS,
-        resumes=True,
     ),
     Verb(
         "calibrate",
         "measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile",
-        calibration.calibrate,
+        cameras.calibrate,
         Place("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
         (
             flag("--to", "FILE", "write the profile to FILE.yaml, and estimates to FILE.json", local, required=True),
@@ -156,7 +141,7 @@ _VERBS = (
     Verb(
         "camera",
         "write a camera option, and a sensor option, from one raw file",
-        camera.camera,
+        cameras.camera,
         Place("FILE", "the raw file: a DNG, or another one that LibRaw reads"),
         (
             flag("--to", "CAMERA", "write the matrix of the camera to CAMERA.yaml", local, required=True),

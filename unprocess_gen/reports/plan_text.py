@@ -49,6 +49,17 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
     )
 
 
+def totals_line(estimates: Sequence[RunEstimate]) -> str:
+    """Totals of a planned sweep, whose jobs run one after the other, in one line."""
+    pairs = sum(job.pairs for job in estimates)
+    about = "" if all(job.exact for job in estimates) else "about "
+    seconds = sum(job.seconds for job in estimates)
+    return (
+        f"totals    {len(estimates)} jobs: {about}{pairs:,} pairs in {sum(job.shards for job in estimates):,} shards, "
+        f"{about}{sum(job.bytes for job in estimates):,} bytes, about " + format_duration(seconds)
+    )
+
+
 def format_duration(seconds: float) -> str:
     """Format a duration in seconds, minutes or hours, whichever reads best."""
     if seconds < 90:
