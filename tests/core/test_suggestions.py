@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import pytest
 
-from unprocess_gen.core.suggestions import suggest
+from unprocess_gen.core.suggestions import did_you_mean
 
-VERBS = ("plan", "verify", "replay", "report", "preview")
+OPTIONS = ("plan", "verify", "replay", "report", "preview", "--keys", "--to")
+CLOSEST = {
+    "verfy": "verify",
+    "plann": "plan",
+    "Verify": "verify",
+    "repaly": "replay",
+    "--kyes": "--keys",
+    "-keys": "--keys",
+    "xyzzy": None,
+    "": None,
+}
 
 
-@pytest.mark.parametrize(
-    ("word", "closest"),
-    [("verfy", "verify"), ("plann", "plan"), ("Verify", "verify"), ("repaly", "replay"), ("xyzzy", None), ("", None)],
-)
-def test_closest_word_is_suggested(word: str, closest: str | None) -> None:
-    assert suggest(word, VERBS) == closest
-
-
-def test_flag_keeps_its_hyphens() -> None:
-    assert suggest("--kyes", ("--keys", "--to")) == suggest("-keys", ("--keys", "--to")) == "--keys"
+@pytest.mark.parametrize("word", CLOSEST)
+def test_closest_word_is_suggested_as_it_is_spelt(word: str) -> None:
+    assert did_you_mean(word, OPTIONS) == (f"; did you mean {CLOSEST[word]}?" if CLOSEST[word] else "")
