@@ -27,10 +27,9 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.object_store import TEMPORARY_PREFIX, ObjectPath
-from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.generate import Summary, generate
-from unprocess_gen.pipeline.run import LISTING, Run
+from unprocess_gen.pipeline.run import LISTING
 
 
 @pytest.fixture(autouse=True)
@@ -175,28 +174,23 @@ def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, un
 def test_run_with_other_settings_loses_the_race(
     twelve: Path, bucket: ObjectPath, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    checked = runner.check_begun
+    create = OutFolder.create
 
-    def begun_by_another(*arguments: Any) -> None:
-        checked(*arguments)
-        monkeypatch.setattr(runner, "check_begun", checked)
+    def begun_by_another(*arguments: Any) -> bool:
+        monkeypatch.setattr(OutFolder, "create", create)
         generate(config_of(twelve, bucket / "ds"))
+        return create(*arguments)
 
-    monkeypatch.setattr(runner, "check_begun", begun_by_another)
+    monkeypatch.setattr(OutFolder, "create", begun_by_another)
     with pytest.raises(ConfigError, match=r"was begun with other settings: seed=4 \(there: 0\)"):
         generate(config_of(twelve, bucket / "ds", "seed=4"))
     assert_same(bucket / "ds", undisturbed)
 
 
-def test_run_with_other_sources_loses_the_race(
-    twelve: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_with_other_sources_loses_the_race(twelve: Path, bucket: ObjectPath) -> None:
     """The listing is never replaced."""
 
-    def begun_by_another(folder: OutFolder, run: Run) -> None:
-        folder.create(LISTING, run.listing_text.partition(b"\n")[2])
-
-    monkeypatch.setattr(runner, "check_begun", begun_by_another)
+    OutFolder(bucket / "ds").create(LISTING, b'["000.png",1]\n')
     with pytest.raises(ConfigError, match=r"ds: was begun with other sources"):
         generate(config_of(twelve, bucket / "ds"))
 

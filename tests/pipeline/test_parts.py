@@ -289,7 +289,7 @@ def test_finished_dataset_needs_no_part(part: Part, run_main: RunMain, tmp_path:
         (("part", "/6", *SETTINGS), "part: its number is missing; expected K/N, or one of SLURM_ARRAY_TASK_ID, "
          "PBS_ARRAY_INDEX, JOB_COMPLETION_INDEX"),
         (("part", "6/6", *SETTINGS), "part: 6/6: out of range; expected K from 0 to N - 1"),
-        (("part", "0/5", *SETTINGS), "part 0/5: ds was begun with 6 parts; expected K/6; choose another out"),
+        (("part", "0/5", *SETTINGS), "part K/5: ds was begun with 6 parts; expected K/6; choose another out"),
         (("part", "0/13", *SETTINGS, "out=new"), "part 0/13: this dataset has 12 shards; expected N from 1 to 12; "
          "lower N or output.pairs_per_shard"),
         (("part", "0/6", *SETTINGS, "seed=1"), "out=ds: was begun with other settings: seed=1 (there: 0); choose "

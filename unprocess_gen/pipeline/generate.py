@@ -32,12 +32,11 @@ from unprocess_gen.pipeline.run import (
     Run,
     RunFile,
     begin,
-    check_begun,
     check_finished,
     check_settings,
-    part_of_run,
     read_run,
     resolve,
+    resolve_part,
 )
 from unprocess_gen.pipeline.sizes import check_free_space
 from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, Made, ShardReport, StageTimes, Tally
@@ -168,8 +167,7 @@ def generate(config: Config, label: str = "") -> Summary:
         facts = folder.finished()
         if facts is None:
             folder.lock()
-            check_begun(folder, run)
-            known, made = _make(folder, run, range(run.shards), None, label)
+            known, made = _make(folder, run, None, label)
             facts = folder.finished()  # by a concurrent run, where there is no lock
         if facts is None:
             process = {
@@ -183,7 +181,7 @@ def generate(config: Config, label: str = "") -> Summary:
             facts = _finish(folder, known, columns_of(run.config), run.file(None).facts(), process)
         else:
             made = Made()
-            check_finished(folder, run, facts)
+            check_finished(folder, run.config, run.sources, facts)
     return Summary.of(folder.path, facts, started, made=made.rows, times=made.times, unmatched=run.listing.unmatched)
 
 
@@ -197,8 +195,13 @@ def make_part(config: Config, part: int, parts: int, label: str = "") -> Made | 
         if folder.finished() is not None:
             check_settings(folder, dataset_yaml(PairSettings.read(config).config))
             return None
-        run, shards = part_of_run(folder, config, part, parts)
-        _, made = _make(folder, run, shards, parts, ": ".join(filter(None, (label, f"part {part} of {parts}"))))
+        run = resolve_part(folder, config)
+        if parts > run.shards:
+            raise ConfigError(
+                f"part {part}/{parts}: this dataset has {run.shards} shard{'s' * (run.shards != 1)}; expected N "
+                f"from 1 to {run.shards}; lower N or output.pairs_per_shard"
+            )
+        _, made = _make(folder, run, (part, parts), label)
         if folder.finished() is not None:  # another process made the part and merged
             folder.remove_work()
         return made
@@ -232,19 +235,22 @@ def merge(out: str) -> tuple[Summary, int]:
     return replace(summary, made=summary.rows), known.max_failed
 
 
-def _make(folder: OutFolder, run: Run, shards: range, parts: int | None, label: str) -> tuple[RunFile, Made]:
-    """Make and commit those of some shards that are not done."""
+def _make(folder: OutFolder, run: Run, part: tuple[int, int] | None, label: str) -> tuple[RunFile, Made]:
+    """Make and commit the shards that are not done, all or those of part K of N."""
     if run.config.executor.kind == "dask":
         from unprocess_gen.pipeline.executors.dask import make_shards
     else:
         from unprocess_gen.pipeline.executors.local import make_shards
+    first, parts = part or (0, 1)
+    shards = range(first, run.shards, parts)
     done = done_shards(folder, shards)
     todo = [run.task(shard) for shard in shards if shard not in done]
     if run.config.check_disk:
         check_free_space(run.config, [source for task in todo for source in task.sources])
-    known, made = begin(folder, run, parts), Made(done=len(done))
+    known, made = begin(folder, run, parts if part else None), Made(done=len(done))
     images = sum(len(task.sources) for task in todo)
-    total = images if parts else len(run.sources)
+    total = images if part else len(run.sources)
+    label = ": ".join(filter(None, (label, part and f"part {first} of {parts}")))
     with machine_errors(folder.path, RESUME), Progress(total, total - images, label) as progress:
         for warning in run.warnings():
             progress.warn(warning)

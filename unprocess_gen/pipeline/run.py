@@ -18,7 +18,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property, partial
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -40,7 +40,6 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.deaths import DEATHS
 from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
-from unprocess_gen.pipeline.records import tar_name
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.sensor_levels import sensor_warning
@@ -73,9 +72,8 @@ class RunFile(msgspec.Struct, frozen=True):
 
     def facts(self) -> dict[str, Any]:
         """Facts about the sources, as ``dataset.json`` has them."""
-        names = "not_matched", "skipped_links", "source", "dark_frames"
-        facts: dict[str, Any] = msgspec.to_builtins({name: getattr(self, name) for name in names})
-        return {name: value for name, value in facts.items() if value is not None}
+        facts = {name: getattr(self, name) for name in ("not_matched", "skipped_links", "source", "dark_frames")}
+        return {name: msgspec.to_builtins(fact) for name, fact in facts.items() if fact is not None}
 
 
 @dataclass(frozen=True)
@@ -112,22 +110,19 @@ class Run:
         return tuple(dict.fromkeys(filter(None, warnings)))
 
     @cached_property
-    def config_yaml(self) -> str:
-        """Text of the dataset's ``config.yaml``."""
-        return dataset_yaml(self.config)
-
-    @cached_property
     def listing_text(self) -> bytes:
         """Lines of `LISTING`."""
+        if isinstance(self.sources, RecordedSources):
+            return self.sources.content
         return b"".join(msgspec.json.encode(_values(source)) + b"\n" for source in self.sources)
 
     def file(self, parts: int | None) -> RunFile:
         """Facts on which all processes of the run must agree, as this process finds them."""
         config = self.config
-        place, listed = absolute_text(config.source.place), absolute_text(config.source.list)
+        source = {"root": absolute_text(config.source.place), "list": absolute_text(config.source.list)}
         return RunFile(
             version=version("unprocess_gen"),
-            config=self.config_yaml,
+            config=dataset_yaml(config),
             sources=len(self.sources),
             shards=self.shards,
             parts=parts,
@@ -135,7 +130,7 @@ class Run:
             max_failed=config.source.max_failed,
             not_matched=self.listing.not_matched,
             skipped_links=self.listing.skipped_links,
-            source=check_record({"kind": source_kind(config), "root": place, "list": listed}, SourceFacts),
+            source=check_record({"kind": source_kind(config), **source}, SourceFacts),
             dark_frames=_dark_facts(self.settings),
         )
 
@@ -149,6 +144,15 @@ def resolve(config: Config) -> Run:
     return Run(PairSettings.read(config), listing)
 
 
+def resolve_part(folder: OutFolder, config: Config) -> Run:
+    """Find the run of a part as `resolve`, but read its listing if another part has recorded one."""
+    known = read_run(folder)
+    recorded = None if known is None else _read_listing(folder, known)
+    if known is None or recorded is None:
+        return resolve(config)
+    return Run(PairSettings.read(config), Listing(recorded, known.skipped_links, {"": known.not_matched}))
+
+
 def _dark_facts(settings: PairSettings) -> DarkFrameFacts | None:
     """Place, number, sizes and noise of the dark frames."""
     root, dark_frames = settings.config.noise.dark_frames, settings.dark_frames
@@ -159,42 +163,7 @@ def _dark_facts(settings: PairSettings) -> DarkFrameFacts | None:
     return DarkFrameFacts(absolute_text(root), len(dark_frames.frames), sizes, dark_frames.black_dn, std_dn)
 
 
-# ----------------------------------------------------------------------------------------------------------- listings
-
-_FIELDS = tuple(field.name for field in fields(Source) if field.name not in ("index", "path"))
-_DEFAULTS = tuple(field.default for field in fields(Source) if field.name not in ("index", "path"))
-
-
-class RecordedSources(Sequence[Source]):
-    """Sources of a recorded listing, each parsed when it is taken: a part of a million takes only its own."""
-
-    def __init__(self, content: bytes) -> None:
-        self._content = content
-        letters, size = np.frombuffer(content, np.uint8), 2**24
-        starts = range(0, len(content), size)
-        self._ends = np.concatenate([np.flatnonzero(letters[i : i + size] == ord("\n")) + i for i in starts])
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    def __getitem__(self, item: Any) -> Any:
-        if isinstance(item, slice):
-            return tuple(self[index] for index in range(*item.indices(len(self))))
-        start = self._ends[item - 1] + 1 if item else 0
-        values = parse_record(self._content[start : self._ends[item]], list[Any])
-        source = dict(zip(_FIELDS, values, strict=False))
-        return check_record({"index": item, "path": decode_name(str(source["name"])), **source}, Source)
-
-
-def _values(source: Source) -> list[Any]:
-    """Values of a source, without those at the end that are defaults."""
-    values = [getattr(source, name) for name in _FIELDS]
-    while values[-1] == _DEFAULTS[len(values) - 1]:
-        values.pop()
-    return values
-
-
-# -------------------------------------------------------------------------------------------------------------- begun
+# -------------------------------------------------------------------------------------------------------------- files
 
 
 def read_run(folder: OutFolder) -> RunFile | None:
@@ -202,76 +171,27 @@ def read_run(folder: OutFolder) -> RunFile | None:
     return folder.record(RUN, lambda content: parse_record(content, RunFile))
 
 
-def read_listing(folder: OutFolder, known: RunFile) -> RecordedSources | None:
-    """Read the listing of a run, None if it was lost; MachineError if it was edited."""
-
-    def parse(content: bytes) -> RecordedSources:
-        if hashlib.sha256(content).hexdigest() != known.listing_sha256:
-            raise ValueError(f"its SHA-256 differs from that in {RUN}")
-        return RecordedSources(content)
-
-    return folder.record(LISTING, parse, MOST_BYTES)
-
-
-def part_of_run(folder: OutFolder, config: Config, part: int, parts: int) -> tuple[Run, range]:
-    """Find the run of a part, whose listing is read if there is one, and the shards of the part.
-
-    ConfigError if the run was begun with other settings, parts, or by another version, or has fewer shards than parts.
-    """
-    settings, known = PairSettings.read(config), read_run(folder)
-    recorded = None
-    if known is not None:
-        check_settings(folder, dataset_yaml(settings.config), config.source.place)
-        _check_parts(folder, known, part, parts)
-        recorded = read_listing(folder, known)
-    if known is None or recorded is None:
-        run = Run(settings, list_photographs(config.source))
-    else:
-        run = Run(settings, Listing(recorded, known.skipped_links, {"": known.not_matched}))
-    if parts > run.shards:
-        raise ConfigError(
-            f"part {part}/{parts}: this dataset has {run.shards} shard{'s' * (run.shards != 1)}; expected N from 1 to "
-            f"{run.shards}; lower N or output.pairs_per_shard"
-        )
-    return run, range(part, run.shards, parts)
-
-
-def _check_parts(folder: OutFolder, known: RunFile, part: int, parts: int) -> None:
-    """Raise ConfigError if a run was begun by another version, or with another number of parts."""
-    own = version("unprocess_gen")
-    if known.version != own:
-        raise ConfigError(
-            f"out={folder}: was begun by unprocess_gen {known.version}, this is {own}; expected the same version; "
-            "install it, or choose another out"
-        )
-    if known.parts not in (None, parts):
-        raise ConfigError(
-            f"part {part}/{parts}: {folder} was begun with {known.parts} parts; expected K/{known.parts}; choose "
-            "another out"
-        )
-
-
-def check_begun(folder: OutFolder, run: Run) -> None:
-    """Raise ConfigError if ``out`` was begun with other settings or sources; name the differences."""
-    check_settings(folder, run.config_yaml, run.config.source.place)
-    known = read_run(folder)
-    if known is not None and known.listing_sha256 != hashlib.sha256(run.listing_text).hexdigest():
-        recorded = read_listing(folder, known) or ()
-        _check_sources(folder, lambda: iter(recorded), run.sources, _is_listed_alike)
-
-
 def begin(folder: OutFolder, run: Run, parts: int | None = None) -> RunFile:
-    """Record a run that has been checked, unless another process has; return the record.
+    """Record a run, or check that it is the one that is recorded; return the record.
 
-    ConfigError if the folder cannot be written, or another process has begun another run meanwhile; MachineError if
-    the disk is full.
+    ConfigError if it was begun with other settings, sources or parts, a part also if by another version; if the folder
+    cannot be written. MachineError if the disk is full.
     """
+    own, known = run.file(parts), read_run(folder)
     try:
-        known = read_run(folder)
-        if known is None or not (folder / LISTING).is_listed():
-            known = _record(folder, run, parts)
-        if not folder.create("config.yaml", known.config.encode()):
-            check_settings(folder, run.config_yaml, run.config.source.place)
+        if known is None:
+            check_settings(folder, own.config, run.config.source.place)
+            if not folder.create(LISTING, run.listing_text) and folder.read(LISTING, MOST_BYTES) != run.listing_text:
+                raise ConfigError(
+                    f"out={folder}: was begun with other sources ({LISTING} differs); choose another out, or remove it"
+                )
+            folder.create(RUN, json.dumps(msgspec.to_builtins(own), indent=1).encode() + b"\n")
+            known = read_run(folder) or own  # another process may have been first
+        check_settings(folder, own.config, run.config.source.place)
+        _check_record(folder, run, known, own)
+        folder.create("config.yaml", known.config.encode())
+        if not (folder / LISTING).is_listed():
+            folder.create(LISTING, run.listing_text)
         for name in ("shards", DEATHS):
             (folder / name).mkdir(exist_ok=True)
         folder.delete_unfinished()
@@ -288,42 +208,35 @@ def begin(folder: OutFolder, run: Run, parts: int | None = None) -> RunFile:
     return known
 
 
-def _record(folder: OutFolder, run: Run, parts: int | None) -> RunFile:
-    """Create listing and run.json; where another process was first, equal ones are used."""
-    own, other = (
-        run.file(parts),
-        ConfigError(
-            f"out={folder}: was begun with other sources ({LISTING} differs); choose another out, or remove it"
-        ),
-    )
-    if not folder.create(LISTING, run.listing_text) and folder.read(LISTING, MOST_BYTES) != run.listing_text:
-        raise other
-    folder.create(RUN, json.dumps(msgspec.to_builtins(own), indent=1).encode() + b"\n")
-    known = read_run(folder) or own
-    check_settings(folder, run.config_yaml, run.config.source.place)
-    if known.listing_sha256 != own.listing_sha256:
-        raise other
-    return known
-
-
-def check_finished(folder: OutFolder, run: Run, facts: dict[str, Any]) -> None:
-    """Raise ConfigError if a dataset was made from other settings or sources, DamageError if a tar has another size."""
-    if (folder / "config.yaml").size() is None:
-        raise DamageError(
-            f"{folder}/config.yaml: is missing from a finished dataset; gen-dataset verify {folder} --repair restores "
-            "it"
+def _check_record(folder: OutFolder, run: Run, known: RunFile, own: RunFile) -> None:
+    """Raise ConfigError if a run was begun with other sources or parts, or a part by another version."""
+    if own.parts and known.version != own.version:
+        raise ConfigError(
+            f"out={folder}: was begun by unprocess_gen {known.version}, this is {own.version}; expected the same "
+            "version; install it, or choose another out"
         )
-    check_settings(folder, run.config_yaml)
-    _check_sources(folder, partial(_sources_of_rows, folder / "manifest.csv"), run.sources, _is_alike)
+    if own.parts and known.parts not in (None, own.parts):
+        raise ConfigError(
+            f"part K/{own.parts}: {folder} was begun with {known.parts} parts; expected K/{known.parts}; choose "
+            "another out"
+        )
+    if known.listing_sha256 != own.listing_sha256:
+        _check_sources(folder, lambda: iter(_read_listing(folder, known) or ()), run.sources, listed=True)
+
+
+def check_finished(folder: OutFolder, config: Config, sources: Sequence[Source], facts: dict[str, Any]) -> None:
+    """Raise ConfigError if a dataset was made from other settings or sources, DamageError if a tar has another size."""
+    repair = f"gen-dataset verify {folder} --repair restores it"
+    if (folder / "config.yaml").size() is None:
+        raise DamageError(f"{folder}/config.yaml: is missing from a finished dataset; {repair}")
+    check_settings(folder, dataset_yaml(config))
+    _check_sources(folder, lambda: _sources_of_rows(folder / "manifest.csv"), sources, listed=False)
     sizes = (folder / "shards").entries()
-    for shard, entry in enumerate(facts["shards"]):
-        size = sizes.get(tar_name(shard).partition("/")[2])
+    for entry in facts["shards"]:
+        size = sizes.get(str(entry["file"]).partition("/")[2])
         if entry["file"] is not None and size != entry["bytes"]:
             problem = "is missing" if size is None else f"has {size} bytes"
-            raise DamageError(
-                f"{folder}/{entry['file']}: {problem}, expected {entry['bytes']} bytes; gen-dataset verify {folder} "
-                "--repair restores it"
-            )
+            raise DamageError(f"{folder}/{entry['file']}: {problem}, expected {entry['bytes']} bytes; {repair}")
 
 
 def check_settings(folder: OutFolder, config_yaml: str, place: str | None = None) -> None:
@@ -350,61 +263,101 @@ def check_settings(folder: OutFolder, config_yaml: str, place: str | None = None
         )
 
 
-def _check_sources(
-    folder: OutFolder,
-    known: Callable[[], Iterator[Source]],
-    sources: Sequence[Source],
-    same: Callable[[Source, Source], bool],
-) -> None:
-    """Raise ConfigError if the sources are not those that are known; name the differences.
+# ------------------------------------------------------------------------------------------------------------ sources
 
-    Both are in the order of the listing, so equal ones are compared without holding the known ones: a million take
-    0.4 GB.
-    """
-    pairs = itertools.zip_longest(known(), sources)
-    if all(old and new and old.name == new.name and same(old, new) for old, new in pairs):
-        return
-    files, listed = ({source.name: source for source in side} for side in (known(), sources))
-    changes = (_change(name, files.get(name), listed.get(name), same) for name in listed | files)
-    differing = [change for change in changes if change]
-    if differing:
-        raise ConfigError(
-            f"out={folder}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
-        )
+_FIELDS = tuple(field.name for field in fields(Source) if field.name not in ("index", "path"))
+_DEFAULTS = tuple(field.default for field in fields(Source) if field.name not in ("index", "path"))
+
+
+class RecordedSources(Sequence[Source]):
+    """Sources of a recorded listing, each parsed when it is taken: a part of a million takes only its own."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content = content
+        letters, size = np.frombuffer(content, np.uint8), 2**24
+        starts = range(0, len(content), size)
+        self._ends = np.concatenate([np.flatnonzero(letters[i : i + size] == ord("\n")) + i for i in starts])
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    def __getitem__(self, item: Any) -> Any:
+        if isinstance(item, slice):
+            return tuple(self[index] for index in range(*item.indices(len(self))))
+        start = self._ends[item - 1] + 1 if item else 0
+        values = parse_record(self.content[start : self._ends[item]], list[Any])
+        source = dict(zip(_FIELDS, values, strict=False))
+        return check_record({"index": item, "path": decode_name(str(source["name"])), **source}, Source)
+
+
+def _values(source: Source) -> list[Any]:
+    """Values of a source, without those at the end that are defaults."""
+    values = [getattr(source, name) for name in _FIELDS]
+    while values[-1] == _DEFAULTS[len(values) - 1]:
+        values.pop()
+    return values
+
+
+def _read_listing(folder: OutFolder, known: RunFile) -> RecordedSources | None:
+    """Read the listing of a run, None if it was lost; MachineError if it was edited."""
+
+    def parse(content: bytes) -> RecordedSources:
+        if hashlib.sha256(content).hexdigest() != known.listing_sha256:
+            raise ValueError(f"its SHA-256 differs from that in {RUN}")
+        return RecordedSources(content)
+
+    return folder.record(LISTING, parse, MOST_BYTES)
 
 
 def _sources_of_rows(manifest: AnyPath) -> Iterator[Source]:
     """Yield the source of every image, with name, size and digest only."""
     for index, rows in enumerate(group_by_image(read_rows(manifest))):
         size, name = rows[0]["source_bytes"], str(rows[0]["source"])
-        sha256 = str(rows[0]["source_sha256"])
-        yield Source(index, name, name, size if isinstance(size, int) else None, sha256=sha256)
+        yield Source(index, name, name, size if isinstance(size, int) else None, sha256=str(rows[0]["source_sha256"]))
 
 
-def _change(name: str, old: Source | None, new: Source | None, same: Callable[[Source, Source], bool]) -> str:
-    """Describe how a source differs from the known file of its name; empty if it does not."""
-    if old is None or new is None:
-        return f"{name} is new" if old is None else f"{name} was deleted"
+def _check_sources(
+    folder: OutFolder, known: Callable[[], Iterator[Source]], sources: Sequence[Source], listed: bool
+) -> None:
+    """Raise ConfigError if the sources are not the known ones, which were ``listed`` before or are rows of a manifest.
+
+    Both are in the order of the listing, so equal ones are compared without holding the known ones: a million take
+    0.4 GB.
+    """
+    change = _change_of_listed if listed else _change
+    pairs = itertools.zip_longest(known(), sources)
+    if all(old and new and old.name == new.name and not change(old, new) for old, new in pairs):
+        return
+    files, present = ({source.name: source for source in side} for side in (known(), sources))
+    changes = ((name, files.get(name), present.get(name)) for name in present | files)
+    differing = [
+        f"{name} {'is new' if old is None else 'was deleted' if new is None else change(old, new)}"
+        for name, old, new in changes
+        if old is None or new is None or change(old, new)
+    ]
+    if differing:
+        raise ConfigError(
+            f"out={folder}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
+        )
+
+
+def _change(old: Source, new: Source) -> str:
+    """How a source differs from its row in a manifest, of which the digest is compared if the listing hashed it."""
     if new.size_bytes != old.size_bytes:
-        return f"{name} has {new.size_bytes} bytes, had {old.size_bytes}"
-    return "" if same(old, new) else f"{name} has other bytes than it had"
+        return f"has {new.size_bytes} bytes, had {old.size_bytes}"
+    return "has other bytes than it had" if old.sha256 and new.sha256 not in (None, old.sha256) else ""
 
 
-def _is_alike(old: Source, new: Source) -> bool:
-    """Check whether a source has the size of the one in the manifest, and its digest if the listing hashed it."""
-    return new.size_bytes == old.size_bytes and (not old.sha256 or new.sha256 in (None, old.sha256))
-
-
-def _is_listed_alike(old: Source, new: Source) -> bool:
-    """Check whether a source was listed before with the same size, digest and ETag.
+def _change_of_listed(old: Source, new: Source) -> str:
+    """How a source differs from an earlier listing.
 
     A listing hashes the files that could be identical. If one of them has changed, another one can have another number
     among identical files, and so other noise.
     """
     same_etag = not old.etag or new.etag in (None, old.etag)
-    return (new.size_bytes, new.sha256) == (old.size_bytes, old.sha256) and same_etag
+    return _change(old, new) or ("" if same_etag and new.sha256 == old.sha256 else "has other bytes than it had")
 
 
 def _first(differing: Sequence[str]) -> str:
     rest = len(differing) - DIFFERENCES_SHOWN
-    return "; ".join(itertools.islice(differing, DIFFERENCES_SHOWN)) + (f"; and {rest} more" if rest > 0 else "")
+    return "; ".join(differing[:DIFFERENCES_SHOWN]) + (f"; and {rest} more" if rest > 0 else "")
