@@ -2,7 +2,7 @@
 
     out/config.yaml              the resolved config (`run`)
     out/.work/run.json           what all processes of a run agree on (`run`), and the listing next to it
-    out/.work/rows/00000.json    record of a shard that is done (`records`)
+    out/.work/rows/00000.json    record of a shard that is done (`tasks`)
     out/.work/deaths/00000       deaths of workers at a shard (`deaths`)
     out/.work/tmp/WRITER/        unfinished files of one writer, which it deletes when it ends
     out/.work/lock               the process that coordinates a local run

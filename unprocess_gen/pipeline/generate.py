@@ -1,7 +1,7 @@
 """Generate a dataset: find the shards that are missing, make and commit them, and finish when none is missing.
 
 `generate` does this for all shards, `make_part` for those of a part, `merge` finishes a run in parts. Read on in `run`
-(what a run is, how it begins), `executors` (processes that make shards), `worker` (make one, commit it) and `records`
+(what a run is, how it begins), `executors` (processes that make shards), `worker` (make one, commit it) and `tasks`
 (a shard is done when its record exists). Design: ``docs/design/pipeline.md``.
 """
 
@@ -27,7 +27,6 @@ from unprocess_gen.dataset.row import columns_of
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
-from unprocess_gen.pipeline.records import done_shards, read_records
 from unprocess_gen.pipeline.run import (
     Run,
     RunFile,
@@ -39,7 +38,7 @@ from unprocess_gen.pipeline.run import (
     resolve_part,
 )
 from unprocess_gen.pipeline.sizes import check_free_space
-from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, Made, ShardReport, StageTimes, Tally
+from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, Made, ShardReport, StageTimes, Tally, done_shards, read_records
 from unprocess_gen.sources.raw.decode import decoder_versions
 
 PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")

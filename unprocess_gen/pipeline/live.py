@@ -29,8 +29,7 @@ from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_fol
 from unprocess_gen.dataset.row import COLUMNS
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
-from unprocess_gen.pipeline.pairs import PairSettings
-from unprocess_gen.pipeline.targets import kernels_for, levels_of, targets_of
+from unprocess_gen.pipeline.pairs import PairSettings, kernels_for, levels_of, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of

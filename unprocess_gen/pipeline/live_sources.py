@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
 
 import numpy as np
 
@@ -72,29 +73,42 @@ class LiveImage:
         return {**row, "epoch": plan.place.epoch} if plan.place.epoch else dict(row)
 
 
-class LiveSource(Protocol):
+class LiveSource(abc.ABC):
     """Pairs of epoch 0: the name of their dataset, their settings, and each of them by number."""
 
-    name: str
+    name = ""
     settings: PairSettings
 
+    def __init__(self, cache: PixelCache | None) -> None:
+        self._cache = cache
+
+    @abc.abstractmethod
     def __len__(self) -> int: ...
 
+    @abc.abstractmethod
     def image(self, number: int) -> LiveImage:
-        """Return all that decides a pair."""
+        """Find all that decides a pair."""
+
+    @abc.abstractmethod
+    def _decode(self, image: LiveImage) -> Srgb:
+        """Decode the image of a pair."""
 
     def pixels(self, image: LiveImage) -> Srgb:
-        """Return the decoded image of a pair."""
+        """Take the decoded image of a pair from the cache, or decode it."""
+        decode = partial(self._decode, image)
+        return decode() if self._cache is None else self._cache.get(_cache_name(image), decode)
 
     def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
-        """Return the row of a pair; the recorded one in epoch 0."""
+        """Build the row of a pair."""
+        return image.row(plan, patch, pair)
 
 
-class RecordedPairs:
+class RecordedPairs(LiveSource):
     """Pairs of a dataset, or of those in a split; reads its manifest and its sources, and no shard."""
 
     def __init__(self, folder: AnyPath, root: str | None, cache: PixelCache | None, split: str | None = None) -> None:
-        self.path, self.name, self._cache = folder, folder_name(folder), cache
+        super().__init__(cache)
+        self.path, self.name = folder, folder_name(folder)
         self._manifest = folder / "manifest.csv"
         check_format(folder)
         config, _ = read_dataset_yaml(folder / "config.yaml")
@@ -132,13 +146,9 @@ class RecordedPairs:
             image = self._kept.keep(number, LiveImage(*identity, *parts))
         return image
 
-    def pixels(self, image: LiveImage) -> Srgb:
-        """Return the decoded image of a pair; raise as `PairRegenerator.photograph`."""
-
-        def decode() -> Srgb:
-            return self._sources.photograph(image.source, image.sha256, image.plan.source).srgb
-
-        return decode() if self._cache is None else self._cache.get(_cache_name(image), decode)
+    def _decode(self, image: LiveImage) -> Srgb:
+        """Decode the image of a pair; raise as `PairRegenerator.photograph`."""
+        return self._sources.photograph(image.source, image.sha256, image.plan.source).srgb
 
     def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
         """Return the row of a pair; the recorded one in epoch 0."""
@@ -147,10 +157,11 @@ class RecordedPairs:
         return self._read(image.offset)
 
 
-class PlannedPairs:
+class PlannedPairs(LiveSource):
     """Pairs of listed photographs, planned when they are read, as a run would make them."""
 
     def __init__(self, config: Config, root: str | None, cache: PixelCache | None) -> None:
+        super().__init__(cache)
         config = config if root is None else replaced(config, {"source.root": root})
         validate_config(config)
         rule = patch_rule(config.source)
@@ -159,7 +170,6 @@ class PlannedPairs:
                 f"source.patch={config.source.patch}: the number of patches depends on the sizes of the images; "
                 "expected random patches or null; give LivePairs a finished dataset"
             )
-        self.name, self._cache = "", cache
         run = resolve(config)
         self.settings = run.settings
         self._sources = [source for source in run.sources if source.reason is None]
@@ -177,7 +187,7 @@ class PlannedPairs:
         source, config = self._sources[index], self.settings.config
         planned = self._planned.get(index)
         if planned is None:
-            sha256, photograph = self._decode(source)
+            sha256, photograph = self._load(source)
             image = plan_pixels(self.settings, photograph, source, sha256)
             planned = self._planned.keep(index, (sha256, photograph.orientation, image.plans, image.patches))
         sha256, orientation, plans, patches = planned
@@ -187,20 +197,12 @@ class PlannedPairs:
         shard = source.index // self.settings.config.output.pairs_per_shard
         return LiveImage(source, sha256, orientation, shard, key, plan, patch)
 
-    def pixels(self, image: LiveImage) -> Srgb:
-        """Return the decoded image of a pair; raise as `load_source`."""
+    def _decode(self, image: LiveImage) -> Srgb:
+        """Decode the image of a pair; raise as `load_source`."""
+        return self._load(image.source)[1].srgb
 
-        def decode() -> Srgb:
-            return self._decode(image.source)[1].srgb
-
-        return decode() if self._cache is None else self._cache.get(_cache_name(image), decode)
-
-    def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
-        """Return the row of a pair."""
-        return image.row(plan, patch, pair)
-
-    def _decode(self, source: Source) -> tuple[str, Photograph]:
-        """Decode a source; the last one stays decoded, because pairs of one image are consecutive."""
+    def _load(self, source: Source) -> tuple[str, Photograph]:
+        """Load a source; the last one stays decoded, because pairs of one image are consecutive."""
         decoded, config = self._decoded, self.settings.config
         if decoded is None or decoded[0] != source:
             decoded = self._decoded = source, *load_source(config.source, source, config.output.layout)

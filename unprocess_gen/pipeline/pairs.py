@@ -1,24 +1,32 @@
-"""Make the pairs of an image: examine, plan, cut and simulate it, the one sequence that decides what a pair is.
+"""Make the pairs of an image and their targets: examine, plan, cut and simulate it; this decides what a pair is.
 
 Runs, estimates, replays, the Python functions and benchmarks use it; they differ in where pixels and plans come from.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.arrays import FLOAT32, Array, Frame, Srgb
 from unprocess_gen.core.source import Source
+from unprocess_gen.core.targets import LINEAR_RGB
+from unprocess_gen.dataset.columns import Value
+from unprocess_gen.dataset.training import noise_std
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.raw_source import with_raw_sensor
+from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.facts import DarkFrames, Facts
 from unprocess_gen.simulation.frames import Pair, Patch
-from unprocess_gen.simulation.pair import make_pairs
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.pair import linear_rgb, make_pairs
+from unprocess_gen.simulation.plan import EXACT, Plan
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.patches import crop_patch, list_patches
@@ -82,6 +90,10 @@ class PlannedImage:
             for plan, pair in zip(self.plans, pairs, strict=True):
                 yield patch, plan, pair
 
+    def without_frames(self) -> Iterator[tuple[Patch, Plan, None]]:
+        """Yield patches and plans as `pairs`, and simulate nothing."""
+        return ((patch, plan, None) for patch in self.patches for plan in self.plans)
+
 
 def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, sha256: str) -> PlannedImage:
     """Plan the pairs of a decoded image; ``sha256`` is the digest of the source's bytes."""
@@ -92,3 +104,46 @@ def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, 
     height, width = srgb.shape[:2]
     patches = list_patches(patch_rule(config.source), plans[0].stream_key, height, width, config.output.layout)
     return PlannedImage(srgb, plans, patches, facts, settings.dark_folder, config)
+
+
+Targets = dict[str, Array]
+
+
+def targets_of(
+    names: Sequence[str], srgb: Srgb, plan: Plan, patch: Patch, pair: Pair, *, as_float: bool = False
+) -> Targets:
+    """Compute targets by name from the complete image; with ``as_float``, noise is in units of white."""
+    targets: Targets = {}
+    for name in names:
+        pixels = crop_patch(srgb, patch)
+        if name == "srgb":
+            targets[name] = pixels.copy()
+        elif name == LINEAR_RGB:
+            targets[name] = linear_rgb(pixels, plan, patch.origin)
+        else:
+            targets[name] = _noise(name, pair.clean if name == "variance" else pair.noisy, plan, as_float)
+    return targets
+
+
+def levels_of(plan: Plan) -> dict[str, Value]:
+    """Return the levels of a plan as columns of a row."""
+    return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
+
+
+def kernels_for(names: Sequence[str], plan: Plan) -> list[str]:
+    """Return the sets of kernels that simulate a plan and its targets (`self_test.kernels`)."""
+    own = self_test.kernels(plan)
+    if LINEAR_RGB not in names:
+        return [own]
+    rounded = plan.replace(accuracy=EXACT)
+    plans = rounded, rounded.replace(clean_dtype=FLOAT32)
+    return list(dict.fromkeys([own, *map(self_test.kernels, plans)]))
+
+
+def _noise(name: str, frame: Frame, plan: Plan, as_float: bool) -> NDArray[np.float32]:
+    """Compute the variance (DN²) or the standard deviation (DN) of the noise at each site of a frame."""
+    black, span = plan.sensor.black_level_dn, plan.sensor.span_dn
+    law = {**levels_of(plan), "a_dn": plan.noise.a_dn, "dark_variance_dn2": dark_variance_dn2(plan)}
+    frame_dn = frame if frame.dtype == np.uint16 else frame * np.float32(span) + np.float32(black)
+    std = noise_std(frame_dn, law) / np.float32(span if as_float else 1)
+    return std * std if name == "variance" else std

@@ -21,17 +21,16 @@ from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, So
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.dataset_json import check_format, dataset_facts, dataset_text, fingerprint, read_dataset
+from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import read_rows, write_rows
 from unprocess_gen.dataset.row import columns_of, has_frames
-from unprocess_gen.dataset.shards import ShardWriter, arrays_of, check_members, shard_name
+from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.records import tar_name
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, source_changes
 from unprocess_gen.pipeline.run import resolve
-from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask, Tally
-from unprocess_gen.pipeline.verify import expected_samples, shard_rows
+from unprocess_gen.pipeline.tasks import RunContext, ShardResult, Tally, tar_name
+from unprocess_gen.pipeline.verify import CONFIG, DATASET, MANIFEST, expected_samples, shard_rows, verify
 from unprocess_gen.pipeline.worker import make_shard
 
 LEAST_PROOF = 100
@@ -50,92 +49,75 @@ class RepairStep(NamedTuple):
 def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> Iterator[RepairStep]:
     """Regenerate every damaged file of a dataset; yield a step for each.
 
-    ``root`` is the folder of the sources, None for synthetic pictures or if none is needed; ``dark_frames`` is that
+    ``root`` is the folder of the sources, None for built-in scenes or if no source is needed; ``dark_frames`` is that
     of dark frames. Raises LockedError if a run holds the folder, DamageError if several files are damaged and nothing
     proves what they were, ConfigError if sources are needed and ``root`` is None, SourceChangedError if the manifest is
     damaged and a source was changed or deleted, MachineError if a file cannot be read or written.
     """
     with OutFolder(folder) as place, machine_errors(folder):
         place.lock()
-        manifest, dataset = folder / "manifest.csv", folder / "dataset.json"
-        check_format(folder)
-        try:
-            facts: dict[str, Any] = read_dataset(dataset)
-        except DamageError:
-            facts = {}
-            _check_proof(folder)
-        if facts and _digest(folder / "config.yaml") != facts["config_sha256"]:
-            place.write("config.yaml", facts["config"].encode())
-            yield RepairStep("config.yaml: restored from dataset.json")
+        damaged = {damage.file for damage in verify(folder)}
+        facts: dict[str, Any] = {} if DATASET in damaged else read_dataset(folder / DATASET)
+        if not facts:
+            _check_proof(folder, damaged)
+        elif CONFIG in damaged:
+            place.write(CONFIG, facts["config"].encode())
+            yield RepairStep(f"{CONFIG}: restored from {DATASET}")
         config, kind = _read_config(folder, root)
-        if facts and _digest(manifest) != facts["manifest_sha256"]:
+        if facts and MANIFEST in damaged:
             _restore_manifest(place, replaced(config, {"noise.dark_frames": dark_frames}), facts["manifest_sha256"])
-            yield RepairStep("manifest.csv: regenerated from the settings and the sources")
+            yield RepairStep(f"{MANIFEST}: regenerated from the settings and the sources")
+            damaged = {damage.file for damage in verify(folder)}
         regenerator = PairRegenerator(root, dark_frames)
-        for number, rows in shard_rows(manifest):
-            if not _is_intact(folder, number, rows):
+        for number, rows in shard_rows(folder / MANIFEST):
+            if tar_name(number) in damaged:
                 yield _regenerate_shard(place, number, [*filter(has_frames, rows)], regenerator)
         if not facts:
-            place.write("dataset.json", _dataset_json(folder, {"kind": kind, "root": absolute_text(root)}).encode())
-            yield RepairStep("dataset.json: rewritten; host, time and versions of the run are lost")
-
-
-def _digest(path: Path) -> str:
-    """SHA-256 of a file, empty if it cannot be read."""
-    try:
-        return file_sha256(path)
-    except OSError:
-        return ""
+            place.write(DATASET, _dataset_json(folder, {"kind": kind, "root": absolute_text(root)}).encode())
+            yield RepairStep(f"{DATASET}: rewritten; host, time and versions of the run are lost")
 
 
 def _read_config(folder: Path, root: str | None) -> tuple[Config, str]:
     """Read the settings with the place of the sources, and the kind of the sources."""
-    config, kind = read_dataset_yaml(folder / "config.yaml")
+    config, kind = read_dataset_yaml(folder / CONFIG)
     return replaced(config, source_changes(None if kind == "synthetic" else root or "", folder)), kind
 
 
-def _check_proof(folder: Path) -> None:
+def _check_proof(folder: Path, damaged: set[str]) -> None:
     """Raise DamageError unless a damaged ``dataset.json`` still proves the other files, or without it they agree."""
-    config, manifest, dataset = (folder / name for name in ("config.yaml", "manifest.csv", "dataset.json"))
+    dataset = folder / DATASET
     left = dataset.read_text(errors="replace") if dataset.is_file() else ""
-    own = _digest(config), _digest(manifest)
     try:
+        own = file_sha256(folder / CONFIG), file_sha256(folder / MANIFEST)
         agree = fingerprint(*own) in left or all(f'"{digest}"' in left for digest in own)
         if len(left) < LEAST_PROOF:
-            agree = dataset_yaml(_read_config(folder, None)[0]) == config.read_text(encoding="utf-8")
-            agree = agree and all(_is_intact(folder, number, rows) for number, rows in shard_rows(manifest))
+            text = (folder / CONFIG).read_text(encoding="utf-8")
+            agree = damaged == {DATASET} and dataset_yaml(_read_config(folder, None)[0]) == text
     except (OSError, ValueError, ConfigError, DamageError):
         agree = False
     if not agree:
-        raise DamageError(f"{folder}: dataset.json and another file are damaged; {AGAIN}")
+        raise DamageError(f"{folder}: {DATASET} and another file are damaged; {AGAIN}")
 
 
 def _restore_manifest(place: OutFolder, config: Config, sha256: str) -> None:
     """Regenerate every row, and write them as the manifest if they have its digest."""
-    run, part = resolve(config), place.scratch / "manifest.csv"
+    run, part = resolve(config), place.scratch / MANIFEST
     context = RunContext(run.settings, str(place.scratch), os.getpid())
     with part.open("w", encoding="utf-8", newline="") as stream:
-        rows = (row for shard in range(run.shards) for row in _rows_of_shard(context, run.task(shard)))
-        write_rows(stream, rows, columns_of(run.config))
+        made = (make_shard(context, run.task(shard)) for shard in range(run.shards))
+        write_rows(stream, (row for result in made for row in _without_file(result).rows), columns_of(run.config))
     if file_sha256(part) != sha256:
         raise SourceChangedError(
-            f"{place}/manifest.csv: the regenerated one has another SHA-256: a source was changed, added or "
+            f"{place}/{MANIFEST}: the regenerated one has another SHA-256: a source was changed, added or "
             f"deleted; {ADVICE}"
         )
-    (place / "manifest.csv").commit(part)
+    (place / MANIFEST).commit(part)
 
 
-def _rows_of_shard(context: RunContext, task: ShardTask) -> list[Row]:
-    result = make_shard(context, task)
-    if result.path is not None:
-        Path(result.path).unlink()
-    return result.rows
-
-
-def _is_intact(folder: Path, number: int, rows: Sequence[Row]) -> bool:
-    """Check whether a shard contains its rows; one without pairs has no file."""
-    path, pairs = folder / tar_name(number), [*filter(has_frames, rows)]
-    return not pairs or (path.is_file() and not any(check_members(path, expected_samples(pairs))))
+def _without_file(made: ShardResult) -> ShardResult:
+    if made.path is not None:
+        Path(made.path).unlink()
+    return made
 
 
 def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regenerator: PairRegenerator) -> RepairStep:
@@ -161,7 +143,7 @@ def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regene
 
 def _dataset_json(folder: Path, source: dict[str, Any]) -> str:
     """Describe the other files of a dataset as ``dataset.json`` does."""
-    manifest, entries = folder / "manifest.csv", []
+    manifest, entries = folder / MANIFEST, []
     for number, rows in shard_rows(manifest):
         path = folder / tar_name(number)
         result = ShardResult(number, rows=rows)
@@ -170,5 +152,5 @@ def _dataset_json(folder: Path, source: dict[str, Any]) -> str:
         entries.append(result.entry())
     lost = dict.fromkeys(("not_matched", "skipped_links", "run", "versions"))
     facts = Tally.of(read_rows(manifest)).facts() | lost | {"source": source}
-    text = (folder / "config.yaml").read_bytes().decode()
+    text = (folder / CONFIG).read_bytes().decode()
     return dataset_text(dataset_facts(text, file_sha256(manifest), entries, facts))

@@ -31,8 +31,7 @@ from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import read_row, read_rows, rows_with_offsets
 from unprocess_gen.dataset.row import has_frames, patch_from_row, plan_from_row
 from unprocess_gen.dataset.shards import arrays_of
-from unprocess_gen.pipeline.pairs import PlannedImage
-from unprocess_gen.pipeline.targets import Targets, kernels_for, targets_of
+from unprocess_gen.pipeline.pairs import PlannedImage, Targets, kernels_for, targets_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan, SourcePlan
 from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder

@@ -1,20 +1,31 @@
-"""Records that a coordinator and its workers exchange: context of a run; task, result, report and counts of a shard."""
+"""The work of a shard, its result and its record.
+
+``.work/rows/00000.json`` is a line of JSON, then the shard's lines of the manifest. A worker puts the tar in place
+first and the record second, so the record is the commit. Any number of writers may commit a shard, to the same bytes.
+"""
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
 
 from unprocess_gen.config.schema import Config
+from unprocess_gen.core.records import Count, check_record, parse_record
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.dataset_json import ShardFacts, check_shard
 from unprocess_gen.dataset.keys import group_by_image
+from unprocess_gen.dataset.manifest import rows_text
 from unprocess_gen.dataset.row import has_frames
 from unprocess_gen.dataset.shards import shard_name
+from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.simulation.frames import Counts
 
@@ -31,25 +42,13 @@ class StageTimes:
     decode_s: float = 0.0
     simulate_s: float = 0.0
 
-    @contextmanager
-    def adding(self, stage: str) -> Iterator[None]:
-        """Add the time of the body to a stage, ``decode_s`` or ``simulate_s``, even if it fails."""
+    def timed(self, stage: str, function: Callable[..., Item], *given: Any) -> Item:
+        """Call a function, and add its time to a stage, ``decode_s`` or ``simulate_s``, even if it fails."""
         started = time.thread_time()
         try:
-            yield
+            return function(*given)
         finally:
             setattr(self, stage, getattr(self, stage) + time.thread_time() - started)
-
-    def each_simulated(self, pairs: Iterable[Item]) -> Iterator[Item]:
-        """Yield the items, and add the time that each of them takes to ``simulate_s``."""
-        remaining = iter(pairs)
-        while True:
-            with self.adding("simulate_s"):
-                try:
-                    pair = next(remaining)
-                except StopIteration:
-                    return
-            yield pair
 
     def add(self, other: StageTimes) -> None:
         """Add the times of another shard."""
@@ -231,3 +230,72 @@ class Tally:
         filtered = {"filtered": self.filtered} if self.filtered else {}
         failed = dict(sorted(self.failed.items()))
         return {"pairs": self.pairs, "failed": failed, **filtered, "sites": dict(self.sites)}
+
+
+ROWS = f"{WORK}/rows"
+
+
+class _RecordFacts(msgspec.Struct, frozen=True):
+    entry: dict[str, Any]
+    tally: Tally
+    csv_bytes: Count
+
+
+class ShardRecord(NamedTuple):
+    """Record of a shard: its entry in ``dataset.json``, counts of its rows, and its lines of the manifest."""
+
+    entry: dict[str, Any]
+    tally: Tally
+    csv: bytes
+
+
+def commit_shard(folder: OutFolder, result: ShardResult, columns: Sequence[str]) -> ShardReport:
+    """Put a finished shard in place, then its record; raise OSError if the storage fails."""
+    if result.path is not None:
+        (folder / tar_name(result.shard)).commit(Path(result.path))
+    csv = rows_text(result.rows, columns).encode()
+    facts = {"entry": result.entry(), "tally": Tally.of(result.rows).facts(), "csv_bytes": len(csv)}
+    folder.write(_file(result.shard), json.dumps(facts, separators=(",", ":")).encode() + b"\n" + csv)
+    return result.report()
+
+
+def done_shards(folder: OutFolder, shards: range) -> set[int]:
+    """Find the shards that are done: their record has no provisional row."""
+    records = zip(shards, read_records(folder, shards), strict=True)
+    return {shard for shard, record in records if record is not None and not record.entry.get("provisional")}
+
+
+def read_records(folder: OutFolder, shards: range) -> Iterator[ShardRecord | None]:
+    """Read the records of shards in order; None if there is none, it cannot be read, or the tar has another size.
+
+    Consecutive shards are looked up in listings, those of a part one by one.
+    """
+    if shards.step > 1:
+        return folder.path.map(lambda shard: _read(folder, shard, (folder / tar_name(shard)).size), shards)
+    recorded, sizes = (folder / ROWS).entries(), (folder / "shards").entries()
+
+    def read(shard: int) -> ShardRecord | None:
+        is_recorded = Path(_file(shard)).name in recorded
+        return _read(folder, shard, lambda: sizes.get(shard_name(shard))) if is_recorded else None
+
+    return folder.path.map(read, shards)
+
+
+def tar_name(shard: int) -> str:
+    """Name of a shard's file below ``out``."""
+    return f"shards/{shard_name(shard)}"
+
+
+def _read(folder: OutFolder, shard: int, tar_bytes: Callable[[], int | None]) -> ShardRecord | None:
+    try:
+        line, _, csv = folder.read(_file(shard)).partition(b"\n")
+        facts = parse_record(line, _RecordFacts)
+        check_shard(shard, check_record(facts.entry, ShardFacts))
+    except (OSError, ValueError):
+        return None
+    fits = facts.entry["file"] is None or facts.entry["bytes"] == tar_bytes()
+    return ShardRecord(facts.entry, facts.tally, csv) if fits and len(csv) == facts.csv_bytes else None
+
+
+def _file(shard: int) -> str:
+    return f"{ROWS}/{shard:05d}.json"

@@ -36,6 +36,8 @@ from unprocess_gen.dataset.shards import (
 )
 from unprocess_gen.pipeline.progress import with_bar
 
+CONFIG, MANIFEST, DATASET = "config.yaml", "manifest.csv", "dataset.json"
+
 
 @dataclass(frozen=True, slots=True)
 class Damage:
@@ -68,7 +70,7 @@ def verify(folder: AnyPath) -> list[Damage]:
 
 
 def _verify(folder: AnyPath) -> list[Damage]:
-    if not (folder / "dataset.json").exists() and not (folder / "manifest.csv").exists():
+    if not (folder / DATASET).exists() and not (folder / MANIFEST).exists():
         raise DamageError(
             f"{folder}: contains neither dataset.json nor manifest.csv; expected a finished dataset; "
             "check the folder, or run the command that began it again"
@@ -77,25 +79,25 @@ def _verify(folder: AnyPath) -> list[Damage]:
     facts: dict[str, Any] = {}
     check_format(folder)
     try:
-        if (folder / "dataset.json").exists():
-            facts = read_dataset(folder / "dataset.json")
+        if (folder / DATASET).exists():
+            facts = read_dataset(folder / DATASET)
         else:
-            damages.append(Damage("dataset.json", "is missing"))
+            damages.append(Damage(DATASET, "is missing"))
     except DamageError as error:
-        damages.append(Damage("dataset.json", _without_path(error)))
+        damages.append(Damage(DATASET, _without_path(error)))
     damages += _check_files(folder, facts)
     listed = {number: entry for number, entry in enumerate(facts.get("shards", [])) if entry["file"] is not None}
     try:
-        if (folder / "manifest.csv").exists():
-            return damages + _check_shards(folder, listed, shard_rows(folder / "manifest.csv"))
+        if (folder / MANIFEST).exists():
+            return damages + _check_shards(folder, listed, shard_rows(folder / MANIFEST))
     except DamageError as error:
-        damages.append(Damage("manifest.csv", _without_path(error)))
+        damages.append(Damage(MANIFEST, _without_path(error)))
     return damages + _check_shards(folder, listed, iter(()))
 
 
 def is_sweep(folder: AnyPath) -> bool:
     """Check whether a folder is a sweep's: it has a ``sweep.csv`` and is no dataset."""
-    return (folder / SWEEP_TABLE).is_file() and not (folder / "dataset.json").exists()
+    return (folder / SWEEP_TABLE).is_file() and not (folder / DATASET).exists()
 
 
 def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
@@ -106,15 +108,15 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
     jobs = {job["folder"]: job["exit"] for job in read_sweep_table(folder / SWEEP_TABLE)}
     for name, exit_code in jobs.items():
         dataset = folder / name
-        if (dataset / "dataset.json").exists() or (dataset / "manifest.csv").exists():
+        if (dataset / DATASET).exists() or (dataset / MANIFEST).exists():
             yield SweepVerification(name, tuple(verify(dataset)))
         else:
             what = f"is missing: the job ended with exit code {exit_code}; rerun the sweep to finish it"
-            yield SweepVerification(name, (Damage("dataset.json", what),))
+            yield SweepVerification(name, (Damage(DATASET, what),))
     for name in sorted(path.name for path in folder.iterdir() if (path / ".work").exists()):
-        if name not in jobs and not (folder / name / "dataset.json").exists():
+        if name not in jobs and not (folder / name / DATASET).exists():
             what = "is missing: the sweep ended before this job; rerun the sweep to finish it"
-            yield SweepVerification(name, (Damage("dataset.json", what),))
+            yield SweepVerification(name, (Damage(DATASET, what),))
 
 
 def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
@@ -135,7 +137,7 @@ def _without_path(error: DamageError) -> str:
 
 
 def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
-    for name, field in (("config.yaml", "config_sha256"), ("manifest.csv", "manifest_sha256")):
+    for name, field in ((CONFIG, "config_sha256"), (MANIFEST, "manifest_sha256")):
         try:
             digest = file_sha256(folder / name)
         except FileNotFoundError:

@@ -28,10 +28,8 @@ from unprocess_gen.dataset.row import columns_of, failed_row, has_frames, pair_r
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.deaths import counted_attempt
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels
-from unprocess_gen.pipeline.records import commit_shard
-from unprocess_gen.pipeline.targets import kernels_for, targets_of
-from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask
+from unprocess_gen.pipeline.pairs import kernels_for, plan_pixels, targets_of
+from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, commit_shard
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan
@@ -101,34 +99,36 @@ def make_image(
     context: RunContext, made: ShardResult, source: Source, writer: ShardWriter, read: ReadFile = read_bytes
 ) -> list[Row]:
     """Append the samples of one image to a shard, and return its rows; notes and times go to ``made``."""
-    config, shard = context.config, made.shard
+    config, shard, timed = context.config, made.shard, made.times.timed
     try:
-        with made.times.adding("decode_s"):
-            sha256, photograph = load_source(config.source, source, config.output.layout, read)
+        sha256, photograph = timed("decode_s", load_source, config.source, source, config.output.layout, read)
     except SourceError as error:
         _check_not_deleted(config, source, error)
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
     if photograph.note:
         made.notes.append(f"{source.name} {photograph.note}")
-    with made.times.adding("simulate_s"):
-        image = plan_pixels(context.settings, photograph, source, sha256)
-        noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
-    if not config.output.frames:
-        identity = sha256, photograph.orientation, shard
-        return _planned_rows(image, source, identity, noise_dn, config.source.patch is not None)
-    made.self_test.update(dict.fromkeys(_self_test(context, image.plans)))
+    image = timed("simulate_s", plan_pixels, context.settings, photograph, source, sha256)
+    noise_dn = None
+    if config.source.place is not None:
+        noise_dn = timed("simulate_s", source_noise_dn, photograph.srgb, image.plans[0])
+    if config.output.frames:
+        made.self_test.update(dict.fromkeys(_self_test(context, image.plans)))
+    identity = source, sha256, photograph.orientation, shard
     rows: list[Row] = []
     sample: list[Row] = []
-    for patch, plan, pair in made.times.each_simulated(image.pairs()):
+    pairs = image.pairs() if config.output.frames else image.without_frames()
+    while (made_pair := timed("simulate_s", next, pairs, None)) is not None:
+        patch, plan, pair = made_pair
         key = patch_key(source.index, patch, several=config.source.patch is not None)
+        row_key = pair_key(key, plan, several=len(image.plans) > 1)
+        if pair is None:
+            rows.append(pair_row(row_key, *identity, plan, None, ("", ""), patch, noise_dn))
+            continue
         if plan is image.plans[0]:
             sample, clean_xxh3 = [], array_xxh3(pair.clean)
-            with made.times.adding("simulate_s"):
-                targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
+            targets = timed("simulate_s", targets_of, config.output.targets, photograph.srgb, plan, patch, pair)
             stored_targets = targets_cell(targets)
-        digests = clean_xxh3, array_xxh3(pair.noisy)
-        row_key = pair_key(key, plan, several=len(image.plans) > 1)
-        row = pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn)
+        row = pair_row(row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn)
         row = {**row, "targets": stored_targets}
         arrays = {"clean": pair.clean, "noisy": pair.noisy, **targets}
         for name, stored in arrays_of(row).items():
@@ -139,20 +139,6 @@ def make_image(
             writer.add_rows(key, row_json(sample))
             rows += sample
     return rows
-
-
-def _planned_rows(
-    image: PlannedImage, source: Source, identity: tuple[str, int, int], noise_dn: float | None, several: bool
-) -> list[Row]:
-    """Return the rows of an image whose frames are not made; identity is the SHA-256, orientation and shard."""
-    return [
-        pair_row(
-            pair_key(patch_key(source.index, patch, several=several), plan, several=len(image.plans) > 1),
-            *(source, *identity, plan, None, ("", ""), patch, noise_dn),
-        )
-        for patch in image.patches
-        for plan in image.plans
-    ]
 
 
 def _check_not_deleted(config: Config, source: Source, error: SourceError) -> None:

@@ -18,11 +18,10 @@ from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
-from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
+from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels, targets_of
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import source_bytes
-from unprocess_gen.pipeline.targets import targets_of
 from unprocess_gen.planning.effect_selection import Prediction
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.planning.source_noise import noise_ratio
