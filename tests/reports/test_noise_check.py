@@ -15,7 +15,7 @@ import pytest
 from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.noise_faults import FAULTS, SITE_FAULTS, Fault, repeated_noise, replace_noisy_frames, with_numbers
+from helpers.noise_faults import FAULTS, SITE_FAULTS, Fault, NoisyPair, replace_noisy_frames, with_numbers
 from helpers.promise_report import Figure
 from numpy.typing import NDArray
 
@@ -84,9 +84,8 @@ KINDS: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
 Checked = tuple[Plan, Scores]
 
 
-def untouched(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
-    """Change nothing."""
-    return noisy
+def untouched(pair: NoisyPair) -> Frame:
+    return pair.noisy
 
 
 def scores_of_pair(clean: Frame, noisy: Frame, row: Row) -> Scores:
@@ -118,7 +117,7 @@ def checked(
         assert plan.physics is not None
         pair = make_pair(srgb, plan.replace(**numbers))
         plan = plan_from_row(pair.row)
-    noisy_frames = [fault(srgb, pair.noisy, plan, np.random.default_rng(number)) for fault in faults]
+    noisy_frames = [fault(NoisyPair(srgb, pair.noisy, plan, np.random.default_rng(number))) for fault in faults]
     return [(plan, scores_of_pair(pair.clean, noisy, pair.row)) for noisy in noisy_frames]
 
 
@@ -338,12 +337,10 @@ def test_repeated_draws_and_noise_are_found(settings: Settings) -> None:
     assert repetitions([(pairs[0].clean, pairs[0].noisy, pairs[0].row)] * 2) == []  # patches of a frame at one place
     assert repetitions([(pair.clean, pair.noisy, pair.row) for pair in pairs]) == []
     assert repetitions([(pairs[0].clean, pairs[0].noisy, pairs[0].row)] * 2, draw=0)
-    draws = np.random.default_rng(0)
-    repeated = [
-        (pair.clean, repeated_noise(srgb, pair.noisy, plan_from_row(pair.row), draws), pair.row)
-        for srgb, pair in zip(scenes, pairs, strict=True)
-    ]
-    assert repetitions(repeated)
+    noise = np.random.default_rng(0).standard_normal((64, 64))
+    planned = [NoisyPair(srgb, pair.noisy, plan_from_row(pair.row)) for srgb, pair in zip(scenes, pairs, strict=True)]
+    frames = [one.with_noise(noise) for one in planned]
+    assert repetitions([(pair.clean, frame, pair.row) for pair, frame in zip(pairs, frames, strict=True)])
 
 
 @pytest.mark.slow
