@@ -14,15 +14,13 @@ from typing import Any
 
 import pytest
 import yaml
-from helpers.cases import slow_except
 from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from omegaconf import OmegaConf, open_dict
 
 from unprocess_gen.config import distributions
-from unprocess_gen.config.composition import compose_node, load_config
+from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.distributions import parse_distribution
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
@@ -67,25 +65,6 @@ SHA256 = "0" * 64
 def test_every_option_is_valid(settings: Settings) -> None:
     for file in FILES:  # a message names the option's key and value
         validate_config(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
-
-
-OPTIONS_BY_GROUP = [
-    [one for one in FILES if one.parent == group] for group in dict.fromkeys(one.parent for one in FILES)
-]
-
-
-@pytest.mark.parametrize("number", slow_except((0, 1), range(max(map(len, OPTIONS_BY_GROUP)))))
-def test_fixture_settings_builds_what_hydra_composes(number: int, settings: Settings) -> None:
-    """Every option occurs; one composition takes an option of each group."""
-    files = [options[number % len(options)] for options in OPTIONS_BY_GROUP]
-    if Path("sensor/source.yaml") in files:  # a raw source takes no colours of a photograph
-        files = [file for file in files if str(file.parent) not in ("camera", "gains", "isp")]
-    overrides = [f"{file.parent}={file.stem}" for file in files]
-    overrides += [override for file in files for override in NEEDS.get(str(file), [])]
-    composed = compose_node(overrides)
-    with open_dict(composed):
-        del composed["hydra"]
-    assert OmegaConf.to_object(composed) == settings(*overrides)
 
 
 OPTIONS = """

@@ -121,7 +121,7 @@ class Call(argparse.Namespace):
     """A parsed command line: flags are attributes, None or False if they are not given.
 
     ``place`` is what the verb works on, ``settings`` are those of the verb itself by key, ``overrides`` those of a
-    config as the user wrote them, ``words`` the whole command line after the verb.
+    config as the user wrote them, ``words`` the complete command line after the verb.
     """
 
     verb: Verb
