@@ -55,7 +55,7 @@ class Flag(NamedTuple):
 
     @property
     def summary(self) -> str:
-        """What the flag does, for ``--help``."""
+        """Sentence about the flag for ``--help``."""
         return f"{self.options['help']}{' (required)' if self.options.get('required') else ''}"
 
 
