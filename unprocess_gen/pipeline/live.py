@@ -296,7 +296,8 @@ def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, spli
         return [*recorded]
     if split is not None:
         raise ConfigError(
-            f"LivePairs: split={split!r}: splits follow from digests of the images; expected the folder of a dataset"
+            f"LivePairs: split={split!r}: splits follow from digests of the images; expected the folder of a "
+            "dataset; make one without frames by gen-dataset manifest"
         )
     if not isinstance(dataset, Config):
         from unprocess_gen.config.composition import load_config
