@@ -460,18 +460,6 @@ def test_impossible_number_of_strips_is_not_read() -> None:
     assert peak < 10**6
 
 
-def test_exif_directory_of_too_many_entries_is_broken() -> None:
-    block = struct.pack("<2sHIH", b"II", 42, 8, 5000) + bytes(12 * 5000 + 4)
-    data = encoded("JPEG", exif=b"Exif\0\0" + block)
-    assert decode(data, max_pixels=MAX_PIXELS, icc="ignore").orientation == 1
-
-
-def test_bytes_after_the_last_row_are_accepted() -> None:
-    """As some cameras write them: libjpeg passes them over."""
-    data = encoded("JPEG")
-    assert decode(data[:-2] + b"\0\0" + data[-2:], max_pixels=MAX_PIXELS, icc="ignore").srgb.shape == (48, 64, 3)
-
-
 # Damage reported by rare codec messages -------------------------------------------------------------------------------
 
 
