@@ -36,7 +36,7 @@ from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.frames import Patch
-from unprocess_gen.simulation.kernels.body import forget_bodies
+from unprocess_gen.simulation.kernels.site_patterns import forget_patterns
 from unprocess_gen.simulation.pair import make_pair, make_pairs
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources import synthetic
@@ -53,7 +53,7 @@ LEAST_NS = 20_000_000
 
 @dataclass(frozen=True)
 class Work:
-    """A call to be timed, and the number of sites that it simulates; `forget_bodies` before each repetition is free."""
+    """A call to be timed, and the number of sites that it simulates; `forget_patterns` before it is free."""
 
     call: Callable[[], object]
     sites: int
@@ -64,7 +64,7 @@ class Work:
         times: list[float] = []
         while len(times) < 2 or sum(times) * self.sites < least_ns:
             if self.is_new_body:
-                forget_bodies()
+                forget_patterns()
             times.append(thread_ns(self.call, self.sites))
         return min(times)
 

@@ -45,7 +45,7 @@ from numba.core.typing.templates import builtin_registry
 
 from unprocess_gen.cli import main as cli
 from unprocess_gen.simulation import self_test as selftest
-from unprocess_gen.simulation.kernels import body, render
+from unprocess_gen.simulation.kernels import render, site_patterns
 from unprocess_gen.simulation.kernels.strips import STRIP, allocate_scratch
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import Plan
@@ -208,7 +208,7 @@ def code() -> dict[str, Any]:
 
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for the arguments of their calls; execute none."""
-    for module, name in ((render, "_render"), (body, "_fill_normals"), (body, "_fill_defects")):
+    for module, name in ((render, "_render"), (site_patterns, "_fill_normals"), (site_patterns, "_fill_defects")):
         setattr(module, name, compiler(getattr(module, name)))
     for dtype in (np.uint8, np.uint16):
         for plan in plans():

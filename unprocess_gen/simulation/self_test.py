@@ -25,7 +25,7 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS
 from unprocess_gen.simulation.kernels.jit import has_run, kernel, note_run
-from unprocess_gen.simulation.kernels.render import uses_scene32
+from unprocess_gen.simulation.kernels.render import uses_float32
 from unprocess_gen.simulation.lookup_tables import normal_table
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import (
@@ -117,7 +117,7 @@ def kernels(plan: Plan) -> str:
     noise = "electrons" if plan.counts_electrons else "gaussian"
     if plan.output.clean_normalised:
         return f"{'normalised' if plan.output.normalised else 'float_clean'}_{noise}"
-    return "float32" if uses_scene32(plan) else noise
+    return "float32" if uses_float32(plan) else noise
 
 
 def are_compiled(kernel_set: str) -> bool:

@@ -42,8 +42,8 @@ from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.frames import Pair
-from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.kernels.render import render_clean
+from unprocess_gen.simulation.kernels.site_patterns import forget_patterns
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan
 from unprocess_gen.simulation.reference.sensor import in_dn
@@ -215,7 +215,7 @@ def measure_runs(config: Config, inputs: Inputs, out: Path) -> dict[str, list[Ru
 
 def time_run(config: Config, inputs: Inputs, tier: str, out: Path) -> RunTimes:
     """Generate a dataset with one worker, delete it, and return the processor time."""
-    forget_bodies()
+    forget_patterns()
     level = LOGGER.level
     LOGGER.setLevel(logging.ERROR)  # progress and warnings would repeat for every run
     try:

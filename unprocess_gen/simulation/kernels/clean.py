@@ -4,11 +4,11 @@ Products of each matrix entry and each code are tabulated, so a site's signal is
 channel recorded at each CFA site is computed (all three for ``highlight="gray_mean"``).
 
 The first pass over a strip treats every site as unclipped. The second recomputes vectors that contain a signal above
-`Scene.limits`: highlights, clipped or saturated values. Other vectors need neither its division nor its counts.
+`Unprocessing.limits`: highlights, clipped or saturated values. Other vectors need neither its division nor its counts.
 
-Two forms: `Scene` is equal to `reference.unprocess` and `reference.sensor.to_dn` to the last bit (float64, in the
-reference's order of operations). `Scene32` (float32, of the tier ``fast``) tabulates products that include gains,
-exposure and span, so sums of them are DN above the black level; see `FLOAT32_CLEAN_DN`.
+Two forms: `Unprocessing` is equal to `reference.unprocess` and `reference.sensor.to_dn` to the last bit (float64, in
+the reference's order of operations). `Unprocessing32` (float32, of the tier ``fast``) tabulates products that include
+gains, exposure and span, so sums of them are DN above the black level; see `FLOAT32_CLEAN_DN`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.simulation.kernels import simd, strips
-from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.jit import by_class, inner
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
+from unprocess_gen.simulation.kernels.site_patterns import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.strips import Buffers, SiteMap, Strip, count_outside, strip_values
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import tile
@@ -63,7 +63,7 @@ def is_steep(plan: Plan) -> bool:
 # ----------------------------------------------------------------------------------------------------------- parameters
 
 
-class Scene(NamedTuple):
+class Unprocessing(NamedTuple):
     """Hold the parameters of a clean frame in float64."""
 
     products: NDArray[Any]  # [3, 3, codes]: matrix entry (c, j) times the curve at code k; [4, 3, codes] of raw sources
@@ -80,7 +80,7 @@ class Scene(NamedTuple):
     brightest: float
     clipped: float  # light above it counts as clipped
     white: float  # light above it counts as clipped before the exposure; infinity without an exposure ratio
-    black_dn: Any  # float, or uint32 in Scene32
+    black_dn: Any  # float, or uint32 in Unprocessing32
     span_dn: float
     dn_per_signal: float  # scale of the signal with gray_mean
     limits: NDArray[Any]  # [2, VECTOR_WIDTH + 2]: signals up to it are neither highlights nor clipped nor saturated
@@ -90,16 +90,18 @@ class Scene(NamedTuple):
     response: SiteMap  # relative gain of each pixel; in float64 only
 
 
-class Scene32(Scene):
+class Unprocessing32(Unprocessing):
     """Hold the parameters of a clean frame in float32; DN count from the black level, and ``clipped`` has a margin.
 
     ``products`` are scaled to DN, except with gray_mean, which compares channels.
     """
 
 
-def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] = Scene) -> Scene:
-    """Return the parameters of a plan for sources of ``codes`` codes; ``kind`` is `Scene` or `Scene32`."""
-    in_float32, is_raw, camera = kind is Scene32, plan.source.is_raw, plan.camera
+def unprocessing_of(
+    plan: Plan, codes: int, origin: tuple[int, int], kind: type[Unprocessing] = Unprocessing
+) -> Unprocessing:
+    """Numbers of a clean frame from ``codes`` codes; ``kind`` is `Unprocessing` or `Unprocessing32`."""
+    in_float32, is_raw, camera = kind is Unprocessing32, plan.source.is_raw, plan.camera
     channels = _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2, is_raw)
     f: Any = np.float32 if in_float32 else float
     exposure, brightest, threshold = plan.scene.exposure, plan.brightest, plan.isp.highlight_threshold
@@ -152,8 +154,8 @@ def _linear_limit(plan: Plan, brightest: float, exposure: float, gain: float) ->
     return min(1.0, light / exposure) / gain * 0.999
 
 
-KEPT_SCENES = 1024, 4
-"""Numbers of scenes of 256 codes (18 kB each) and of 65,536 codes (5 MB each) that are kept."""
+KEPT_FORMS = 1024, 4
+"""Numbers of forms of images of 256 codes (18 kB each) and of 65,536 codes (5 MB each) that are kept."""
 
 
 def _products(plan: Plan, codes: int) -> NDArray[np.float64]:
@@ -170,10 +172,10 @@ def _raw_products(plan: Plan, codes: int) -> NDArray[np.float64]:
     return products
 
 
-def with_response(scene: Scene, response: SiteMap) -> Scene:
-    """Return the scene of a clean frame whose light is multiplied by a response."""
+def with_response(inverse: Unprocessing, response: SiteMap) -> Unprocessing:
+    """Return the numbers of a clean frame whose light is multiplied by a response."""
     # the second pass computes every vector, because only it applies the response
-    return scene._replace(response=response, limits=np.full_like(scene.limits, -np.inf))
+    return inverse._replace(response=response, limits=np.full_like(inverse.limits, -np.inf))
 
 
 @functools.lru_cache(maxsize=16)
@@ -195,11 +197,11 @@ def _load_sites(values: Pointer, strip: Strip) -> Vector:
 
 
 @inner
-def _fill_signal(codes: Pointer, strip: Strip, scene: Any, signal: Pointer) -> None:
+def _fill_signal(codes: Pointer, strip: Strip, inverse: Any, signal: Pointer) -> None:
     """Linearise codes and apply the matrix, for the channel of each site: sum three products."""
-    channels, code_count = simd.pointer_to(scene.site_channels, _ROW_SITES * (strip.y & 1)), scene.code_count
-    even = simd.pointer_to(scene.products, 3 * code_count * channels[0])
-    odd = simd.pointer_to(scene.products, 3 * code_count * channels[1])
+    channels, code_count = simd.pointer_to(inverse.site_channels, _ROW_SITES * (strip.y & 1)), inverse.code_count
+    even = simd.pointer_to(inverse.products, 3 * code_count * channels[0])
+    odd = simd.pointer_to(inverse.products, 3 * code_count * channels[1])
     for x in range(strip.length):
         table = odd if x & 1 else even
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
@@ -207,31 +209,31 @@ def _fill_signal(codes: Pointer, strip: Strip, scene: Any, signal: Pointer) -> N
 
 
 @inner
-def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Any, out: Pointer) -> None:
+def _fill_gray_mean_signal(codes: Pointer, strip: Strip, inverse: Any, out: Pointer) -> None:
     """Linearise, apply the matrix, and invert the gains with highlights preserved by the mean of the channels."""
-    products, gains = scene.products, scene.inverse_gains
-    channel = 3 * scene.code_count
+    products, gains = inverse.products, inverse.inverse_gains
+    channel = 3 * inverse.code_count
     for x in range(strip.length):
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
-        g, b = scene.code_count + g, 2 * scene.code_count + b
+        g, b = inverse.code_count + g, 2 * inverse.code_count + b
         red = (products[r] + products[g]) + products[b]
         green = (products[channel + r] + products[channel + g]) + products[channel + b]
         blue = (products[2 * channel + r] + products[2 * channel + g]) + products[2 * channel + b]
-        gray = ((red + green) + blue) / scene.three - scene.highlight_threshold
-        m = simd.maximum(gray, 0.0) / scene.divisor * scene.steepness
-        mask, rest = m * m, scene.one - m * m
-        c = scene.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
+        gray = ((red + green) + blue) / inverse.three - inverse.highlight_threshold
+        m = simd.maximum(gray, 0.0) / inverse.divisor * inverse.steepness
+        mask, rest = m * m, inverse.one - m * m
+        c = inverse.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
         i = red if c == 0 else green if c == 1 else blue
-        out[x] = i * simd.maximum(mask + rest * gains[c], gains[c]) * scene.dn_per_signal
+        out[x] = i * simd.maximum(mask + rest * gains[c], gains[c]) * inverse.dn_per_signal
 
 
 # ------------------------------------------------------------------------------------------------- float64 and float32
 
 
 @inner
-def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
+def _store_clean64(inverse: Unprocessing, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
     """Store eight clean values: unrounded, rounded, their difference, and as uint16."""
-    dn = above_black + scene.black_dn
+    dn = above_black + inverse.black_dn
     rounded = (dn + ROUND) - ROUND
     rounded_dn = simd.to_float32(rounded)
     simd.store(buffers.unrounded_dn, x, dn)
@@ -241,27 +243,29 @@ def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, buffers: Buf
 
 
 @inner
-def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
+def _store_clean32(inverse: Unprocessing32, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
     """Store eight clean values: DN above black, and as uint16."""
     simd.store(buffers.unrounded_dn, x, above_black)
-    simd.store(buffers.clean, x, simd.to_bits(above_black + ROUND32) + scene.black_dn)
+    simd.store(buffers.clean, x, simd.to_bits(above_black + ROUND32) + inverse.black_dn)
 
 
-_store_clean = by_class({Scene: _store_clean64, Scene32: _store_clean32})
+_store_clean = by_class({Unprocessing: _store_clean64, Unprocessing32: _store_clean32})
 """Store eight clean values, given as DN above black."""
 _linear_dn = by_class(
     {
-        Scene: lambda scene, signal, gains: simd.maximum(signal * gains * scene.exposure, 0.0) * scene.span_dn,
-        Scene32: lambda scene, signal, gains: simd.maximum(signal, 0.0),
+        Unprocessing: lambda inverse, signal, gains: (
+            simd.maximum(signal * gains * inverse.exposure, 0.0) * inverse.span_dn
+        ),
+        Unprocessing32: lambda inverse, signal, gains: simd.maximum(signal, 0.0),
     }
 )
 """Return DN above black of signals that are not bright."""
 _with_response = by_class(
     {
-        Scene: lambda scene, light, x, strip: (
-            light * simd.to_float64(simd.load(strip_values(scene.response, strip), x))
+        Unprocessing: lambda inverse, light, x, strip: (
+            light * simd.to_float64(simd.load(strip_values(inverse.response, strip), x))
         ),
-        Scene32: lambda scene, light, x, strip: light,
+        Unprocessing32: lambda inverse, light, x, strip: light,
     }
 )
 """Return eight values of light times the response."""
@@ -271,49 +275,49 @@ _with_response = by_class(
 
 
 @inner
-def fill_clean(scene: Any, codes: Pointer, strip: Strip, buffers: Buffers, counts: Pointer) -> bool:
+def fill_clean(inverse: Any, codes: Pointer, strip: Strip, buffers: Buffers, counts: Pointer) -> bool:
     """Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
 
     Return whether any site can be saturated.
     """
     signal = simd.pointer_to(buffers.signal, strip.first)
-    if scene.gray_mean:
-        _fill_gray_mean_signal(codes, strip, scene, signal)
+    if inverse.gray_mean:
+        _fill_gray_mean_signal(codes, strip, inverse, signal)
     else:
-        _fill_signal(codes, strip, scene, signal)
-    has_negative, has_bright = _fill_linear(scene, strip, buffers)
+        _fill_signal(codes, strip, inverse, signal)
+    has_negative, has_bright = _fill_linear(inverse, strip, buffers)
     if has_bright:
-        counts[strips.LIGHT_HIGH] += _recompute_bright(scene, strip, buffers)
-        counts[strips.CLEAN_HIGH] += count_outside(strip, buffers.bright_light, 0.0, scene.clipped)[1]
+        counts[strips.LIGHT_HIGH] += _recompute_bright(inverse, strip, buffers)
+        counts[strips.CLEAN_HIGH] += count_outside(strip, buffers.bright_light, 0.0, inverse.clipped)[1]
     if has_negative:
-        light = buffers.bright_light if scene.response.steps[1] else buffers.signal
+        light = buffers.bright_light if inverse.response.steps[1] else buffers.signal
         counts[strips.CLEAN_LOW] += count_outside(strip, light, 0.0, np.inf)[0]
     return bool(has_bright)
 
 
 @inner
-def _fill_linear(scene: Any, strip: Strip, buffers: Buffers) -> tuple[bool, bool]:
+def _fill_linear(inverse: Any, strip: Strip, buffers: Buffers) -> tuple[bool, bool]:
     """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
-    gains, limits = _load_sites(scene.gains, strip), _load_sites(scene.limits, strip)
+    gains, limits = _load_sites(inverse.gains, strip), _load_sites(inverse.limits, strip)
     lowest = highest = simd.load(buffers.signal, _0)
     for n in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(n) * _8
         signal = simd.load(buffers.signal, x)
         lowest, highest = simd.minimum(lowest, signal), simd.maximum(highest, signal)
-        _store_clean(scene, _linear_dn(scene, signal, gains), x, buffers)
+        _store_clean(inverse, _linear_dn(inverse, signal, gains), x, buffers)
     return simd.has_any_bit(simd.less_than(lowest, 0.0)), simd.has_any_bit(simd.less_than(limits, highest))
 
 
 @inner
-def _recompute_bright(scene: Any, strip: Strip, buffers: Buffers) -> int:
+def _recompute_bright(inverse: Any, strip: Strip, buffers: Buffers) -> int:
     """Recompute vectors that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
 
-    ``bright_light`` receives their light, and 0 elsewhere. Return how many sites are above ``scene.white``.
+    ``bright_light`` receives their light, and 0 elsewhere. Return how many sites are above ``inverse.white``.
     """
     above_white = 0
-    limits, light_per_signal = _load_sites(scene.limits, strip), _load_sites(scene.light_per_signal, strip)
-    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
-    most = np.inf if scene.exposure == 1.0 else 1.0  # otherwise light above white would reappear
+    limits, light_per_signal = _load_sites(inverse.limits, strip), _load_sites(inverse.light_per_signal, strip)
+    gains, headroom = _load_sites(inverse.gains, strip), _load_sites(inverse.headroom, strip)
+    most = np.inf if inverse.exposure == 1.0 else 1.0  # otherwise light above white would reappear
     for n in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(n) * _8
         signal = simd.load(buffers.signal, x)
@@ -321,14 +325,14 @@ def _recompute_bright(scene: Any, strip: Strip, buffers: Buffers) -> int:
             simd.store(buffers.bright_light, x, signal * 0.0)
             continue
         i = signal * light_per_signal
-        m = simd.maximum(i - scene.highlight_threshold, 0.0) / scene.divisor * scene.steepness
+        m = simd.maximum(i - inverse.highlight_threshold, 0.0) / inverse.divisor * inverse.steepness
         light = i * gains + i * (m * m) * headroom
-        if scene.white < np.inf:
+        if inverse.white < np.inf:
             simd.store(buffers.bright_light, x, light)
             for site in range(n * VECTOR_WIDTH, (n + 1) * VECTOR_WIDTH):
                 if strip.first <= site < strip.after:
-                    above_white += buffers.bright_light[site] > scene.white
-        light = _with_response(scene, simd.minimum(light, most) * scene.exposure, x, strip)
+                    above_white += buffers.bright_light[site] > inverse.white
+        light = _with_response(inverse, simd.minimum(light, most) * inverse.exposure, x, strip)
         simd.store(buffers.bright_light, x, light)
-        _store_clean(scene, simd.minimum(simd.maximum(light, 0.0), scene.brightest) * scene.span_dn, x, buffers)
+        _store_clean(inverse, simd.minimum(simd.maximum(light, 0.0), inverse.brightest) * inverse.span_dn, x, buffers)
     return above_white

@@ -17,11 +17,11 @@ from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import BLOCK, purpose, words
 from unprocess_gen.simulation.effects.dark_frame import dark_frame_offsets
 from unprocess_gen.simulation.facts import DarkPixels
-from unprocess_gen.simulation.kernels.body import NO_OFFSETS, WITHOUT_PATTERNS, Body
-from unprocess_gen.simulation.kernels.electrons import FLOAT32_ERROR_DN, MAX_STEPS, Electrons, FrameNumbers
+from unprocess_gen.simulation.kernels.electrons import FLOAT32_ERROR_DN, MAX_STEPS, PLACES, Electrons, FrameNumbers
 from unprocess_gen.simulation.kernels.normal import Quantiles, build_quantiles, normal_quantiles
 from unprocess_gen.simulation.kernels.poisson import MAX_THRESHOLD_RATE, count_tables, count_thresholds
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH
+from unprocess_gen.simulation.kernels.site_patterns import NO_OFFSETS, WITHOUT_PATTERNS, SitePatterns
 from unprocess_gen.simulation.kernels.strips import SiteMap, padded_width
 from unprocess_gen.simulation.lookup_tables import quantile_table
 from unprocess_gen.simulation.plan import Plan
@@ -31,23 +31,21 @@ from unprocess_gen.simulation.slots import LineOffsets, SiteNoise, Slots, SlotWo
 FARTHEST_NORMAL = 6.4
 """Bound of the absolute value of a normal deviate of 32 bits."""
 
-_ERROR_DN = FrameNumbers._fields.index("error_dn")
-
 
 def electron_noise(
     plans: Sequence[Plan],
     frames: tuple[Slots, ...],
-    body: Body,
+    patterns: SitePatterns,
     dark_pixels: DarkPixels | None,
     shape: tuple[int, int],
     origin: tuple[int, int],
 ) -> Electrons:
-    """Return the noise of frames of one body."""
+    """Return the noise of frames of one sensor unit."""
     columns, left = padded_width(origin[1], shape[1]), origin[1] // BLOCK * BLOCK
     has_columns = any(slots.columns or slots.fixed_columns for slots in frames)
     end = -(-(left + columns) // _COLUMNS) * _COLUMNS if has_columns else columns
     noise = _electron_noise(frames, end, origin[0] % 2)
-    members: dict[str, Any] = {"body": body, "padded_width": columns}
+    members: dict[str, Any] = {"patterns": patterns, "padded_width": columns}
     if has_columns:
         cut = slice(left, left + columns)
         members["columns_dn"] = np.ascontiguousarray(noise.columns_dn[:, cut])
@@ -56,7 +54,7 @@ def electron_noise(
     if any(slots.rows and slots.rows.correlation for slots in frames):
         members |= {"rows_dn": _correlated_rows(frames, origin[0], shape[0]), "rows_step": shape[0]}
     noise = noise._replace(**members)
-    offsets, step = body.sites_dn, 0
+    offsets, step = patterns.sites_dn, 0
     if any(slots.has_site_offsets for slots in frames):
         pitch, first, step = noise.padded_width, origin[1] % BLOCK, noise.padded_width * shape[0]
         sites_dn = np.zeros((len(plans), shape[0], pitch), dtype=np.float32)
@@ -70,13 +68,13 @@ def electron_noise(
         return noise
     numbers, values = noise.numbers.copy(), offsets.values
     farthest_dn = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
-    numbers[:, _ERROR_DN] += 2 * FLOAT32_ERROR_DN * farthest_dn
+    numbers[:, PLACES.error_dn] += 2 * FLOAT32_ERROR_DN * farthest_dn
     return noise._replace(numbers=numbers, sites_dn=offsets, sites_step=step)
 
 
 @functools.lru_cache(maxsize=256)
 def _electron_noise(frames: tuple[Slots, ...], columns: int, top: int) -> Electrons:
-    """Return the noise without the body, of the first columns of frames whose first row is ``top``.
+    """Return the noise without the sensor unit, of the first columns of frames whose first row is ``top``.
 
     Crops cut their columns from it: to compute them would take a tenth of a crop of 128 x 128.
     """
@@ -84,7 +82,7 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, top: int) -> Electr
     columns_dn = np.stack([_columns_dn(slots, columns) for slots in frames])
     base_dn = columns_dn.reshape(len(frames), 1, -1, VECTOR_WIDTH) + members["planes_dn"][:, :, None]
     numbers = members["numbers"].copy()
-    numbers[:, _ERROR_DN] += 2 * FLOAT32_ERROR_DN * np.abs(columns_dn).max(axis=1)
+    numbers[:, PLACES.error_dn] += 2 * FLOAT32_ERROR_DN * np.abs(columns_dn).max(axis=1)
     return Electrons(
         **(members | {"numbers": numbers}),
         columns_dn=columns_dn,
@@ -98,13 +96,13 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, top: int) -> Electr
         black_dn=first.black_dn,
         full_dn=first.full_well_e * first.dn_per_e + first.black_dn,
         dead_dn=first.patterns.dead.value_dn if first.patterns.dead else 0.0,
-        body=WITHOUT_PATTERNS,
+        patterns=WITHOUT_PATTERNS,
         tables=count_tables(),
     )
 
 
 def _columns_dn(slots: Slots, columns: int) -> Float:
-    """Return the offsets of the first columns of a frame, whose body can be another one."""
+    """Return the offsets of the first columns of a frame, whose unit can be another one."""
     columns_dn = _fixed_columns(slots.fixed_columns, columns)
     if slots.columns:
         columns_dn = columns_dn + slots.columns.std_dn * _normals(slots.columns.words, 1, columns)
@@ -196,13 +194,13 @@ _COLUMNS = 1024
 
 
 def _fixed_columns(offsets: LineOffsets | None, columns: int) -> Float:
-    """Return the offsets of the first columns of a body."""
+    """Return the offsets of the first columns of a sensor unit."""
     return np.zeros(columns) if offsets is None else np.asarray(offsets.std_dn * _first_normals(offsets.words, columns))
 
 
 @functools.lru_cache(maxsize=512)
 def _first_normals(stream: SlotWords, columns: int) -> Float:
-    """Return the normals of the first columns of a body."""
+    """Return the normals of the first columns of a sensor unit."""
     return _normals(stream, 1, columns)
 
 

@@ -26,8 +26,9 @@ with a bound of the error, eight sites at a time. Only the sites whose bound rea
 daylight, are computed exactly, in float64, in the order of the reference. Defects are always among them, so that other
 sites pay nothing for them. Float32 frames are not rounded, so all of their sites are exact.
 
-The sum in DN is written once, in `_sum_dn`, for all three. Fixed patterns of the body are prepared once (`body`), and
-numbers of frames by `electron_records`. The Poisson form of two-parameter noise is counts and noise of the site alone.
+The sum in DN is written once, in `_sum_dn`, for all three. Fixed patterns of the sensor unit are prepared once, by
+`site_patterns`, and numbers of frames by `electron_records`. The Poisson form of two-parameter noise is counts and
+noise of the site alone.
 """
 
 from __future__ import annotations
@@ -39,7 +40,6 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.simulation.kernels import normal, simd
-from unprocess_gen.simulation.kernels.body import Body
 from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, first_word
 from unprocess_gen.simulation.kernels.poisson import (
@@ -50,6 +50,7 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts_of_one_rate,
 )
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer_to
+from unprocess_gen.simulation.kernels.site_patterns import SitePatterns
 from unprocess_gen.simulation.kernels.strips import Buffers, Float32, SiteMap, Strip, list_lanes, strip_values
 
 FLOAT32_ERROR_DN = 2.0**-21
@@ -63,9 +64,9 @@ _RATE_ERROR32 = np.float32(FLOAT32_RATE)
 
 
 class Electrons(NamedTuple):
-    """Hold the slots of N frames of one body; P is the number of columns of complete blocks."""
+    """Hold the slots of N frames of one sensor unit; P is the number of columns of complete blocks."""
 
-    numbers: Float  # [N, NUMBER_COUNT]: see `FrameNumbers`
+    numbers: Float  # [N, len(PLACES)]: see `FrameNumbers`
     site_lines: NDArray[np.uint64]  # [N, 4097]: quantiles of the noise of a site
     site_quadratics: Float  # [N, 4096]
     dn_per_e: Float  # [N, 2, 8]: of eight sites of even and of odd rows
@@ -76,14 +77,14 @@ class Electrons(NamedTuple):
     columns_dn: Float  # [N, P]: offsets by column
     fixed_columns_dn: Float  # [P]: without those that are new in every frame
     base_dn: Float32  # [N, 2, P]: black level, column and plane
-    sites_dn: SiteMap  # offsets by site: of the body, or [N, H, P] of all frames
+    sites_dn: SiteMap  # offsets by site: of the sensor unit, or [N, H, P] of all frames
     sites_step: int  # elements from frame to frame
     dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
     black_dn: float
     full_dn: float  # DN of the full well in a clean frame with fixed patterns
     dead_dn: float  # value of dead pixels
-    body: Body
+    patterns: SitePatterns
     tables: CountTables
 
 
@@ -107,19 +108,31 @@ class FrameNumbers(NamedTuple):
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
 
 
-NUMBER_COUNT = len(FrameNumbers._fields)
+PLACES: Any = FrameNumbers(*range(len(FrameNumbers._fields)))
+"""The place of each number in the array of a frame."""
 
 
 @inner
 def load_frame(noise: Electrons, n: int) -> FrameNumbers:
     """Return the numbers of frame ``n`` with their types."""
-    v = pointer_to(noise.numbers, np.uint64(n * NUMBER_COUNT))
-    counts_light, has_dark, has_thresholds = v[0] != 0.0, v[1] != 0.0, v[2] != 0.0
-    light, dark, defect, site, row = np.uint64(v[3]), np.uint64(v[4]), np.uint64(v[5]), np.uint64(v[6]), np.uint64(v[7])
+    v = pointer_to(noise.numbers, np.uint64(n * len(PLACES)))
     return FrameNumbers(
-        counts_light, has_dark, has_thresholds, light, dark, defect, site, row,
-        v[8], v[9], np.float32(v[10]), np.int64(v[11]), v[12], v[13], v[14],
-    )  # fmt: skip
+        counts_light=v[PLACES.counts_light] != 0.0,
+        has_dark=v[PLACES.has_dark] != 0.0,
+        has_thresholds=v[PLACES.has_thresholds] != 0.0,
+        light_stream=np.uint64(v[PLACES.light_stream]),
+        dark_stream=np.uint64(v[PLACES.dark_stream]),
+        defect_stream=np.uint64(v[PLACES.defect_stream]),
+        site_stream=np.uint64(v[PLACES.site_stream]),
+        row_stream=np.uint64(v[PLACES.row_stream]),
+        dark_e=v[PLACES.dark_e],
+        removed_e=v[PLACES.removed_e],
+        fewest_dark=np.float32(v[PLACES.fewest_dark]),
+        dark_steps=np.int64(v[PLACES.dark_steps]),
+        site_std_dn=v[PLACES.site_std_dn],
+        row_std_dn=v[PLACES.row_std_dn],
+        error_dn=v[PLACES.error_dn],
+    )
 
 
 @inner
@@ -160,7 +173,7 @@ def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, buff
     if frame.has_dark:
         fill_word_blocks(key, strip, frame.dark_stream, buffers.dark_words)
         _count_dark(noise, n, frame, strip, buffers)
-    if _fill_defects(noise.body, strip, buffers):
+    if _fill_defects(noise.patterns, strip, buffers):
         fill_word_blocks(key, strip, frame.defect_stream, buffers.defect_words)
         _count_defects(noise, strip, buffers)
     row_word = first_word(key, strip.row, frame.row_stream)
@@ -175,7 +188,7 @@ def _fill_rates(noise: Electrons, n: int, strip: Strip, buffers: Buffers) -> Non
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
     """
     e_per_dn = simd.to_float32(1.0 / simd.load(noise.dn_per_e, np.uint64(_first_site(n, strip))))
-    response = strip_values(noise.body.response, strip)
+    response = strip_values(noise.patterns.response, strip)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         light_dn = (simd.load(buffers.rounded_dn, x) - noise.black_dn) + simd.load(buffers.residual_dn, x)
@@ -207,18 +220,18 @@ def _dark_buffers(frame: FrameNumbers, buffers: Buffers) -> tuple[Pointer, Point
 
 
 @inner
-def _fill_defects(body: Body, strip: Strip, buffers: Buffers) -> bool:
+def _fill_defects(patterns: SitePatterns, strip: Strip, buffers: Buffers) -> bool:
     """Fill ``defects_e`` with the means of bright defects, less than 0 at dead pixels; return whether there are any."""
-    if body.defects.steps[1] == 0:  # no strip has filled it
+    if patterns.defects.steps[1] == 0:  # no strip has filled it
         return False
-    numbers, any_number = strip_values(body.defects, strip), np.uint16(0)
+    numbers, any_number = strip_values(patterns.defects, strip), np.uint16(0)
     for x in range(strip.total):
         buffers.defects_e[x] = 0.0
         any_number |= numbers[x]
     if any_number == 0:
         return False
     for x in range(strip.total):
-        buffers.defects_e[x] = body.means_e[numbers[x]]
+        buffers.defects_e[x] = patterns.means_e[numbers[x]]
     return True
 
 
@@ -321,7 +334,7 @@ def _exact_light(
     """Return the electrons of light of one site: a count, or the mean."""
     if buffers.light_error_e[x] == _ZERO32:
         return float(buffers.light_e[x])
-    response = np.float64(strip_values(noise.body.response, strip)[x])
+    response = np.float64(strip_values(noise.patterns.response, strip)[x])
     rate = (buffers.unrounded_dn[x] - noise.black_dn) / dn_per_e * response
     return float(exact_count(buffers.words[x], rate, noise.tables) if frame.counts_light else rate)
 
@@ -338,8 +351,8 @@ def _exact_dark(noise: Electrons, frame: FrameNumbers, x: int, buffers: Buffers)
 def average_electrons(noise: Electrons, strip: Strip, buffers: Buffers) -> None:
     """Add the fixed patterns to the unrounded clean frame, as `effects.order.average`."""
     frame, clean_dn, defects_e = load_frame(noise, np.int64(0)), buffers.unrounded_dn, buffers.defects_e
-    _fill_defects(noise.body, strip, buffers)
-    kept_e, sites_dn = frame.dark_e - frame.removed_e, strip_values(noise.body.sites_dn, strip)
+    _fill_defects(noise.patterns, strip, buffers)
+    kept_e, sites_dn = frame.dark_e - frame.removed_e, strip_values(noise.patterns.sites_dn, strip)
     for x in range(strip.total):
         site = _first_site(np.int64(0), strip) + (x & 1)
         gain = noise.dn_per_e[site]

@@ -28,7 +28,7 @@ _CounterBlock = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 
 
 def philox_key(key: int) -> PhiloxKey:
-    """Return the 64-bit key of a body's patterns as kernels take it: level, draw, frame and epoch are 0."""
+    """Return the 64-bit key of a sensor unit's patterns as kernels take it: level, draw, frame and epoch are 0."""
     return np.uint64(key & LOW), np.uint64(key >> 32), np.uint64(0), np.uint64(0)
 
 

@@ -135,7 +135,7 @@ def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:
 def load_limits(readout: Any, n: int) -> Limits:
     """Return the limits of noisy frame ``n``."""
     limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * n))
-    return Limits(limits_dn[0], limits_dn[1], limits_dn[2], limits_dn[3])
+    return Limits(low=limits_dn[0], high=limits_dn[1], pinned_dn=limits_dn[2], pinned_from=limits_dn[3])
 
 
 # ------------------------------------------------------------------------------------------------------- noise by class

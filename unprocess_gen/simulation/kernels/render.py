@@ -1,9 +1,9 @@
 """Render clean and noisy frames strip by strip: the one compiled entry of all pairs.
 
 Per strip: the clean frame (`clean`), then for each noisy frame a sampler and a read-out. Numba chooses the sampler by
-the class of ``noise``, the precision by the class of ``scene``, and the read-out by the class of ``readout``; so
+the class of ``noise``, the precision by the class of ``inverse``, and the read-out by the class of ``readout``; so
 compiled code contains only what a pair needs. Every form gives the same DN as `pair.reference_pair` on every processor,
-except `clean.Scene32` with `gaussian.Gaussian32`, which state their errors.
+except `clean.Unprocessing32` with `gaussian.Gaussian32`, which state their errors.
 """
 
 from __future__ import annotations
@@ -19,14 +19,13 @@ from unprocess_gen.core.arrays import PACKED, Frame, Srgb
 from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Counts, Pair
-from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE, body_of, light_factor
 from unprocess_gen.simulation.kernels.clean import (
-    KEPT_SCENES,
-    Scene,
-    Scene32,
+    KEPT_FORMS,
+    Unprocessing,
+    Unprocessing32,
     fill_clean,
     is_steep,
-    scene_of,
+    unprocessing_of,
     with_response,
 )
 from unprocess_gen.simulation.kernels.electron_records import electron_noise
@@ -45,6 +44,7 @@ from unprocess_gen.simulation.kernels.readout import (
     write_clean,
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
+from unprocess_gen.simulation.kernels.site_patterns import EQUAL_RESPONSE, light_factor, patterns_at
 from unprocess_gen.simulation.kernels.strips import COUNT_FIELDS, STRIP, Scratch, buffers_in, locate, scratch_of_thread
 from unprocess_gen.simulation.plan import FAST, Plan
 from unprocess_gen.simulation.plan_slots import slots_of
@@ -98,10 +98,10 @@ class CropRenderer:
     def __call__(self, srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
         """Return the clean frame, the noisy frame and a function that returns their counts, which takes 5 µs."""
         form = self._form
-        scene, noise = _records(form, self._plans, self._shape, origin, epoch=epoch, frame=self._frame)
+        inverse, noise = _records(form, self._plans, self._shape, origin, epoch=epoch, frame=self._frame)
         keys = form.keys.copy()
         keys[0, 3] = frame_word(self._plan.place.frame, epoch)
-        clean, noisy, numbers = _fill_frames(srgb, form, scene, noise, keys, origin)
+        clean, noisy, numbers = _fill_frames(srgb, form, inverse, noise, keys, origin)
         return clean, noisy[0], lambda: _counts_of(numbers, self._plan)[0]
 
 
@@ -129,7 +129,7 @@ class _Form(NamedTuple):
     shape: tuple[int, ...]
     clean_dtype: Any
     noisy_dtype: Any
-    scene: Scene  # its class selects the precision
+    inverse: Unprocessing  # its class selects the precision
     noise: Gaussian | Gaussian32 | None  # None for noise in electrons, which depends on the place
     frames: tuple[Slots, ...]  # of noise in electrons
     readout: ReadOut
@@ -138,14 +138,14 @@ class _Form(NamedTuple):
 
 def _form(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int, int], codes: int) -> _Form:
     """Return the form of frames of ``shape``, from ``codes`` codes, whose first site is ``corner`` of a tile."""
-    first, in_float32 = plans[0], uses_scene32(plans[0])
+    first, in_float32 = plans[0], uses_float32(plans[0])
     packed = first.output.layout == PACKED
     noise = None if first.counts_electrons else (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
     return _Form(
         (4, shape[0] // 2, shape[1] // 2) if packed else shape,
         np.float32 if first.output.clean_normalised else np.uint16,
         np.float32 if first.output.normalised else np.uint16,
-        scene_of(first, codes, corner, Scene32 if in_float32 else Scene),
+        unprocessing_of(first, codes, corner, Unprocessing32 if in_float32 else Unprocessing),
         noise,
         () if noise else tuple(map(slots_of, plans)),
         readout_of(plans, shape if packed else (0, 0), corner, in_float32),
@@ -153,7 +153,7 @@ def _form(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int, in
     )
 
 
-_forms = [functools.lru_cache(maxsize=count)(_form) for count in KEPT_SCENES]
+_forms = [functools.lru_cache(maxsize=count)(_form) for count in KEPT_FORMS]
 
 
 def _frames_of(
@@ -166,12 +166,12 @@ def _frames_of(
     """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`."""
     shape, is_wide = srgb.shape[:2], srgb.itemsize > 1
     form = _forms[is_wide](plans, shape, (origin[0] % 2, origin[1] % 2), CODES[is_wide])
-    scene, noise = _records(form, plans, shape, origin, dark_pixels)
-    return _fill_frames(srgb, form, scene, noise, form.keys[:count], origin)
+    inverse, noise = _records(form, plans, shape, origin, dark_pixels)
+    return _fill_frames(srgb, form, inverse, noise, form.keys[:count], origin)
 
 
 def _fill_frames(
-    srgb: Srgb, form: _Form, scene: Scene, noise: Noise, keys: NDArray[np.uint64], origin: tuple[int, int]
+    srgb: Srgb, form: _Form, inverse: Unprocessing, noise: Noise, keys: NDArray[np.uint64], origin: tuple[int, int]
 ) -> tuple[Frame, Frame, NDArray[np.int64]]:
     """Return the clean frame, a noisy frame for each key, and their numbers of `Counts`.
 
@@ -182,9 +182,9 @@ def _fill_frames(
     counts = np.zeros((max(len(keys), 1), COUNT_FIELDS), np.int64)
     # a view, a read-only array or a subclass would be another type, compiled again
     codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
-    scratch = scratch_of_thread(np.float32 if type(scene) is Scene32 else np.float64)
+    scratch = scratch_of_thread(np.float32 if type(inverse) is Unprocessing32 else np.float64)
     frames = clean.reshape(-1), noisy.reshape(len(keys), clean.size)
-    _render(codes, scene, noise, keys, origin, form.readout, scratch, *frames, counts)
+    _render(codes, inverse, noise, keys, origin, form.readout, scratch, *frames, counts)
     return clean, noisy, counts
 
 
@@ -196,29 +196,29 @@ def _records(
     dark_pixels: DarkPixels | None = None,
     epoch: int = 0,
     frame: Shape | None = None,
-) -> tuple[Scene, Noise]:
-    """Return the scene and the noise at a place, whose classes select the compiled code."""
-    first, scene = plans[0], form.scene
+) -> tuple[Unprocessing, Noise]:
+    """Return the numbers of the unprocessing and the noise at a place, whose classes select the compiled code."""
+    first, inverse = plans[0], form.inverse
     if form.noise is not None:
-        return scene, form.noise
+        return inverse, form.noise
     frames = form.frames
     if epoch and any(slots.columns or (slots.rows and slots.rows.correlation) for slots in frames):
         frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in plans)  # offsets of lines have words of an epoch
-    body = body_of(frames[0].patterns, shape, origin, frame)
-    factor = light_factor(frames[0].patterns, body, shape, origin, first.averaged)
+    patterns = patterns_at(frames[0].patterns, shape, origin, frame)
+    factor = light_factor(frames[0].patterns, patterns, shape, origin, first.averaged)
     if factor is not None:
-        scene = with_response(scene, factor)
+        inverse = with_response(inverse, factor)
     if first.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
-        body = body._replace(response=EQUAL_RESPONSE)
-    return scene, electron_noise(plans, frames, body, dark_pixels, shape, origin)
+        patterns = patterns._replace(response=EQUAL_RESPONSE)
+    return inverse, electron_noise(plans, frames, patterns, dark_pixels, shape, origin)
 
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
-    """Key that the plans of one pass have in common: the kernels, and the fixed patterns of the body."""
+    """Key that the plans of one pass have in common: the kernels, and the fixed patterns of the sensor unit."""
     return plan.counts_electrons, slots_of(plan).patterns
 
 
-def uses_scene32(plan: Plan) -> bool:
+def uses_float32(plan: Plan) -> bool:
     """True if a plan is rendered in float32, which its clean frame alone decides."""
     return plan.clean_accuracy == FAST and not is_steep(plan)
 
@@ -226,7 +226,7 @@ def uses_scene32(plan: Plan) -> bool:
 @kernel
 def _render(
     srgb: Srgb,
-    scene: Any,
+    inverse: Any,
     noise: Any,
     keys: NDArray[np.uint64],
     origin: tuple[int, int],
@@ -238,7 +238,7 @@ def _render(
 ) -> None:
     """Fill the frames and counts of all pairs, strip by strip."""
     height, width = srgb.shape[:2]
-    light, sampler, frames = pointers_of(scene), pointers_of(noise), pointers_of(readout)
+    light, sampler, frames = pointers_of(inverse), pointers_of(noise), pointers_of(readout)
     buffers = buffers_in(scratch)
     codes, clean_sites, noisy_sites = pointer_to(srgb, 0), pointer_to(clean, 0), pointer_to(noisy, 0)
     key_words, all_counts, sites = pointer_to(keys, 0), pointer_to(counts, 0), clean.size

@@ -1,4 +1,4 @@
-"""Prepare the fixed patterns of a camera body once for all of its frames: factors, offsets and defects by site."""
+"""Prepare the fixed patterns of a sensor unit once for all of its frames: factors, offsets and defects by site."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ DEAD, FIRST_STEP = 1, 2
 Shape = tuple[int, int]
 
 
-class Body(NamedTuple):
-    """Hold the fixed patterns of a body for a crop."""
+class SitePatterns(NamedTuple):
+    """Hold the fixed patterns of a sensor unit for a crop."""
 
     response: SiteMap  # float32: factor on the electrons of light
     sites_dn: SiteMap  # float32: offsets by site
@@ -51,26 +51,26 @@ class Body(NamedTuple):
 
 
 EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS = equal_sites(1.0), equal_sites(0.0), equal_sites(0, np.uint16)
-WITHOUT_PATTERNS = Body(EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS, np.zeros(1))
+WITHOUT_PATTERNS = SitePatterns(EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS, np.zeros(1))
 
 
-def body_of(patterns: Patterns, shape: Shape, origin: Shape, frame: Shape | None = None) -> Body:
-    """Return the fixed patterns of a body for a crop of ``shape`` at ``origin``, without the factor on the light.
+def patterns_at(slots: Patterns, shape: Shape, origin: Shape, frame: Shape | None = None) -> SitePatterns:
+    """Fixed patterns of a sensor unit for a crop of ``shape`` at ``origin``, without the factor on the light.
 
     ``frame`` are the height and width of the complete frame from which live crops are cut.
     """
-    electrons, sites, bright, dead = patterns.electrons, patterns.sites_dn, patterns.bright, patterns.dead
     kept = _live_patterns if frame else _kept
     response_of, defects_of = functools.partial(kept, _normal_pattern), functools.partial(kept, _defect_map)
-    if frame and not patterns.light:
+    if frame and not slots.light:
         response_of = functools.partial(_cut_response, frame)
     if frame:
         defects_of = functools.partial(_cut_defects, frame)
-    return Body(
-        response_of(electrons, shape, origin) if electrons else EQUAL_RESPONSE,
-        kept(_normal_pattern, sites, shape, origin) if sites else NO_OFFSETS,
-        defects_of((bright, dead), shape, origin) if bright or dead else NO_DEFECTS,
-        _means_e(bright.mean_e if bright else 0.0),
+    defects = slots.bright, slots.dead
+    return SitePatterns(
+        response_of(slots.electrons, shape, origin) if slots.electrons else EQUAL_RESPONSE,
+        kept(_normal_pattern, slots.sites_dn, shape, origin) if slots.sites_dn else NO_OFFSETS,
+        defects_of(defects, shape, origin) if any(defects) else NO_DEFECTS,
+        _means_e(slots.bright.mean_e if slots.bright else 0.0),
     )
 
 
@@ -79,17 +79,19 @@ def _means_e(mean_e: float) -> Float:
     return np.concatenate([[0.0, -1.0], mean_e * exponential_levels()])
 
 
-def light_factor(patterns: Patterns, body: Body, shape: Shape, origin: Shape, is_averaged: bool) -> SiteMap | None:
+def light_factor(
+    slots: Patterns, patterns: SitePatterns, shape: Shape, origin: Shape, is_averaged: bool
+) -> SiteMap | None:
     """Return the factor on the light of the clean frame, as `effects.order.light_factor`; None without one.
 
     ``is_averaged``: the clean frame contains the fixed patterns.
     """
-    if patterns.light is None:
-        return body.response if is_averaged else None
-    light: SiteMap = _kept(_radial_factor, patterns.light, shape, origin)
-    if not is_averaged or not patterns.electrons:
+    if slots.light is None:
+        return patterns.response if is_averaged else None
+    light: SiteMap = _kept(_radial_factor, slots.light, shape, origin)
+    if not is_averaged or not slots.electrons:
         return light
-    return light._replace(values=(light.values * body.response.values.astype(np.float64)).astype(np.float32))
+    return light._replace(values=(light.values * patterns.response.values.astype(np.float64)).astype(np.float32))
 
 
 # A crop's pattern is computed once for all frames and patches at its place.
@@ -108,8 +110,8 @@ _caches = [functools.lru_cache(maxsize=count)(_compute) for count in (SMALL_PATT
 _live_patterns = _caches[2]
 
 
-def forget_bodies() -> None:
-    """Drop the cached patterns, so that the next frame computes them, as the first frame of a body does."""
+def forget_patterns() -> None:
+    """Drop the cached patterns, so that the next frame computes them, as the first frame of a unit does."""
     for cache in _caches:
         cache.cache_clear()
     _frames.clear()

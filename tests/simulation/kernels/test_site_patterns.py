@@ -1,4 +1,4 @@
-"""Fixed patterns of a body equal the reference for any crop."""
+"""Fixed patterns of a sensor unit equal the reference for any crop."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from helpers.flats import dead, hot_pixel_means, plan_with, response
 
 from unprocess_gen.core.random_streams import BLOCK
-from unprocess_gen.simulation.kernels import body
-from unprocess_gen.simulation.kernels.body import Body, body_of, forget_bodies
+from unprocess_gen.simulation.kernels import site_patterns
+from unprocess_gen.simulation.kernels.site_patterns import SitePatterns, forget_patterns, patterns_at
 from unprocess_gen.simulation.kernels.strips import SiteMap
 from unprocess_gen.simulation.plan import Physics
 from unprocess_gen.simulation.plan_slots import slots_of
@@ -29,9 +29,9 @@ DEFECTS = ("hot_pixels", "dead_pixels")
 
 @pytest.fixture(autouse=True)
 def _forgotten() -> Iterator[None]:
-    forget_bodies()
+    forget_patterns()
     yield
-    forget_bodies()
+    forget_patterns()
 
 
 def patterns_of(*on: str, **numbers: float) -> tuple[Patterns, Physics]:
@@ -40,7 +40,7 @@ def patterns_of(*on: str, **numbers: float) -> tuple[Patterns, Physics]:
     return slots_of(plan).patterns, plan.physics
 
 
-def means_of(found: Body, shape: tuple[int, int], first: int) -> np.ndarray:
+def means_of(found: SitePatterns, shape: tuple[int, int], first: int) -> np.ndarray:
     """Return the mean excess of each pixel: -1 if it is dead, 0 if it has no defect."""
     pitch, column = found.defects.steps
     if not column:  # no pixel has a defect
@@ -53,7 +53,7 @@ def assert_defects(on: tuple[str, ...], shape: tuple[int, int], origin: tuple[in
     expected = hot_pixel_means(physics, shape, origin) if "hot_pixels" in on else np.zeros(shape)
     if "dead_pixels" in on:
         expected = np.where(dead(physics, shape, origin), -1.0, expected)
-    found = means_of(body_of(patterns, shape, origin), shape, origin[1] % BLOCK)
+    found = means_of(patterns_at(patterns, shape, origin), shape, origin[1] % BLOCK)
     np.testing.assert_array_equal(found, expected)
 
 
@@ -71,7 +71,7 @@ def test_response_of_a_crop_equals_the_reference(
 ) -> None:
     """The large standard deviation gives pixels without any response."""
     patterns, physics = patterns_of("prnu", prnu_std=prnu_std)
-    found, first = body_of(patterns, shape, origin), origin[1] % BLOCK
+    found, first = patterns_at(patterns, shape, origin), origin[1] % BLOCK
     pitch = found.response.steps[0]
     assert found.response.steps == (pitch, 1)
     assert pitch % BLOCK == 0
@@ -82,9 +82,9 @@ def test_response_of_a_crop_equals_the_reference(
 
 def test_patterns_are_computed_once_for_all_frames_of_a_body() -> None:
     pattern = NormalPattern(5, "prnu", 0.1, 1.0, 0.0)
-    first = body_of(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values
-    assert body_of(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values is first
-    other = body_of(Patterns(electrons=pattern._replace(body_key=2)), (4, 70), (1, 1)).response.values
+    first = patterns_at(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values
+    assert patterns_at(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values is first
+    other = patterns_at(Patterns(electrons=pattern._replace(body_key=2)), (4, 70), (1, 1)).response.values
     assert not np.array_equal(other, first)
 
 
@@ -95,15 +95,15 @@ def test_patterns_of_live_crops_equal_those_of_other_crops(
 ) -> None:
     """They are cut from patterns of the frame, which grow, unless these are too large or too many."""
     for name, limit in limits.items():
-        monkeypatch.setattr(body, name, limit)
+        monkeypatch.setattr(site_patterns, name, limit)
     patterns, _ = patterns_of("prnu", *DEFECTS, hot_pixel_share=share, dead_pixel_share=share)
     for shape, origin in CROPS:
         frame = origin[0] + shape[0], origin[1] + shape[1]
-        expected, live = (body_of(patterns, shape, origin, sides) for sides in (None, frame))
+        expected, live = (patterns_at(patterns, shape, origin, sides) for sides in (None, frame))
         first = origin[1] % BLOCK
         for ours, theirs in zip(live[:3], expected[:3], strict=True):
             np.testing.assert_array_equal(sites(ours, shape, first), sites(theirs, shape, first))
-    assert not limits.get("MOST_FRAMES", 1) or len(body._frames) == 2
+    assert not limits.get("MOST_FRAMES", 1) or len(site_patterns._frames) == 2
 
 
 def sites(values: SiteMap, shape: tuple[int, int], first: int) -> np.ndarray:
