@@ -24,10 +24,8 @@ from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.distributions import parse_distribution
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
-from unprocess_gen.config.schema import Config, all_settings, replaced
+from unprocess_gen.config.schema import GROUPS, Config, all_settings, replaced
 from unprocess_gen.config.serialization import (
-    NOT_DATA,
-    NOT_RECORDED,
     dataset_yaml,
     differences,
     parse_dataset_yaml,
@@ -202,7 +200,10 @@ REFUSED = [
     ("noise=sony_a7s2;noise.dark_e_per_s=1e6;scene.exposure_s=1e5", r"noise.dark_e_per_s=1000000.0: more than 1e\+09"),
     ("effects.all=maybe", r"effects.all=maybe: expected one of auto, on, off"),
     ("noise=oppo_reno10x;effects.row=on", r"effects.row=on: noise=oppo_reno10x gives no row_std_dn"),
-    ("noise=nikon_d850;scene.iso=-1", r"scene.iso=-1: expected an ISO above 0, up to 1e\+07"),
+    ("noise=imx385_iso3200;noise.prnu_std=2", r"noise.prnu_std=2.0: expected 0 to 0.5 or null"),  # used or not
+    ("noise=imx385_iso3200;scene.iso=-1", r"scene.iso=-1: expected more than 0, up to 1e\+07"),
+    ("noise=nikon_d850;noise.a=[uniform,2,1]", r"noise.a=\[uniform, 2, 1\]: expected the lowest value below"),
+    ("noise=nikon_d850;scene.iso=-1", r"scene.iso=-1: expected more than 0, up to 1e\+07"),
     ("scene.exposure_ratio=0", r"scene.exposure_ratio=0: expected 0.001 to 1e\+06"),
     ("scene.temperature_c=[choice]", r"scene.temperature_c=\[choice\]: expected at least one value"),
 ]
@@ -252,28 +253,15 @@ def test_config_yaml_contains_source_kind_but_no_path(settings: Settings, tmp_pa
     assert str(tmp_path) not in dataset_yaml(settings(f"source.root={tmp_path}"))
 
 
-def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> None:
+def test_config_yaml_has_the_keys_that_decide_data(settings: Settings) -> None:
+    omitted = {"out", "n_jobs", "self_test", "check_disk", "source.root", "source.list", "source.max_failed"}
+    omitted |= {"noise.dark_frames", "noise.provenance", "body.name", "body.missing"}
+    omitted |= {"executor.kind", "executor.address", "executor.no_workers_s"}
     loaded = yaml.safe_load(dataset_yaml(settings()))
-    assert NOT_DATA == {
-        "": ("out", "n_jobs", "self_test", "check_disk"),
-        "source": ("root", "list", "max_failed"),
-        "noise": ("dark_frames", "provenance"),
-        "executor": ("kind", "address", "no_workers_s"),
-        "body": ("name", "missing"),
-    }
-    assert "executor" not in loaded
-    assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)
-    assert {"root", "max_failed"}.isdisjoint(loaded["source"])
-
-
-def test_config_yaml_contains_every_other_key(settings: Settings) -> None:
-    loaded = yaml.safe_load(dataset_yaml(settings()))
-    for field in dataclasses.fields(Config):
-        if dataclasses.is_dataclass(group := getattr(Config(), field.name)):
-            names = {key.name for key in dataclasses.fields(group)} - set(NOT_DATA.get(field.name, ()))
-            assert set(loaded.get(field.name, ())) == (set() if field.name in NOT_RECORDED else names)
-        else:
-            assert field.name in loaded or field.name in NOT_DATA[""]
+    groups = {group: loaded.get(group, {}) for group in GROUPS} | {"source.raw": loaded["source"].pop("raw")}
+    keys = {f"{group}.{name}" for group, values in groups.items() for name in values} | (loaded.keys() - groups.keys())
+    assert keys | omitted == {f"{group}.{name}".lstrip(".") for group, name, _ in all_settings()}
+    assert not keys & omitted
 
 
 def test_schema_and_option_files_have_the_same_defaults(settings: Settings) -> None:

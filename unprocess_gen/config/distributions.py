@@ -210,7 +210,7 @@ def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
     """
     distribution = parse_distribution(key, value, limit.kinds)
     if distribution.kind != "log_linear_in_a" and not (
-        limit.low <= lowest(distribution) and highest(distribution) <= limit.high
+        limit.numbers.low <= lowest(distribution) and highest(distribution) <= limit.numbers.high
     ):
         raise refusal(key, value, f"expected {limit.range}")
     return distribution

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from typing import Any
 
 from unprocess_gen.config.values import refusal
-from unprocess_gen.core.fields import Choice, Limit, is_number, value_text
+from unprocess_gen.core.fields import Choice, Limit, Numbers, is_number, value_text
 from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.targets import LINEAR_RGB
+from unprocess_gen.simulation.plan import numbers_of
 from unprocess_gen.simulation.reference.light import LIGHTS
-
-YAML_SWITCHES = {"True": "on", "False": "off"}
-"""Text of the booleans that YAML reads from on and off without quotes."""
-
-
-class Switch(Choice):
-    """One of a few words, of which YAML may have read on or off as a boolean; `schema.Group` restores them."""
 
 
 def text(what: str) -> Limit:
@@ -34,23 +27,22 @@ class LevelRange(Limit):
         self._ends, self._remark = ends, remark
 
     def check_in(self, key: str, value: int, group: Any) -> None:
-        """Raise ConfigError unless the value is in the range that the group, whose ``bits`` are valid, gives."""
+        """Raise ConfigError unless the value is in the range that the group gives; it may lack ``bits`` or a level."""
+        if None in (group.bits, group.black_level_dn):
+            return
         low, high = self._ends(group)
         if not low <= value <= high:
             raise refusal(key, value, f"expected {low} to {high}{self._remark}")
 
 
 class Drawn(Limit):
-    """A number, or a distribution of one of ``kinds``, all of whose draws are from ``low`` to ``high``.
+    """A number, or a distribution of one of ``kinds``, all of whose draws are within ``numbers``.
 
-    ``range_text`` replaces the range in words. `distributions.parse_drawn` checks values.
+    `distributions.parse_drawn` checks values.
     """
 
-    def __init__(
-        self, kinds: tuple[str, ...], low: float = -math.inf, high: float = math.inf, range_text: str = ""
-    ) -> None:
-        self.kinds, self.low, self.high = kinds, low, high
-        self.range = range_text or ("a finite number" if low == -math.inf else f"{low:g} to {high:g}")
+    def __init__(self, kinds: tuple[str, ...], numbers: Numbers, range_text: str = "") -> None:
+        self.kinds, self.numbers, self.range = kinds, numbers, range_text or str(numbers)
         super().__init__(f"{self.range}; constant, or drawn: {', '.join(kinds)}")
         self.is_float = True
 
@@ -75,8 +67,6 @@ MAX_RANDOM_PATCHES = 10**4
 MAX_BRANCH_NUMBER = 1e9
 """Largest number in a branch of a physical profile, and largest standard deviation in DN that a line gives."""
 
-MAX_ISO = 1e7
-
 MAX_SPLITS = 16
 """Most splits. Chosen: more than any benchmark has."""
 
@@ -99,12 +89,8 @@ OUTPUT_PLACE = Limit(
 )
 """A local path, or the URL of an object store; another URL would become a folder named after its scheme."""
 
-SWITCH = Switch("auto", "on", "off")
+SWITCH = Choice("auto", "on", "off")
 """Values of each effect."""
-
-SCATTER = Switch("off", "unit")
-
-DEQUANTIZE = Switch("off", "dither", "dither_all")
 
 CAMERA_LAWS = Choice("fixed", "convex", "choice", "identity", "custom")
 
@@ -126,21 +112,20 @@ SCENE_LIGHT = Limit(
 )
 
 GAIN_TEXT = f"a gain above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}"
-GAIN = Drawn(("uniform", "truncated_normal"), MIN_GAIN, MAX_GAIN, GAIN_TEXT)
-INVERSE_GAIN = Drawn((*GAIN.kinds, "inverse_truncated_normal"), MIN_GAIN, MAX_GAIN, GAIN_TEXT)
+GAIN = Drawn(("uniform", "truncated_normal"), Numbers(MIN_GAIN, MAX_GAIN), GAIN_TEXT)
+INVERSE_GAIN = Drawn((*GAIN.kinds, "inverse_truncated_normal"), GAIN.numbers, GAIN_TEXT)
 
 VARIANCE_SLOPE = Drawn(
-    ("uniform", "log_uniform"), 0, MAX_VARIANCE, f"a slope of the variance of 0 or more, up to {MAX_VARIANCE:g}"
+    ("uniform", "log_uniform"),
+    Numbers(0, MAX_VARIANCE),
+    f"a slope of the variance of 0 or more, up to {MAX_VARIANCE:g}",
 )
-VARIANCE_OFFSET = Drawn((*VARIANCE_SLOPE.kinds, "log_linear_in_a"), -MAX_VARIANCE, MAX_VARIANCE)
+VARIANCE_OFFSET = Drawn((*VARIANCE_SLOPE.kinds, "log_linear_in_a"), Numbers(-MAX_VARIANCE, MAX_VARIANCE))
 
-SCENE_KINDS = ("uniform", "log_uniform", "choice")
-ISO = Drawn(SCENE_KINDS, math.nextafter(0, 1), MAX_ISO, f"an ISO above 0, up to {MAX_ISO:g}")
-EXPOSURE_S = Drawn(SCENE_KINDS, 1e-7, 1e5)
-TEMPERATURE_C = Drawn(SCENE_KINDS, -100.0, 150.0)
-EXPOSURE_RATIO = Drawn(SCENE_KINDS, 1e-3, 1e6)
-"""Ranges of the values of a scene. Chosen: far beyond cameras."""
-
+ISO, EXPOSURE_S, TEMPERATURE_C, EXPOSURE_RATIO = (
+    Drawn(("uniform", "log_uniform", "choice"), numbers_of(name))
+    for name in ("iso", "exposure_s", "temperature_c", "exposure_ratio")
+)
 
 READ_SHAPE = Limit(
     "a shape of more than -0.5, where the Tukey-lambda distribution has a variance, and less than 10, or a table, "

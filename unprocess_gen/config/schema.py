@@ -22,7 +22,7 @@ from unprocess_gen.core.fields import Choice, Integers, Limit, NumberList, Numbe
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.numbers import SHAPE, SITES, Number
-from unprocess_gen.simulation.plan import EXACT, TIERS
+from unprocess_gen.simulation.plan import EXACT, FIELDS
 
 
 class FrozenMapping(dict[str, Any]):
@@ -39,6 +39,10 @@ def frozen(value: Any) -> Any:
     return FrozenMapping({name: frozen(item) for name, item in value.items()}) if isinstance(value, dict) else value
 
 
+YAML_SWITCHES = {"True": "on", "False": "off"}
+"""Text of the booleans that YAML reads from on and off without quotes."""
+
+
 class Group:
     """Base of the dataclasses of a config, whose lists become tuples, and whose switches have one spelling."""
 
@@ -47,11 +51,8 @@ class Group:
         for name, value in vars(self).items():
             if isinstance(value, list | tuple | dict):
                 object.__setattr__(self, name, frozen(value))
-            elif value in ("True", "False") and isinstance(settings_of(self)[name].limit, limits.Switch):
-                object.__setattr__(self, name, limits.YAML_SWITCHES[value])
-
-
-PATTERN = Choice("RGGB", "BGGR", "GRBG", "GBRG")
+            elif value in YAML_SWITCHES and YAML_SWITCHES[value] in getattr(settings_of(self)[name].limit, "words", ()):
+                object.__setattr__(self, name, YAML_SWITCHES[value])
 
 
 @documented
@@ -73,7 +74,7 @@ class RawConfig(Group):
         noise of the files themselves: variance at black
     """
 
-    pattern: Optional[str] = key(None, PATTERN, null="that of the file")
+    pattern: Optional[str] = key(None, FIELDS["raw_pattern"].limit, null="that of the file")
     black_dn: Optional[float] = key(None, Numbers(0, 65534), unit="DN", null="that of the file")
     white_dn: Optional[float] = key(None, Numbers(1, 65535), unit="DN", null="that of the file")
     a_dn: Optional[float] = key(None, Numbers(0, 65535), unit="DN", null="that of the tag NoiseProfile of a DNG")
@@ -113,18 +114,8 @@ class SourceConfig(Group):
         fail
     clips
         treat each folder as a clip: its frames share camera, gains, noise level and fixed patterns
-    downscale
-        side of the squares whose mean becomes one pixel of 16 bits; 2 removes JPEG artefacts, as Brooks et al.
-        did
-    dequantize
-        dither moves 8-bit codes by up to half a code at random, so that gray areas have more than 256 raw
-        levels; 0, 255 and highlights keep their codes; dither_all moves highlights too, and code 254 up to
-        white
     patch
         cut images into square patches, after downscaling
-    shrink
-        of raw sources: 2 takes the mean of the sites of each colour in cells of 2 x 2 sites, one pixel of camera RGB
-        from which a new mosaic is sampled; 1 keeps the mosaic
     own_noise
         noise of raw sources themselves: subtract lowers the variance that a profile with two numbers adds by that of
         the source, down to 0; the column zero_variance counts the sites where the source has as much or more
@@ -149,10 +140,10 @@ class SourceConfig(Group):
     max_failed: int = key(0, Integers(0, 10**9), decides_data=False)
     icc: str = key("ignore", Choice("ignore", "refuse"))
     clips: bool = key(False, limits.BOOLEAN)
-    downscale: int = key(1, Integers(1, 64), unit="pixels")
-    dequantize: str = key("off", limits.DEQUANTIZE)
+    downscale: int = key(1, of="downscale")
+    dequantize: str = key("off", of="dequantize")
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
-    shrink: int = key(1, Integers(1, 2), unit="sites")
+    shrink: int = key(1, of="shrink", unit="sites")
     own_noise: str = key("keep", Choice("keep", "subtract"))
     raw: RawConfig = field(default_factory=RawConfig)
 
@@ -197,44 +188,25 @@ class GainsConfig(Group):
 
     Attributes
     ----------
-    red
-        forward white-balance gain of red
-    blue
-        forward white-balance gain of blue
-    inverse_rgb
-        inverse of the brightening gain; the image is multiplied by it
-    highlight
-        how highlights are preserved: per_channel as in the article, gray_mean as in the code of Brooks et al.,
-        none
-    threshold
-        linear signal above which highlights are preserved
     light
         light from which the gains of red and blue follow, by the matrix of the camera; scene is scene.light
     """
 
-    red: Any = key(("uniform", 1.9, 2.4), limits.GAIN, null="the gain that follows from light")
-    blue: Any = key(("uniform", 1.5, 1.9), limits.GAIN, null="the gain that follows from light")
-    inverse_rgb: Any = key(("truncated_normal", 0.8, 0.1, 0.5, 1.1), limits.INVERSE_GAIN)
-    highlight: str = key("per_channel", Choice("per_channel", "gray_mean", "none"))
-    threshold: float = key(0.9, Numbers(0, 1, open_high=True))
+    red: Any = key(("uniform", 1.9, 2.4), limits.GAIN, of="red_gain", null="the gain that follows from light")
+    blue: Any = key(("uniform", 1.5, 1.9), limits.GAIN, of="blue_gain", null="the gain that follows from light")
+    inverse_rgb: Any = key(("truncated_normal", 0.8, 0.1, 0.5, 1.1), limits.INVERSE_GAIN, of="inverse_rgb_gain")
+    highlight: str = key("per_channel", of="highlight")
+    threshold: float = key(0.9, of="highlight_threshold")
     light: Optional[str] = key(None, limits.LIGHT, null="red and blue are the gains")
 
 
 @documented
 @dataclass(frozen=True)
 class IspConfig(Group):
-    """Define the curves that the camera applied after the colour matrix.
+    """Define the curves that the camera applied after the colour matrix."""
 
-    Attributes
-    ----------
-    tone
-        tone curve that is inverted
-    gamma
-        exponent that is inverted, or srgb for the piecewise curve of IEC 61966-2-1
-    """
-
-    tone: str = key("smoothstep", Choice("smoothstep", "none"))
-    gamma: Any = key(2.2, NumberOrWord("srgb", Numbers(0.1, 10), "a number from {numbers}, or {word}"))
+    tone: str = key("smoothstep", of="tone")
+    gamma: Any = key(2.2, of="gamma")
 
 
 @documented
@@ -246,36 +218,23 @@ class SensorConfig(Group):
     ----------
     levels
         given: bits, levels and pattern are those below; source: they are those of each raw file (source.kind=raw)
-    bits
-        bits per sample
-    black_level_dn
-        black level, the value without light
-    white_level_dn
-        white level, the value at saturation
-    pattern
-        CFA pattern of the top-left 2x2 sites, row by row; MONO has no filters: sites record the mean of the channels
-    clip
-        clipping of noisy frames: sensor at 0 and 2^bits - 1, black at the black level instead of 0, none only
-        with float32
     saturated
         noisy value at sites where the clean frame is saturated: noisy is the clipped value plus noise, as in
         the article; white is the white level where the
         converter ends, and sites at a full well keep the noise behind it; auto is white for physical profiles
         with a full well or a converter that ends, otherwise noisy
-    dark_offset
-        mean of the dark current: removed as a camera does with optical-black pixels, or kept
     units
         camera bodies, each with its own fixed patterns: image is a new body for each image; with a number, each
         image has one of that many bodies
     """
 
-    bits: int = key(12, Integers(1, 16))
-    black_level_dn: int = key(240, limits.BLACK_LEVEL, unit="DN")
-    white_level_dn: int = key(4095, limits.WHITE_LEVEL, unit="DN")
-    pattern: str = key("RGGB", Choice("RGGB", "BGGR", "GRBG", "GBRG", "MONO"))
-    clip: str = key("sensor", Choice("sensor", "black", "none"))
+    bits: int = key(12, of="bits")
+    black_level_dn: int = key(240, limits.BLACK_LEVEL, of="black_level_dn")
+    white_level_dn: int = key(4095, limits.WHITE_LEVEL, of="white_level_dn")
+    pattern: str = key("RGGB", of="pattern")
+    clip: str = key("sensor", of="sensor_clip")
     saturated: str = key("auto", Choice("noisy", "white", "auto"))
-    dark_offset: str = key("removed", Choice("removed", "kept"))
+    dark_offset: str = key("removed", of="dark_offset")
     units: Any = key("image", NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"))
     levels: str = key("given", Choice("given", "source"))
 
@@ -422,9 +381,6 @@ class NoiseConfig(EffectGroup):
         offset of the variance a * x + b
     negative_variance
         profiles whose variance at black is negative: refuse them, or clip the variance at 0
-    law
-        distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times
-        a plus a normal distribution of variance b
     iso
         ISO at which a physical profile is used, in place of scene.iso
     scatter
@@ -469,9 +425,9 @@ class NoiseConfig(EffectGroup):
         None, limits.VARIANCE_OFFSET, TWO_NUMBERS, unit="DN², or 1 with units=normalized", null="a physical profile"
     )
     negative_variance: str = key("refuse", Choice("refuse", "clip"), TWO_NUMBERS)
-    law: str = key("gaussian", Choice("gaussian", "poisson"), CHOSEN)
+    law: str = key("gaussian", section=CHOSEN, of="noise_law")
     iso: Any = key(None, limits.ISO, CHOSEN, null="the ISO of the scene")
-    scatter: str = key("off", limits.SCATTER, CHOSEN)
+    scatter: str = key("off", Choice("off", "unit"), CHOSEN)
     levels: Any = key(None, limits.LEVELS, CHOSEN, null="one level, as the profile has it")
     draws: int = key(1, Integers(1, limits.MAX_LEVELS), CHOSEN)
     dark_frames: Optional[str] = key(
@@ -521,24 +477,15 @@ class SceneConfig(Group):
     ----------
     name
         name of the scene, recorded in each row
-    iso
-        ISO of a physical noise profile
-    exposure_s
-        exposure time
-    temperature_c
-        temperature of the sensor
-    exposure_ratio
-        number by which the light of the photograph is divided: 100 leaves a hundredth; the frames are not
-        brightened afterwards
     light
         light of the scene, used by gains.light=scene
     """
 
     name: str = key("daylight", limits.NAME)
-    iso: Any = key(100, limits.ISO)
-    exposure_s: Any = key(0.001, limits.EXPOSURE_S, unit="seconds")
-    temperature_c: Any = key(25, limits.TEMPERATURE_C, unit="degrees Celsius")
-    exposure_ratio: Any = key(1, limits.EXPOSURE_RATIO)
+    iso: Any = key(100, limits.ISO, of="iso")
+    exposure_s: Any = key(0.001, limits.EXPOSURE_S, of="exposure_s")
+    temperature_c: Any = key(25, limits.TEMPERATURE_C, of="temperature_c")
+    exposure_ratio: Any = key(1, limits.EXPOSURE_RATIO, of="exposure_ratio")
     light: Any = key("daylight", limits.SCENE_LIGHT, null="not stated")
 
 
@@ -583,14 +530,9 @@ class OutputConfig(Group):
 
     Attributes
     ----------
-    dtype
-        type of the arrays: uint16 in DN, or float32 with 0 at black and 1 at white, not rounded
     clean_dtype
         type of clean frames: float32 stores the unrounded mean, 0 at black and 1 at white, next to noisy frames
         in uint16
-    layout
-        layout of the arrays: mosaic is [H, W], packed is [4, H/2, W/2] with planes R, G of red rows, G of blue
-        rows, B
     pairs_per_shard
         sources per shard, the unit of work and of a retry
     targets
@@ -599,9 +541,9 @@ class OutputConfig(Group):
         store frames; false writes a manifest only, as the verb manifest does: ug.LivePairs makes the pairs of it
     """
 
-    dtype: str = key("uint16", Choice("uint16", "float32"))
-    clean_dtype: Optional[str] = key(None, Choice("uint16", "float32"), null="the type of dtype")
-    layout: str = key("mosaic", Choice("mosaic", "packed"))
+    dtype: str = key("uint16", of="dtype")
+    clean_dtype: Optional[str] = key(None, FIELDS["dtype"].limit, null="the type of dtype")
+    layout: str = key("mosaic", of="layout")
     pairs_per_shard: int = key(8, Integers(1, 10**6))
     targets: tuple[str, ...] = key((), limits.TARGET_NAMES)
     frames: bool = key(True, limits.BOOLEAN)
@@ -656,11 +598,6 @@ class Config(Group):
 
     Attributes
     ----------
-    seed
-        seed of all random streams
-    accuracy
-        accuracy tier: reference is computed by NumPy and is slow, exact gives the same DN, fast is less exact for noise
-        with two numbers
     split
         shares of named parts of the dataset, such as {train: 0.8, val: 0.1, test: 0.1}; the column split names the
         part of each image, which depends on seed and file only: patches, noise levels and frames of a clip stay
@@ -689,8 +626,8 @@ class Config(Group):
     output: OutputConfig = field(default_factory=OutputConfig)
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
     body: BodyConfig = field(default_factory=BodyConfig)
-    seed: int = key(0, Integers(0, 2**63 - 1))
-    accuracy: str = key(EXACT, Choice(*TIERS))
+    seed: int = key(0, of="seed")
+    accuracy: str = key(EXACT, of="accuracy")
     split: Any = key(None, limits.SPLIT, null="no splits")
     out: str = key("ds", limits.OUTPUT_PLACE, decides_data=False)
     n_jobs: int = key(-1, Integers(1, 1024, other=-1, remark=" or -1 for one per core"), decides_data=False)

@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
 
@@ -21,9 +20,8 @@ from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import (
     GROUPS,
     Config,
-    all_settings,
 )
-from unprocess_gen.config.settings import Setting, settings_of
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, one_of
 from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_mapping, read_yaml_text
@@ -35,30 +33,15 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
-def _keys(chosen: Callable[[Setting], bool]) -> dict[str, tuple[str, ...]]:
-    """Return the keys of each group whose settings a condition chooses; groups without such keys are left out."""
-    keys: dict[str, tuple[str, ...]] = {}
-    for group, name, setting in all_settings():
-        if chosen(setting):
-            keys[group] = (*keys.get(group, ()), name)
-    return keys
-
-
-NOT_DATA = _keys(lambda setting: not setting.decides_data)
-"""Keys that do not decide the bytes of a dataset, by group; ``config.yaml`` omits them."""
-
-NOT_RECORDED = tuple(
-    group
-    for group, kind in GROUPS.items()
-    if {field.name for field in dataclasses.fields(kind)} == set(NOT_DATA.get(group, ()))
-)
-"""Groups of which no key decides data; ``config.yaml`` omits them."""
-
-_OMITTED = {kind: NOT_DATA.get(group, ()) for group, kind in GROUPS.items()}
-_OMITTED[Config] = (*NOT_DATA[""], *NOT_RECORDED)
-
-NUMBER_KEYS = _keys(lambda setting: setting.limit.is_float and setting.decides_data)
-"""Keys whose numbers are written as floats, because users may write 1 or 1.0."""
+def data_keys(group: Any) -> tuple[str, ...]:
+    """Keys of a dataclass of the schema that decide the bytes of a dataset; ``config.yaml`` omits the others."""
+    settings = settings_of(group)
+    inner = {field.name: field.default_factory for field in dataclasses.fields(group) if field.name not in settings}
+    return tuple(
+        field.name
+        for field in dataclasses.fields(group)
+        if (settings[field.name].decides_data if field.name in settings else data_keys(cast(Any, inner[field.name])))
+    )
 
 
 SOURCE_KINDS = ("folder", "synthetic", "raw")
@@ -73,47 +56,31 @@ def source_kind(config: Config) -> str:
 
 def dataset_yaml(config: Config) -> str:
     """Return the text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
-    settings = _canonical_settings(config)
+    settings = recorded(config)
+    settings["source"] |= {"kind": source_kind(config), "patch": canonical_patch(config.source)}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
 
 
-def _canonical_settings(config: Config) -> dict[str, Any]:
-    """Return the keys that decide the bytes of a dataset, as mappings."""
-    settings: dict[str, Any] = recorded(config)
-    settings["source"] |= {"kind": source_kind(config), "patch": canonical_patch(config.source)}
-    for group, keys in NUMBER_KEYS.items():
-        place = functools.reduce(lambda mapping, name: mapping.get(name, {}), group.split("."), settings)
-        place |= {key: _canonical(value) for key, value in place.items() if key in keys}
-    return settings
+def recorded(value: Any, is_float: bool = False) -> Any:
+    """Return a value of a config as ``config.yaml`` has it: mappings, lists, and numbers of one type.
 
-
-def recorded(group: Any) -> Any:
-    """Return a dataclass of the schema as mappings, without keys that ``config.yaml`` omits."""
-    if isinstance(group, list | tuple):
-        return [recorded(item) for item in group]
-    if isinstance(group, dict):
-        return {name: recorded(value) for name, value in group.items()}
-    if not dataclasses.is_dataclass(group) or isinstance(group, type):
-        return group
-    settings = settings_of(group)
-    mapping: dict[str, Any] = {}
-    for field in dataclasses.fields(group):
-        setting, value = settings.get(field.name), getattr(group, field.name)
-        if field.name not in NOT_RECORDED if setting is None else setting.decides_data:
-            mapping[field.name] = recorded(value)
-    return mapping
-
-
-def _canonical(value: Any) -> Any:
+    Floats are written as floats (``is_float``), because users may write 1 or 1.0.
+    """
     if isinstance(value, list | tuple):
-        return [_canonical(item) for item in value]
-    return float(value) if is_number(value) else value
+        return [recorded(item, is_float) for item in value]
+    if isinstance(value, dict):
+        return {name: recorded(item) for name, item in value.items()}
+    if dataclasses.is_dataclass(value):
+        settings, group = settings_of(value), cast(type[Any], type(value))
+        numbers = {name for name, setting in settings.items() if setting.limit.is_float}
+        return {name: recorded(getattr(value, name), name in numbers) for name in data_keys(group)}
+    return float(value) if is_float and is_number(value) else value
 
 
 def read_dataset_yaml(path: AnyPath) -> tuple[Config, str]:
     """Read the ``config.yaml`` of a dataset: the config, and the kind of its source.
 
-    Keys of `NOT_DATA` have their defaults. ConfigError, with the file, unless `check_values` accepts the config.
+    Keys that do not decide data have their defaults. ConfigError, with the file, unless `check_values` accepts it.
     """
     try:
         config, kind = parse_dataset_yaml(read_yaml_text(path))
@@ -145,9 +112,8 @@ def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
     """Return a dataclass of the schema from a mapping; ``prefix`` is its dotted path, with a dot at the end."""
     if not isinstance(loaded, dict):
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
-    omitted = _OMITTED.get(group, ())
-    fields = {field.name: field for field in dataclasses.fields(group) if field.name not in omitted}
-    missing, unknown = fields.keys() - loaded.keys(), loaded.keys() - fields.keys()
+    fields = set(data_keys(group))
+    missing, unknown = fields - loaded.keys(), loaded.keys() - fields
     for problem, keys in (("missing", missing), ("unknown", unknown)):
         if keys:
             raise ConfigError(f"{problem} key {', '.join(prefix + key for key in sorted(keys))[:200]}")

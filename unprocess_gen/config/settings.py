@@ -1,7 +1,7 @@
 """Describe settings: `key` declares a field of the schema, `settings_of` returns what it declared.
 
-The field's metadata has the description, whose words are those of the docstring of the group (`documented`). Checks and
-messages (`validation`), ``--help`` and ``docs/reference/settings.md`` read it. OmegaConf ignores the metadata.
+The field's metadata has the description. Its words are those of the plan's field, or of the docstring of the group
+(`documented`). Checks and messages (`validation`), ``--help`` and ``docs/reference/settings.md`` read it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import Limit
+from unprocess_gen.simulation.plan import FIELDS
 
 METADATA = "setting"
 """Key of a field's metadata that holds its `Setting`."""
@@ -57,8 +58,15 @@ class Setting:
             raise ConfigError(f"{key}={self.limit.shown(value)}: expected {self.allowed}")
 
 
-def key(default: Any, limit: Limit, section: str = "", **details: Any) -> Any:
-    """Return a field of the schema with its description; ``details`` are other fields of `Setting`."""
+def key(default: Any, limit: Limit | None = None, section: str = "", of: str = "", **details: Any) -> Any:
+    """Return a field of the schema with its description; ``details`` are other fields of `Setting`.
+
+    A key ``of`` a field of the plan has the field's meaning, unit and allowed values, unless others are given.
+    """
+    if of:
+        field = FIELDS[of]
+        limit, details = limit or field.limit, {"meaning": field.meaning, "unit": field.unit, **details}
+    assert limit is not None
     return dataclasses.field(default=default, metadata={METADATA: Setting(limit, section=section, **details)})
 
 

@@ -30,7 +30,6 @@ from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, M
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.raw_validation import check_raw_source
 from unprocess_gen.config.schema import (
-    PHYSICAL,
     CameraConfig,
     Config,
     EffectsConfig,
@@ -48,9 +47,6 @@ from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
-
-CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
-"""Settings that `noise_validation` checks if the noise profile uses them."""
 
 SWITCHES = tuple(
     name for name, setting in settings_of(EffectsConfig).items() if setting.limit is SWITCH and name != "all"
@@ -100,16 +96,15 @@ def _check_values(config: Config) -> None:
 
 
 def _check_settings(config: Config) -> None:
-    """Check each value against the limit that the schema declares for it, except values that the profile ignores."""
-    physical = is_physical(config.noise)
+    """Check each value against the limit that the schema declares for it, whether it is used or not."""
     for group, name, setting in all_settings():
         values = operator.attrgetter(group)(config) if group else config
         key, value, limit = f"{group}.{name}".lstrip("."), getattr(values, name), setting.limit
-        if key in CHECKED_WHERE_USED or (setting.section == PHYSICAL and not physical):
+        if value is None and setting.null:
             continue
-        if isinstance(limit, Drawn) and not (value is None and setting.null):
+        if isinstance(limit, Drawn):
             parse_drawn(key, value, limit)
-        elif isinstance(limit, LevelRange) and group == "sensor":
+        elif isinstance(limit, LevelRange):
             limit.check_in(key, value, values)
         else:
             setting.check(key, value)

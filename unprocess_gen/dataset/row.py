@@ -78,90 +78,60 @@ RELATIVE_PATH = Limit("a path below the source folder, relative and without .. s
 class Region(PlanRecord, frozen=True):
     """Size of the frames of a pair, and their place in the full frame."""
 
+    # fmt: off
     width: Annotated[int, Field("width of the frame; packed planes have half of it", SIDE, "pixels")]
     height: Annotated[int, Field("height of the frame; packed planes have half of it", SIDE, "pixels")]
     patch: Annotated[int, Field("number of the patch in its image, from 0", COORDINATE, needs=PATCHES)] = 0
-    patch_y: Annotated[
-        int, Field("first row of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)
-    ] = 0
-    patch_x: Annotated[
-        int, Field("first column of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)
-    ] = 0
+    patch_y: Annotated[int, Field(
+        "first row of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)] = 0
+    patch_x: Annotated[int, Field(
+        "first column of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)] = 0
+    # fmt: on
 
 
 class Origin(PlanRecord, frozen=True, kw_only=True):
     """Source of a row, its state, and the part of it that the frames show."""
 
-    key: Annotated[
-        str,
-        Field(
-            "source index as eight digits, then number of patch, level and draw if there are several",
-            KEY_TEXT,
-            empty_if="",
-        ),
-    ]
-    source: Annotated[
-        str, Field("path below the source folder, percent-encoded where unsafe", RELATIVE_PATH, empty_if="")
-    ]
+    # fmt: off
+    key: Annotated[str, Field(
+        "source index as eight digits, then number of patch, level and draw if there are several", KEY_TEXT,
+        empty_if="")]
+    source: Annotated[str, Field(
+        "path below the source folder, percent-encoded where unsafe", RELATIVE_PATH, empty_if="")]
     source_sha256: Annotated[str, Field("SHA-256 of the source's bytes", HEX_256, empty_if="the source cannot be read")]
-    source_bytes: Annotated[
-        int | None,
-        Field("size of the source; 0 for a synthetic picture", COUNT, "bytes", empty_if="there is no readable file"),
-    ]
-    status: Annotated[
-        str,
-        Field(
-            "ok, failed if the source could not be used, or filtered if source.min_side leaves it out (other "
-            "cells are then as for failed)",
-            Choice("ok", "failed", "filtered"),
-            empty_if="",
-        ),
-    ] = "ok"
-    reason: Annotated[
-        str, Field("reason of the status", Text("[a-z0-9_]*", "a reason such as corrupt"), empty_if="the status is ok")
-    ] = ""
+    source_bytes: Annotated[int | None, Field(
+        "size of the source; 0 for a synthetic picture", COUNT, "bytes", empty_if="there is no readable file")]
+    status: Annotated[str, Field(
+        "ok, failed if the source could not be used, or filtered if source.min_side leaves it out (other cells are "
+        "then as for failed)", Choice("ok", "failed", "filtered"), empty_if="")] = "ok"
+    reason: Annotated[str, Field(
+        "reason of the status", Text("[a-z0-9_]*", "a reason such as corrupt"), empty_if="the status is ok")] = ""
     detail: Annotated[str, Field("explanation of the reason, one line", ANY_TEXT, empty_if="the status is ok")] = ""
     region: Region | None = None
-    orientation: Annotated[
-        int | None, Field("EXIF orientation that was applied to the source, 1 to 8", Integers(1, 8))
-    ] = None
+    orientation: Annotated[int | None, Field(
+        "EXIF orientation that was applied to the source, 1 to 8", Integers(1, 8))] = None
     shard: Annotated[int, Field("number of the shard", Integers(0, 10**9), empty_if="")]
     clip: Annotated[str, Field("name of the clip", ANY_TEXT, needs=CLIPS)] = ""
+    # fmt: on
 
 
 class Measured(PlanRecord, frozen=True, kw_only=True):
     """Results that were computed from a pair."""
 
-    dark_variance_dn2: Annotated[
-        float,
-        Field(
-            "noise variance of a site at black, by all simulated effects except hot pixels, dead pixels and "
-            "rounding; ug.noise_std uses it",
-            FINITE,
-            "DN²",
-        ),
-    ]
+    # fmt: off
+    dark_variance_dn2: Annotated[float, Field(
+        "noise variance of a site at black, by all simulated effects except hot pixels, dead pixels and rounding; "
+        "ug.noise_std uses it", FINITE, "DN²")]
     clean_xxh3: Annotated[str, Field("XXH3-128 of the clean array's little-endian bytes", HEX_128, needs=FRAMES)]
     noisy_xxh3: Annotated[str, Field("XXH3-128 of the noisy array's little-endian bytes", HEX_128, needs=FRAMES)]
-    targets: Annotated[
-        str,
-        Field(
-            f"the stored target with dtype and XXH3-128: {LINEAR_RGB}:float32:…",
-            Text(f"({LINEAR_RGB}:float32:[0-9a-f]{{32}})?", "name:dtype:digest of a target"),
-            needs=STORED_TARGETS,
-        ),
-    ] = ""
+    targets: Annotated[str, Field(
+        f"the stored target with dtype and XXH3-128: {LINEAR_RGB}:float32:…",
+        Text(f"({LINEAR_RGB}:float32:[0-9a-f]{{32}})?", "name:dtype:digest of a target"), needs=STORED_TARGETS)] = ""
     counts: Annotated[Counts | None, FRAMES]
-    source_noise_dn: Annotated[
-        float | None,
-        Field(
-            "estimated noise of the source itself, in the green plane of the clean frame",
-            Numbers(0),
-            "DN",
-            needs=FOUND_FILES,
-            empty_if=f"{FAILED}, or no tile of 32 x 32 pixels is free of clipping",
-        ),
-    ]
+    source_noise_dn: Annotated[float | None, Field(
+        "estimated noise of the source itself, in the green plane of the clean frame", Numbers(0), "DN",
+        needs=FOUND_FILES, empty_if=f"{FAILED}, or no tile of 32 x 32 pixels is free of clipping")]
+    # fmt: on
 
 
 AFTER = {

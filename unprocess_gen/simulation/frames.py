@@ -43,20 +43,17 @@ class Counts(PlanRecord, frozen=True):
     an exposure ratio.
     """
 
+    # fmt: off
     clean_clipped_low: Annotated[int, _sites("clean sites below black before clipping")]
     clean_clipped_high: Annotated[int, _sites("clean sites above white before clipping")]
     noisy_clipped_low: Annotated[int, _sites("noisy sites below the lowest DN before clipping")]
     noisy_clipped_high: Annotated[int, _sites("noisy sites above the highest DN before clipping")]
     saturated: Annotated[int, _sites("clean sites at the white level")]
     zero_variance: Annotated[int, _sites("sites at which the noise has no variance")]
-    light_clipped_high: Annotated[
-        int | None,
-        _sites(
-            "sites whose light is above white before the exposure ratio divides it",
-            needs=DIVIDED_LIGHT,
-            empty_if=f"{FAILED}, or exposure_ratio is 1",
-        ),
-    ] = None
+    light_clipped_high: Annotated[int | None, _sites(
+        "sites whose light is above white before the exposure ratio divides it", needs=DIVIDED_LIGHT,
+        empty_if=f"{FAILED}, or exposure_ratio is 1")] = None
+    # fmt: on
 
 
 @dataclass(frozen=True, slots=True)

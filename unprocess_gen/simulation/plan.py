@@ -7,7 +7,7 @@ parameter is a new field.
 """
 
 import functools
-from typing import Annotated, Any, NamedTuple, Self, get_type_hints
+from typing import Annotated, Any, NamedTuple, Self, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -133,10 +133,12 @@ def _known(record: PlanRecord, values: dict[str, Any]) -> dict[str, Any]:
 class Place(PlanRecord, frozen=True):
     """Numbers that select the random values of a frame of an image; ``epoch`` numbers those of live pairs."""
 
+    # fmt: off
     frame: Annotated[int, Field("number of the frame in its clip, from 0", COORDINATE, needs=CLIPS)] = 0
     level: Annotated[int, Field("number of the noise level, from 0", Integers(0, 99), needs=NOISY_FRAMES)] = 0
     draw: Annotated[int, Field("number of the draw at this level, from 0", Integers(0, 99), needs=NOISY_FRAMES)] = 0
     epoch: int = 0
+    # fmt: on
 
     @property
     def frame_word(self) -> int:
@@ -147,40 +149,27 @@ class Place(PlanRecord, frozen=True):
 class CameraPlan(PlanRecord, frozen=True, kw_only=True):
     """Colours and gains of the camera."""
 
+    # fmt: off
     camera: Annotated[str, Field("convex, or the name of the camera", ANY_TEXT)]
-    weights: Annotated[
-        tuple[float, float, float, float],
-        Field(
-            "weights of the cameras in the mix",
-            SHARE,
-            columns={
-                f"w_{camera}": "weight of this camera in the mix; 0 if it is not part of it"
-                for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
-            },
-        ),
-    ]
-    rgb2cam: Annotated[
-        tuple[float, float, float, float, float, float, float, float, float],
-        Field(
-            "matrix from linear sRGB to the camera, whose rows sum to 1",
-            Numbers(-1e10, 1e10),
-            columns={
-                f"rgb2cam_{i}{j}": f"matrix from linear sRGB to the camera, row {i}, column {j}"
-                for i in range(3)
-                for j in range(3)
-            },
-        ),
-    ]
+    weights: Annotated[tuple[float, float, float, float], Field(
+        "weights of the cameras in the mix", SHARE,
+        columns={
+            f"w_{camera}": "weight of this camera in the mix; 0 if it is not part of it"
+            for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
+        })]
+    rgb2cam: Annotated[tuple[float, float, float, float, float, float, float, float, float], Field(
+        "matrix from linear sRGB to the camera, whose rows sum to 1", Numbers(-1e10, 1e10),
+        columns={
+            f"rgb2cam_{i}{j}": f"matrix from linear sRGB to the camera, row {i}, column {j}"
+            for i in range(3) for j in range(3)
+        })]
     light: Annotated[str, Field("light from which the white-balance gains follow", ANY_TEXT, needs=LIGHTS)] = ""
-    cct_k: Annotated[
-        float,
-        Field("correlated colour temperature of the light", Numbers(1000, 25000), "K", needs=LIGHTS, blank=True),
-    ] = 0.0
+    cct_k: Annotated[float, Field(
+        "correlated colour temperature of the light", Numbers(1000, 25000), "K", needs=LIGHTS, blank=True)] = 0.0
     red_gain: Annotated[float, Field("forward white-balance gain of red", GAIN)]
     blue_gain: Annotated[float, Field("forward white-balance gain of blue", GAIN)]
-    inverse_rgb_gain: Annotated[
-        float, Field("inverse of the brightening gain; all channels are multiplied by it", GAIN)
-    ]
+    inverse_rgb_gain: Annotated[float, Field("inverse of the brightening gain; the image is multiplied by it", GAIN)]
+    # fmt: on
 
     @property
     def inverse_gains(self) -> tuple[float, float, float]:
@@ -191,16 +180,16 @@ class CameraPlan(PlanRecord, frozen=True, kw_only=True):
 class IspPlan(PlanRecord, frozen=True):
     """Processing that is inverted."""
 
-    tone: Annotated[str, Field("inverted tone curve: smoothstep or none", Choice("smoothstep", "none"))]
-    gamma: Annotated[float | str, Field("inverted gamma: a number or srgb", GAMMA)]
-    highlight: Annotated[
-        str,
-        Field("preservation of highlights: per_channel, gray_mean or none", Choice("per_channel", "gray_mean", "none")),
-    ] = "per_channel"
-    highlight_threshold: Annotated[
-        float,
-        Field("linear signal above which highlights are preserved, 1 is white", Numbers(0, 1, open_high=True)),
-    ] = 0.9
+    # fmt: off
+    tone: Annotated[str, Field("tone curve that is inverted", Choice("smoothstep", "none"))]
+    gamma: Annotated[float | str, Field(
+        "exponent that is inverted, or srgb for the piecewise curve of IEC 61966-2-1", GAMMA)]
+    highlight: Annotated[str, Field(
+        "how highlights are preserved: per_channel as in the article, gray_mean as in the code of Brooks et al., none",
+        Choice("per_channel", "gray_mean", "none"))] = "per_channel"
+    highlight_threshold: Annotated[float, Field(
+        "linear signal above which highlights are preserved; 1 is white", Numbers(0, 1, open_high=True))] = 0.9
+    # fmt: on
 
 
 def _of_raw(meaning: str, limit: Limit, unit: str = "", stated: bool = False) -> Field:
@@ -212,41 +201,30 @@ def _of_raw(meaning: str, limit: Limit, unit: str = "", stated: bool = False) ->
 class SourcePlan(PlanRecord, frozen=True):
     """Preparation of the source's pixels; the fields of raw sources have their defaults for photographs."""
 
-    downscale: Annotated[
-        int, Field("side of the squares of source pixels that were averaged", Integers(1, 64), "pixels")
-    ]
-    dequantize: Annotated[
-        str,
-        Field("dequantization of 8-bit codes: off, dither or dither_all", Choice("off", "dither", "dither_all")),
-    ]
-    shrink: Annotated[
-        int,
-        _of_raw(
-            "of a raw source, side of the cells whose sites of one colour were averaged; 1: the mosaic itself",
-            Integers(1, 2),
-        ),
-    ] = 0
+    # fmt: off
+    downscale: Annotated[int, Field(
+        "side of the squares whose mean becomes one pixel of 16 bits; 2 removes JPEG artefacts, as Brooks et al. did",
+        Integers(1, 64), "pixels")]
+    dequantize: Annotated[str, Field(
+        "dither moves 8-bit codes by up to half a code at random, so that gray areas have more than 256 raw levels; "
+        "0, 255 and highlights keep their codes; dither_all moves highlights too, and code 254 up to white",
+        Choice("off", "dither", "dither_all"))]
+    shrink: Annotated[int, _of_raw(
+        "of raw sources: 2 takes the mean of the sites of each colour in cells of 2 x 2 sites, one pixel of camera "
+        "RGB from which a new mosaic is sampled; 1 keeps the mosaic", Integers(1, 2))] = 0
     raw_pattern: Annotated[str, _of_raw("CFA pattern of the raw file", Choice(*BAYER))] = ""
     raw_black_dn: Annotated[Levels, _of_raw(_FILE_LEVELS.format("black"), LEVELS, "DN of the file")] = ()
     raw_white_dn: Annotated[Levels, _of_raw(_FILE_LEVELS.format("white"), LEVELS, "DN of the file")] = ()
     mosaic_xxh3: Annotated[str, _of_raw("XXH3-128 of the mosaic that the raw file was decoded to", HEX_128)] = ""
     source_iso: Annotated[float, _of_raw("ISO of the raw file", Numbers(0, 1e9), stated=True)] = 0.0
-    source_exposure_s: Annotated[
-        float, _of_raw("exposure time of the raw file", Numbers(0, 1e7), "seconds", stated=True)
-    ] = 0.0
-    own_a_dn: Annotated[
-        float,
-        _of_raw(
-            "noise of the raw source itself in the clean frame, whose variance is own_a_dn (x - black) + own_b_dn2",
-            Numbers(0),
-            "DN",
-            stated=True,
-        ),
-    ] = 0.0
-    own_b_dn2: Annotated[
-        float,
-        _of_raw("variance at black of the raw source itself in the clean frame", Numbers(0), "DN²", stated=True),
-    ] = 0.0
+    source_exposure_s: Annotated[float, _of_raw(
+        "exposure time of the raw file", Numbers(0, 1e7), "seconds", stated=True)] = 0.0
+    own_a_dn: Annotated[float, _of_raw(
+        "noise of the raw source itself in the clean frame, whose variance is own_a_dn (x - black) + own_b_dn2",
+        Numbers(0), "DN", stated=True)] = 0.0
+    own_b_dn2: Annotated[float, _of_raw(
+        "variance at black of the raw source itself in the clean frame", Numbers(0), "DN²", stated=True)] = 0.0
+    # fmt: on
 
     @property
     def is_raw(self) -> bool:
@@ -277,20 +255,20 @@ class SensorPlan(PlanRecord, frozen=True):
     Sites at a full well keep the noise behind it with ``saturated_as="white"``, and count as saturated.
     """
 
-    pattern: Annotated[str, Field("CFA pattern of the top-left 2x2 sites, or MONO", Choice(*BAYER, "MONO"))]
-    bits: Annotated[int, Field("bits per sample of the sensor", Integers(1, 16))]
-    black_level_dn: Annotated[int, Field("black level", Integers(0, 65534), "DN")]
-    white_level_dn: Annotated[int, Field("white level (saturation)", Integers(1, 65535), "DN")]
-    sensor_clip: Annotated[
-        str, Field("clipping of the noisy frame: sensor, black or none", Choice("sensor", "black", "none"))
-    ] = "sensor"
-    saturated_as: Annotated[
-        str,
-        Field(
-            "noisy sites whose clean site is saturated: noisy, or white where the converter ends",
-            Choice("noisy", "white"),
-        ),
-    ] = "noisy"
+    # fmt: off
+    pattern: Annotated[str, Field(
+        "CFA pattern of the top-left 2x2 sites, row by row; MONO has no filters: sites record the mean of the channels",
+        Choice(*BAYER, "MONO"))]
+    bits: Annotated[int, Field("bits per sample", Integers(1, 16))]
+    black_level_dn: Annotated[int, Field("black level, the value without light", Integers(0, 65534), "DN")]
+    white_level_dn: Annotated[int, Field("white level, the value at saturation", Integers(1, 65535), "DN")]
+    sensor_clip: Annotated[str, Field(
+        "clipping of noisy frames: sensor at 0 and 2^bits - 1, black at the black level instead of 0, none only with "
+        "float32", Choice("sensor", "black", "none"))] = "sensor"
+    saturated_as: Annotated[str, Field(
+        "noisy sites whose clean site is saturated: noisy, or white where the converter ends",
+        Choice("noisy", "white"))] = "noisy"
+    # fmt: on
 
     @property
     def span_dn(self) -> int:
@@ -301,8 +279,12 @@ class SensorPlan(PlanRecord, frozen=True):
 class ScenePlan(PlanRecord, frozen=True):
     """Light of the scene."""
 
+    # fmt: off
     scene: Annotated[str, Field("name of the scene", ANY_TEXT)]
-    exposure_ratio: Annotated[float, Field("divisor of the light in the photograph", Numbers(1e-4, 1e7))]
+    exposure_ratio: Annotated[float, Field(
+        "divisor of the light in the photograph: 100 leaves a hundredth; frames are not brightened afterwards",
+        Numbers(1e-3, 1e6))]
+    # fmt: on
 
     @property
     def exposure(self) -> float:
@@ -313,46 +295,25 @@ class ScenePlan(PlanRecord, frozen=True):
 class NoisePlan(PlanRecord, frozen=True):
     """Noise profile, its variance, and the effects that are simulated."""
 
+    # fmt: off
     noise: Annotated[str, Field("name of the noise profile", ANY_TEXT)]
-    noise_law: Annotated[
-        str, Field("distribution of a two-parameter profile: gaussian or poisson", Choice("gaussian", "poisson"))
-    ]
-    a_dn: Annotated[
-        float,
-        Field("slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Numbers(-1e30, 1e30), "DN"),
-    ]
-    b_dn2: Annotated[
-        float,
-        Field("noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE, "DN²"),
-    ]
-    effects: Annotated[
-        tuple[str, ...],
-        Field(
-            "simulated effects, in order, separated by ;",
-            LIST,
-            blank=True,
-            empty_if=f"{FAILED}, or no effect was simulated",
-        ),
-    ] = ()
-    skipped: Annotated[
-        tuple[str, ...],
-        Field(
-            "skipped effects, each with its reason, separated by ;",
-            LIST,
-            blank=True,
-            empty_if=f"{FAILED}, or no effect was skipped",
-        ),
-    ] = ()
-    assumed: Annotated[
-        tuple[str, ...],
-        Field(
-            "assumed numbers of the profile that the simulated effects use, separated by ;",
-            LIST,
-            needs=PHYSICAL,
-            blank=True,
-            empty_if=f"{FAILED}, or no effect uses one",
-        ),
-    ] = ()
+    noise_law: Annotated[str, Field(
+        "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a "
+        "plus a normal distribution of variance b", Choice("gaussian", "poisson"))]
+    a_dn: Annotated[float, Field(
+        "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Numbers(-1e30, 1e30), "DN")]
+    b_dn2: Annotated[float, Field(
+        "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE, "DN²")]
+    effects: Annotated[tuple[str, ...], Field(
+        "simulated effects, in order, separated by ;", LIST, blank=True,
+        empty_if=f"{FAILED}, or no effect was simulated")] = ()
+    skipped: Annotated[tuple[str, ...], Field(
+        "skipped effects, each with its reason, separated by ;", LIST, blank=True,
+        empty_if=f"{FAILED}, or no effect was skipped")] = ()
+    assumed: Annotated[tuple[str, ...], Field(
+        "assumed numbers of the profile that the simulated effects use, separated by ;", LIST, needs=PHYSICAL,
+        blank=True, empty_if=f"{FAILED}, or no effect uses one")] = ()
+    # fmt: on
 
     @property
     def variance_line(self) -> tuple[float, float]:
@@ -370,184 +331,109 @@ class Physics(PlanRecord, frozen=True, kw_only=True):
     default. ``body_key`` keys the fixed patterns of a camera body (`random_streams.body_key`).
     """
 
-    iso: Annotated[float, Field("ISO of a physical profile", Numbers(0, 1e9))]
-    exposure_s: Annotated[float, Field("exposure time", Numbers(0, 1e7), "seconds")]
-    temperature_c: Annotated[float, Field("temperature of the sensor", Numbers(-300, 1000), "degrees Celsius")]
-    lens_shading: Annotated[
-        tuple[float, float, float],
-        Number(
-            "relative illumination 1 + k1 r² + k2 r⁴ + k3 r⁶ as [k1, k2, k3]; r is the distance from the centre of the "
-            "full frame, 1 in the corners",
-            Numbers(-10, 10),
-            count=3,
-            columns={f"lens_shading_{n}": f"coefficient of r^{n} in the relative illumination" for n in (2, 4, 6)},
-        ),
-    ] = (0.0, 0.0, 0.0)
-    prnu_std: Annotated[
-        float,
-        Number(
-            "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1",
-            Numbers(0, 1),
-            key_limit=Numbers(0, 0.5),
-        ),
-    ] = 0.0
-    dn_per_e: Annotated[
-        float, Number("system gain K", Numbers(0, 1e20), "DN per electron", kind=DN, by_iso=True, required=True)
-    ] = 1.0
-    dark_e: Annotated[
-        float,
-        rate(
-            "mean dark current of the exposure",
-            key="dark_e_per_s",
-            key_meaning="mean dark current at dark_reference_c",
-        ),
-    ] = 0.0
+    # fmt: off
+    iso: Annotated[float, Field("ISO of a physical noise profile", Numbers(0, 1e7, open_low=True))]
+    exposure_s: Annotated[float, Field("exposure time", Numbers(1e-7, 1e5), "seconds")]
+    temperature_c: Annotated[float, Field("temperature of the sensor", Numbers(-100, 150), "degrees Celsius")]
+    lens_shading: Annotated[tuple[float, float, float], Number(
+        "relative illumination 1 + k1 r² + k2 r⁴ + k3 r⁶ as [k1, k2, k3]; r is the distance from the centre of the "
+        "full frame, 1 in the corners", Numbers(-10, 10), count=3,
+        columns={
+            f"lens_shading_{n}": f"coefficient of r^{n} in the relative illumination"
+            for n in (2, 4, 6)
+        })] = (0.0, 0.0, 0.0)
+    prnu_std: Annotated[float, Number(
+        "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1", Numbers(0, 1),
+        key_limit=Numbers(0, 0.5))] = 0.0
+    dn_per_e: Annotated[float, Number(
+        "system gain K", Numbers(0, 1e20), "DN per electron", kind=DN, by_iso=True, required=True)] = 1.0
+    dark_e: Annotated[float, rate(
+        "mean dark current of the exposure", key="dark_e_per_s",
+        key_meaning="mean dark current at dark_reference_c")] = 0.0
     hot_pixel_share: Annotated[float, Number("fraction of hot pixels", SHARE)] = 0.0
-    hot_pixel_e: Annotated[
-        float,
-        rate(
-            "mean excess of a hot pixel in the exposure",
-            key="hot_pixel_e_per_s",
-            key_meaning="mean of the exponentially distributed current of hot pixels at dark_reference_c",
-        ),
-    ] = 0.0
-    full_well_e: Annotated[
-        float, Number("saturation capacity", Numbers(0, 1e9), "electrons", key_limit=Numbers(1, 1e9))
-    ] = 0.0
-    gain_by_colour: Annotated[
-        tuple[float, float, float],
-        Number(
-            "system gain of red, green and blue, relative to dn_per_e",
-            Numbers(0.1, 10),
-            count=3,
-            columns={
-                f"gain_{colour[0]}": f"system gain of {colour}, relative to dn_per_e"
-                for colour in ("red", "green", "blue")
-            },
-        ),
-    ] = (1.0, 1.0, 1.0)
-    read_law: Annotated[
-        str,
-        Number(
-            "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45",
-            Choice("gaussian", "tukey_lambda"),
-            key_default="gaussian",
-        ),
-    ] = "gaussian"
-    read_shape: Annotated[
-        float,
-        Number("shape of Tukey's lambda distribution", Numbers(-0.5, 10), kind=SHAPE, by_iso=True, key_default=0.0),
-    ] = 0.0
+    hot_pixel_e: Annotated[float, rate(
+        "mean excess of a hot pixel in the exposure", key="hot_pixel_e_per_s",
+        key_meaning="mean of the exponentially distributed current of hot pixels at dark_reference_c")] = 0.0
+    full_well_e: Annotated[float, Number(
+        "saturation capacity", Numbers(0, 1e9), "electrons", key_limit=Numbers(1, 1e9))] = 0.0
+    gain_by_colour: Annotated[tuple[float, float, float], Number(
+        "system gain of red, green and blue, relative to dn_per_e", Numbers(0.1, 10), count=3,
+        columns={
+            f"gain_{colour[0]}": f"system gain of {colour}, relative to dn_per_e"
+            for colour in ("red", "green", "blue")
+        })] = (1.0, 1.0, 1.0)
+    read_law: Annotated[str, Number(
+        "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45",
+        Choice("gaussian", "tukey_lambda"), key_default="gaussian")] = "gaussian"
+    read_shape: Annotated[float, Number(
+        "shape of Tukey's lambda distribution", Numbers(-0.5, 10), kind=SHAPE, by_iso=True, key_default=0.0)] = 0.0
     read_std_dn: Annotated[float, number_in_dn("standard deviation of the read noise", required=True, counter=1)] = 0.0
     row_std_dn: Annotated[float, number_in_dn("standard deviation of row offsets", counter=2)] = 0.0
-    row_correlation: Annotated[
-        float,
-        Number(
-            "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the "
-            "effect row",
-            Numbers(-0.999, 0.999),
-            optional="independent rows",
-        ),
-    ] = 0.0
+    row_correlation: Annotated[float, Number(
+        "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the effect row",
+        Numbers(-0.999, 0.999), optional="independent rows")] = 0.0
     column_std_dn: Annotated[float, number_in_dn("standard deviation of column offsets", counter=3)] = 0.0
-    column_temporal_std_dn: Annotated[
-        float,
-        number_in_dn("standard deviation of the part of column offsets that is new in every frame", counter=4),
-    ] = 0.0
-    black_error_dn: Annotated[
-        tuple[float, float, float, float],
-        Number(
-            "error of the black level",
-            FINITE,
-            "DN",
-            kind=SITES,
-            by_iso=True,
-            count=4,
-            columns={
-                f"black_error_dn_{i}{j}": f"black-level error of the 2x2 CFA pattern, row {i}, column {j}"
-                for i in range(2)
-                for j in range(2)
-            },
-        ),
-    ] = (0.0, 0.0, 0.0, 0.0)
-    dsnu_std_e: Annotated[
-        float,
-        Number(
-            "standard deviation of the dark-signal non-uniformity (DSNU), whose mean is 0",
-            Numbers(0, 1e9),
-            "electrons",
-            key_limit=Numbers(0, 1e6),
-        ),
-    ] = 0.0
+    column_temporal_std_dn: Annotated[float, number_in_dn(
+        "standard deviation of the part of column offsets that is new in every frame", counter=4)] = 0.0
+    black_error_dn: Annotated[tuple[float, float, float, float], Number(
+        "error of the black level", FINITE, "DN", kind=SITES, by_iso=True, count=4,
+        columns={
+            f"black_error_dn_{i}{j}": f"black-level error of the 2x2 CFA pattern, row {i}, column {j}"
+            for i in range(2) for j in range(2)
+        })] = (0.0, 0.0, 0.0, 0.0)
+    dsnu_std_e: Annotated[float, Number(
+        "standard deviation of the dark-signal non-uniformity (DSNU), whose mean is 0", Numbers(0, 1e9), "electrons",
+        key_limit=Numbers(0, 1e6))] = 0.0
     dead_pixel_share: Annotated[float, Number("fraction of dead pixels", SHARE)] = 0.0
-    dead_pixel_level: Annotated[
-        float,
-        Number(
-            "value of dead pixels as a fraction of the black level; part of the effect dead_pixels",
-            SHARE,
-            optional="0 DN",
-        ),
-    ] = 0.0
-    dark_offset: Annotated[str, Field("mean dark current: removed or kept", Choice("removed", "kept"))]
+    dead_pixel_level: Annotated[float, Number(
+        "value of dead pixels as a fraction of the black level; part of the effect dead_pixels", SHARE,
+        optional="0 DN")] = 0.0
+    dark_offset: Annotated[str, Field(
+        "mean of the dark current: removed as a camera does with optical-black pixels, or kept",
+        Choice("removed", "kept"))]
     sensor_unit: Annotated[str, Field("camera body", ANY_TEXT)]
     body_key: Annotated[int, Field("key of the fixed patterns, 16 hex digits", HEX_KEY)]
     fixed_pattern_in_clean: Annotated[bool, Field("1 if the clean frame has the fixed patterns too", FLAG)]
-    frame_size: Annotated[
-        tuple[int, int],
-        Field(
-            "size of the full frame, to which the lens shading belongs",
-            COORDINATE,
-            "pixels",
-            needs=SHADING,
-            blank=True,
-            columns={
-                f"frame_{side}": f"{side} of the full frame, to which the lens shading belongs"
-                for side in ("height", "width")
-            },
-        ),
-    ] = (0, 0)
+    frame_size: Annotated[tuple[int, int], Field(
+        "size of the full frame, to which the lens shading belongs", COORDINATE, "pixels", needs=SHADING, blank=True,
+        columns={
+            f"frame_{side}": f"{side} of the full frame, to which the lens shading belongs"
+            for side in ("height", "width")
+        })] = (0, 0)
+    # fmt: on
 
 
 class DarkFramePlan(PlanRecord, frozen=True):
     """Dark frame whose noise replaces that of the read-out."""
 
-    dark_frame: Annotated[
-        str, Field("SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256)
-    ]
-    shift: Annotated[
-        tuple[int, int],
-        Field(
-            "first row and column of the dark frame that the full frame uses; even",
-            COORDINATE,
-            "pixels",
-            columns={
-                f"dark_frame_{axis}": f"first {side} of the dark frame that the full frame uses; even"
-                for axis, side in (("y", "row"), ("x", "column"))
-            },
-        ),
-    ]
+    # fmt: off
+    dark_frame: Annotated[str, Field(
+        "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256)]
+    shift: Annotated[tuple[int, int], Field(
+        "first row and column of the dark frame that the full frame uses; even", COORDINATE, "pixels",
+        columns={
+            f"dark_frame_{axis}": f"first {side} of the dark frame that the full frame uses; even"
+            for axis, side in (("y", "row"), ("x", "column"))
+        })]
     dark_black_dn: Annotated[float, Field("black level of the dark frame", Numbers(0, 65535), "DN of the dark frame")]
     dark_scale: Annotated[float, Field("DN of the sensor per DN of the dark frame", Numbers(1e-9, 1e9))]
+    # fmt: on
 
 
 class OutputPlan(PlanRecord, frozen=True):
     """Format of the frames."""
 
-    dtype: Annotated[
-        str,
-        Field("dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", Choice(UINT16, FLOAT32)),
-    ] = UINT16
-    layout: Annotated[str, Field("layout of the arrays: mosaic, or packed planes", Choice(MOSAIC, PACKED))] = MOSAIC
-    clean_dtype: Annotated[
-        str,
-        Field(
-            "dtype of the clean array, if it is not that of dtype",
-            Choice(FLOAT32),
-            needs=FLOAT_CLEAN,
-            blank=True,
-            empty_if=f"{FAILED}, or the clean array has the dtype of the noisy one",
-        ),
-    ] = ""
+    # fmt: off
+    dtype: Annotated[str, Field(
+        "type of the arrays: uint16 in DN, or float32 with 0 at black and 1 at white, not rounded",
+        Choice(UINT16, FLOAT32))] = UINT16
+    layout: Annotated[str, Field(
+        "layout of the arrays: mosaic is [H, W], packed is [4, H/2, W/2] with planes R, G of red rows, G of blue "
+        "rows, B", Choice(MOSAIC, PACKED))] = MOSAIC
+    clean_dtype: Annotated[str, Field(
+        "dtype of the clean array, if it is not that of dtype", Choice(FLOAT32), needs=FLOAT_CLEAN, blank=True,
+        empty_if=f"{FAILED}, or the clean array has the dtype of the noisy one")] = ""
+    # fmt: on
 
     @property
     def normalised(self) -> bool:
@@ -599,16 +485,12 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
     ``physics`` is None for two-parameter profiles, whose one effect is ``heteroscedastic``.
     """
 
-    seed: Annotated[int, Field("seed of the run", COUNT, empty_if="")]
+    # fmt: off
+    seed: Annotated[int, Field("seed of all random streams", COUNT, empty_if="")]
     stream_key: Annotated[int, Field("key of the image's random streams, 16 hex digits", HEX_KEY)]
-    split: Annotated[
-        str,
-        Field(
-            "part of the dataset that the image belongs to",
-            Text(r"[\w-]{1,32}", "up to 32 letters, digits, _ and -"),
-            needs=SPLITS,
-        ),
-    ] = ""
+    split: Annotated[str, Field(
+        "part of the dataset that the image belongs to", Text(r"[\w-]{1,32}", "up to 32 letters, digits, _ and -"),
+        needs=SPLITS)] = ""
     place: Place = Place()
     camera: CameraPlan
     isp: IspPlan
@@ -616,10 +498,13 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
     sensor: SensorPlan
     scene: ScenePlan
     noise: NoisePlan
-    accuracy: Annotated[str, Field("accuracy tier", Choice(*TIERS))]
+    accuracy: Annotated[str, Field(
+        "accuracy tier: reference is computed by NumPy and is slow, exact gives the same DN, fast is less exact for "
+        "noise with two numbers", Choice(*TIERS))]
     physics: Annotated[Physics | None, PHYSICAL] = None
     dark: Annotated[DarkFramePlan | None, DARK_FRAMES] = None
     output: OutputPlan = OutputPlan()
+    # fmt: on
 
     @property
     def numbers(self) -> Physics:
@@ -711,3 +596,26 @@ NUMBERS: dict[str, Number] = {
     name: declared for name, (_, declared) in fields_of(Physics).items() if isinstance(declared, Number)
 }
 """Numbers of all effects by the names of their fields."""
+
+
+def _declared(record: type[msgspec.Struct]) -> dict[str, Field]:
+    """Declared fields of a record and of the records in it."""
+    fields: dict[str, Field] = {}
+    for name, (kind, declared) in fields_of(record).items():
+        parts = [part for part in (kind, *get_args(kind)) if isinstance(part, type) and issubclass(part, PlanRecord)]
+        for part in parts:
+            fields |= _declared(part)
+        if isinstance(declared, Field):
+            fields[name] = declared
+    return fields
+
+
+FIELDS = _declared(Plan)
+"""All declared fields of a plan by their names; keys of the settings refer to them."""
+
+
+def numbers_of(name: str) -> Numbers:
+    """Numbers that a field of the plan allows."""
+    limit = FIELDS[name].limit
+    assert isinstance(limit, Numbers)
+    return limit
