@@ -3,7 +3,7 @@
 Importing this module registers the schema in Hydra's ConfigStore, so that Hydra's own ``compose`` works on ``conf/``
 too. Composing leaves the state of a running Hydra application unchanged.
 
-Design: ``docs/design/composition_and_sweeps.md``.
+Design: ``docs/design/configuration.md``.
 """
 
 from __future__ import annotations
