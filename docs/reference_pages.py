@@ -133,14 +133,14 @@ def _options(group: str, options: Iterable[str], default: str) -> str:
 def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
     """Return the table of a group's keys; ``None`` stands for the branches, which have no defaults."""
     values = {} if group is None else default_values(group)
-    head = ["key", "meaning", "default", "unit", "allowed"]
+    head = ["key", "default", "unit", "allowed", "meaning"]
     rows = [
         [
             code(name),
-            setting.meaning + (f"; null: {setting.null}" if setting.null else ""),
             code(value_text(values[name])) if name in values else "",
             setting.unit,
             str(setting.limit),
+            setting.meaning + (f"; null: {setting.null}" if setting.null else ""),
         ]
         for name, setting in settings.items()
     ]

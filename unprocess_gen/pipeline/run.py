@@ -342,14 +342,14 @@ def _check_sources(
 
 
 def _change(old: Source, new: Source) -> str:
-    """How a source differs from its row in a manifest, of which the digest is compared if the listing hashed it."""
+    """Describe how a source differs from its row in a manifest; digests are compared if the listing hashed it."""
     if new.size_bytes != old.size_bytes:
         return f"has {new.size_bytes} bytes, had {old.size_bytes}"
     return "has other bytes than it had" if old.sha256 and new.sha256 not in (None, old.sha256) else ""
 
 
 def _change_of_listed(old: Source, new: Source) -> str:
-    """How a source differs from an earlier listing.
+    """Describe how a source differs from an earlier listing.
 
     A listing hashes the files that could be identical. If one of them has changed, another one can have another number
     among identical files, and so other noise.
