@@ -319,7 +319,7 @@ SWITCH_FIELDS: Fields = {
 @dataclass(frozen=True)
 @with_fields(BRANCH_FIELDS)
 class BranchConfig(EffectGroup):
-    """Hold the numbers of a physical noise profile that depend on ISO, for one range of ISO.
+    """Numbers of a physical noise profile that depend on ISO, for one range of ISO.
 
     A number may be written as a form of `forms.ISO_FORMS`.
 
@@ -594,7 +594,7 @@ class BodyConfig(Group):
 @documented
 @dataclass(frozen=True)
 class Config(Group):
-    """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level.
+    """The complete configuration of a run: a dataclass for each group, and the keys at the top level.
 
     Attributes
     ----------

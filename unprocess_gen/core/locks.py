@@ -20,7 +20,7 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
 
 class LockFile:
-    """Hold a lock from `acquire` until `release` or the end of the process; ``path`` is in a folder that exists."""
+    """A lock, held from `acquire` until `release` or the end of the process; ``path`` is in a folder that exists."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

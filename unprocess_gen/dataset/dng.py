@@ -175,7 +175,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 class Tag(NamedTuple):
-    """Hold one entry of the TIFF directory: code, type, number of values (0: length of the text) and values."""
+    """An entry of the TIFF directory: code, type, number of values (0: length of the text) and values."""
 
     code: int
     type: int

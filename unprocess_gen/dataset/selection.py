@@ -24,7 +24,7 @@ _INDEX = re.compile(r"\d{1,12}")
 
 
 class KeySelection(NamedTuple):
-    """Hold what ``--keys`` names.
+    """Source indices and keys that ``--keys`` names.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class KeySelection(NamedTuple):
 
 
 class SelectedPairs(NamedTuple):
-    """Hold selected pairs.
+    """Selected pairs of a dataset.
 
     Attributes
     ----------

@@ -54,7 +54,7 @@ def shard_name(number: int) -> str:
 
 
 class ArrayFormat(NamedTuple):
-    """Hold dtype (one of `DESCRIPTIONS`) and shape of a stored array."""
+    """Dtype (one of `DESCRIPTIONS`) and shape of a stored array."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -195,7 +195,7 @@ class ShardWriter:
 
 
 class Member(NamedTuple):
-    """Hold the byte offset and the size of a tar member's content."""
+    """Byte offset and the size of a tar member's content."""
 
     offset: int
     size: int
@@ -240,7 +240,7 @@ def map_array(path: AnyPath, member: Member, array: ArrayFormat) -> Frame:
 
 
 class ExpectedFrame(NamedTuple):
-    """Hold member, XXH3-128 and format of a frame."""
+    """Member, XXH3-128 and format of a frame."""
 
     member: str
     digest: str
@@ -260,7 +260,7 @@ def arrays_of(row: Row) -> dict[str, ExpectedFrame]:
 
 
 class ExpectedSample(NamedTuple):
-    """Hold what a shard must contain of one sample.
+    """Contents that a shard must have of one sample.
 
     ``frames`` are in the order of their members; ``json`` is the content of ``KEY.json``.
     """

@@ -38,7 +38,7 @@ PHOTOGRAPHS_FROM = "scikit-image 0.24.0, 0.25.2 and 0.26.0"
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the file of a build: for people, a title and a purpose; settings, of which ``sweep`` has several values.
+    """File of a build: for people, a title and a purpose; settings, of which ``sweep`` has several values.
 
     ``photographs`` are files that scikit-image contains; without them the sources are synthetic pictures.
     """

@@ -39,7 +39,7 @@ KEPT = 4096
 
 @dataclass(frozen=True, slots=True)
 class LiveImage:
-    """Hold all that decides a pair in epoch 0.
+    """All that decides a pair in epoch 0.
 
     Attributes
     ----------

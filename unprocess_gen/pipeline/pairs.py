@@ -34,7 +34,7 @@ from unprocess_gen.sources.patches import crop_patch, list_patches
 
 @dataclass(frozen=True, slots=True)
 class PairSettings:
-    """Hold what all pairs of a run follow from: the config, and its dark frames if it names any.
+    """Settings that all pairs of a run share: the config, and its dark frames if it names any.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class PairSettings:
 
 @dataclass(frozen=True, slots=True)
 class PlannedImage:
-    """Hold the pixels of an image and all that decides its pairs.
+    """The pixels of an image and all that decides its pairs.
 
     Attributes
     ----------

@@ -48,7 +48,7 @@ ADVICE = "restore the file, or regenerate the dataset"
 
 @dataclass(frozen=True, slots=True)
 class ReplayResult:
-    """Hold the outcome for one row.
+    """Outcome of regenerating one row.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class ReplayResult:
 
 
 class _Places(msgspec.Struct, frozen=True):
-    """Hold the places of sources and dark frames that a ``dataset.json`` records."""
+    """Places of sources and dark frames that a ``dataset.json`` records."""
 
     source: SourceFacts = SourceFacts("synthetic", None)
     dark_frames: DarkFrameFacts | None = None

@@ -54,7 +54,7 @@ class Damage:
 
 
 class SweepVerification(NamedTuple):
-    """Hold the outcome for one dataset of a sweep: its folder's name in ``sweep.csv``, and its damage."""
+    """Outcome for one dataset of a sweep: its folder's name in ``sweep.csv``, and its damage."""
 
     folder: str
     damages: tuple[Damage, ...]

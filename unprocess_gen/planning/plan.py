@@ -223,7 +223,7 @@ class Planner:
     def levels_of_key(
         self, seed: int, key: int, split: str, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int = 0
     ) -> Iterator[tuple[Plan, Selection | None]]:
-        """Yield what `levels` does for the key of an image, in an epoch."""
+        """Yield the noise levels of the image with a key, in an epoch."""
         if self._needs_dark_frames and dark_frames is None:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
@@ -317,7 +317,7 @@ DrawnNoise = tuple[NoisePlan, Physics | None, Selection | None]
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """Hold what noise levels of an image depend on, in addition to its uniforms.
+    """Facts on which the noise levels of an image depend, in addition to its uniforms.
 
     Attributes
     ----------

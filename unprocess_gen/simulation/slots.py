@@ -119,7 +119,7 @@ class SiteNoise(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """Hold the slots of a frame.
+    """The filled slots of a frame.
 
     Attributes
     ----------
