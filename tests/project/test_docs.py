@@ -14,7 +14,7 @@ import update_reference
 from helpers.datasets import Settings
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD
-from unprocess_gen.cli.help import global_help, synopsis
+from unprocess_gen.cli.help import global_help
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
@@ -22,23 +22,13 @@ from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, optio
 from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import REASONS
-from unprocess_gen.core.fields import Choice
-from unprocess_gen.dataset.columns import TYPE_NAMES
+from unprocess_gen.core.fields import value_text
 from unprocess_gen.dataset.row import COLUMNS
 
 HELP = global_help(VERBS)
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-README = PAGES[0].read_text(encoding="utf-8")
 TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-
-
-def generated(name: str) -> str:
-    """Return a page of ``docs/reference``."""
-    return (ROOT / "docs" / "reference" / f"{name}.md").read_text(encoding="utf-8")
-
-
-SETTINGS = generated("settings")
 
 
 @pytest.mark.parametrize("name", update_reference.GENERATED)
@@ -75,11 +65,6 @@ def test_every_page_is_reached_by_links_without_the_site() -> None:
 # Explanations in the code, which --help and the reference show -------------------------------------------------------
 
 
-def section(title: str) -> str:
-    """Return a group's section of the settings page, with its parts."""
-    return SETTINGS.split(f"\n## `{title}`\n" if title else "\n## Top level\n")[1].split("\n## ")[0]
-
-
 UNITS = {"_dn": "DN", "_dn2": "DN²", "_e": "electrons", "_e_per_s": "electrons per second", "_s": "seconds"}
 UNITS |= {"_c": "degrees Celsius", "_per_e": "DN per electron"}
 """First words of the unit that a name's suffix promises."""
@@ -91,16 +76,15 @@ def promised_unit(name: str) -> str:
     return next((UNITS[suffix] for suffix in sorted(UNITS, key=len, reverse=True) if name.endswith(suffix)), "")
 
 
-def test_every_setting_is_explained() -> None:
+def test_every_setting_and_column_is_explained() -> None:
+    """Generated pages list them, like the declarations below (`test_generated_files_follow_from_the_code`)."""
     kinds = (BranchConfig, ProvenanceConfig)
-    items = [("noise", name, setting) for kind in kinds for name, setting in settings_of(kind).items()]
-    for group, name, setting in [*all_settings(), *items]:
-        key = f"{group}.{name}"
-        assert setting.meaning and not setting.meaning.endswith("."), key
-        assert str(setting.limit), key
-        assert setting.unit.startswith(promised_unit(name)), key
-        outer, _, inner = group.partition(".")
-        assert f"| `{f'{inner}.' * bool(inner)}{name}` |" in section(outer), key
+    items = [(name, setting) for kind in kinds for name, setting in settings_of(kind).items()]
+    items += [(name, setting) for _, name, setting in all_settings()]
+    for name, declared in [*items, *((column.name, column) for column in COLUMNS)]:
+        assert declared.meaning and not declared.meaning.endswith("."), name
+        assert str(declared.limit), name
+        assert declared.unit.startswith(promised_unit(name)), name
 
 
 def test_settings_declare_all_keys_of_the_schema() -> None:
@@ -118,63 +102,24 @@ def test_null_is_explained_if_it_is_a_default() -> None:
 def test_default_values_are_those_of_a_composed_config(settings: Settings) -> None:
     config = settings()
     for group in ("", *GROUPS):
-        composed = getattr(config, group) if group else config
-        values = {name: getattr(composed, name) for name in settings_of(composed)}
-        written = {
-            name: type(values[name])(value) if values[name] is not None else value
-            for name, value in default_values(group).items()
-        }
-        assert written == values, group
+        values = {name: getattr(getattr(config, group) if group else config, name) for name in default_values(group)}
+        written = {name: value_text(value) for name, value in default_values(group).items()}
+        assert written == {name: value_text(value) for name, value in values.items()}, group
 
 
-def test_every_option_is_explained() -> None:
+def test_every_option_form_reason_verb_and_flag_is_explained() -> None:
     for group in (*GROUPS, *ADDED_GROUPS):
         for option in group_options(group):
-            summary = option_summary(group, option)
-            assert re.fullmatch(r"[A-Z].*\.", summary), f"{group}={option}: {summary!r}"
-            row = rf"^\| `{option}`( \(default\))? \| {re.escape(summary)} \|$"
-            assert option == "default" or re.search(row, section(group), re.MULTILINE), f"{group}={option}"
-
-
-def test_every_form_reason_and_exit_code_has_a_meaning() -> None:
-    """Generated pages list them (`test_generated_parts_follow_from_the_code`)."""
+            assert re.fullmatch(r"[A-Z].*\.", option_summary(group, option)), f"{group}={option}"
     assert all(form.meaning and form.numbers for form in [*DISTRIBUTION_FORMS.values(), *ISO_FORMS.values()])
     assert all(REASONS.values())
-
-
-def test_every_column_is_explained() -> None:
-    page = generated("columns")
-    for column in COLUMNS:
-        assert column.meaning and not column.meaning.endswith("."), column.name
-        assert column.unit.startswith(promised_unit(column.name)), column.name
-        row = rf"^\| `{column.name}`(\\\*)? \| {re.escape(column.meaning)} \| {TYPE_NAMES[column.type]} \|"
-        assert re.search(row, page, re.MULTILINE), column.name
-
-
-def test_every_verb_and_flag_is_explained() -> None:
-    page = generated("command_line")
     for verb in VERBS.values():
-        assert verb.summary and f"    {synopsis(verb)}\n" in page, verb.name
-        assert f"  {verb.name} " in HELP
-        text = page.split(f"\n## {verb.name}\n")[1].split("\n## ")[0]
-        for spelled, summary in [*((flag.spelled, flag.summary) for flag in verb.flags), *verb.keys.items()]:
-            assert summary and f"| `{spelled}` | {summary} |" in text, spelled
-        assert verb.place is None or f"| `{verb.place.metavar}` | {verb.place.expected} |" in text
-    for argument in (*STANDARD, *HYDRA_FLAGS):
-        assert f"| `{argument.spelled}` | {argument.summary} |" in page
-
-
-def test_columns_allow_every_value_that_settings_allow() -> None:
-    columns = {column.name: column.limit for column in COLUMNS}
-    pairs = {"isp.tone": "tone", "gains.highlight": "highlight", "noise.law": "noise_law", "sensor.pattern": "pattern"}
-    pairs |= {"sensor.saturated": "saturated_as", "sensor.dark_offset": "dark_offset", "sensor.clip": "sensor_clip"}
-    pairs |= {"source.dequantize": "dequantize", "output.dtype": "dtype", "output.layout": "layout"}
-    limits = {f"{group}.{name}": setting.limit for group, name, setting in all_settings()}
-    resolved = {"sensor.saturated": {"auto"}}  # rows have the value that auto selects
-    for setting, column in pairs.items():
-        limit = limits[setting]
-        assert isinstance(limit, Choice), setting
-        assert all(columns[column].allows(word) for word in {*limit.words} - resolved.get(setting, set())), setting
+        summaries = [
+            verb.summary,
+            *(flag.summary for flag in (*verb.flags, *STANDARD, *HYDRA_FLAGS)),
+            *verb.keys.values(),
+        ]
+        assert all(summaries) and f"  {verb.name} " in HELP, verb.name
 
 
 # Pages ----------------------------------------------------------------------------------------------------------------

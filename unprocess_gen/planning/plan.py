@@ -223,7 +223,7 @@ class Planner:
     def levels_of_key(
         self, seed: int, key: int, split: str, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int = 0
     ) -> Iterator[tuple[Plan, Selection | None]]:
-        """Yield the noise levels of the image with a key, in an epoch."""
+        """Yield plan and selection at each noise level, for the key of an image and an epoch."""
         if self._needs_dark_frames and dark_frames is None:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
