@@ -79,33 +79,23 @@ def test_sweep_in_a_file_equals_the_command_line(
         assert tree_hash(tmp_path / "sweep" / name) == tree_hash(swept / name)
 
 
-def test_settings_next_to_the_params_hold_for_every_job(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
-    two = {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"camera": "sony_a7r,nexus_6p"}}}}
-    write(mine / "sweep/two.yaml", {"defaults": [{"override /isp": "linear"}], "seed": 9} | two)
-    assert run_main("+sweep=two", *REST).code == 0
-    for camera in ("sony_a7r", "nexus_6p"):
-        config = yaml.safe_load((tmp_path / f"sweep/camera={camera},source.limit=1/config.yaml").read_text())
-        assert (config["seed"], config["isp"]["tone"]) == (9, "none")
+def test_settings_next_to_the_params_hold_for_every_job(mine: Path) -> None:
+    write(mine / "sweep/two.yaml", {"defaults": [{"override /isp": "linear"}], "seed": 9} | SWEEP)
+    for job in compose_jobs(["+sweep=two"], OptionFolders(own=mine)):
+        assert (job.config().seed, job.config().isp.tone) == (9, "none")
 
 
-def test_overrides_win_over_params_of_a_file(mine: Path) -> None:
+def test_overrides_win_over_params_of_a_file_and_multiply_others(mine: Path) -> None:
     write(mine / "sweep/two.yaml", SWEEP)
     assert jobs("+sweep=two", "gains.red=2.3", own=mine) == [
-        "camera=sony_a7r,gains.red=2.3", "camera=nexus_6p,gains.red=2.3",
-    ]  # fmt: skip
+        f"camera={camera},gains.red=2.3" for camera in ("sony_a7r", "nexus_6p")
+    ]
     assert jobs("+sweep=two", "camera=convex,identity", "gains.red=2.3", own=mine) == [
-        "camera=convex,gains.red=2.3", "camera=identity,gains.red=2.3",
-    ]  # fmt: skip
-
-
-def test_values_on_the_command_line_multiply_those_of_a_file(mine: Path) -> None:
-    write(mine / "sweep/two.yaml", SWEEP)
+        f"camera={camera},gains.red=2.3" for camera in ("convex", "identity")
+    ]
     assert jobs("+sweep=two", "seed=1,2", own=mine) == [
         f"{folder},seed={seed}" for seed in (1, 2) for folder in FOLDERS
     ]
-
-
-def test_all_forms_of_values_are_expanded(mine: Path) -> None:
     params = {"seed": "range(1,4)", "camera": "glob(sony*)", "source.recursive": True, "noise.draws": 2}
     write(mine / "sweep/forms.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": params}}})
     assert jobs("+sweep=forms", own=mine) == [
@@ -169,13 +159,9 @@ def test_params_in_an_option_that_the_sweep_selects_are_refused(mine: Path, run_
 
 
 def test_sweep_file_without_package_line_is_refused_with_advice(mine: Path, run_main: RunMain) -> None:
-    write(mine / "sweep/seeds.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"seed": "1,2"}}}}, header="")
+    write(mine / "sweep/seeds.yaml", SWEEP, header="")
     done = run_main("+sweep=seeds", *REST)
-    assert (done.code, done.err) == (
-        2,
-        "gen-dataset: sweep=seeds: the keys of the file are below 'sweep'; expected '# @package _global_' as its "
-        "first line\n",
-    )
+    assert (done.code, done.err.count("\n"), "expected '# @package _global_'" in done.err) == (2, 1, True)
 
 
 SHIPPED = {"iso_ladder": 5, "cameras": 4, "camera_by_iso": 20, "gain_extremes": 8, "paper_figure6": 4}
@@ -189,20 +175,10 @@ def test_shipped_sweeps_have_a_purpose_and_their_jobs(name: str) -> None:
     assert len(set(jobs(f"+sweep={name}"))) == SHIPPED[name]
 
 
-@pytest.mark.parametrize(
-    ("name", "place"),
-    [
-        ("cameras", "3/4 camera=sony_rx100"),
-        pytest.param("camera_by_iso", "3/20 camera=sony_a7r,noise=imx385_iso6400", marks=pytest.mark.slow),
-    ],
-)
-def test_shipped_sweep_runs_and_shows_its_places(
-    name: str, place: str, mine: Path, run_main: RunMain, tmp_path: Path
-) -> None:
-    done = run_main(f"+sweep={name}", "source.root=p", "out=sweep", "n_jobs=1")
-    assert done.code == 0, done.err
-    assert [row["exit"] for row in sweep_rows(tmp_path / "sweep")] == ["0"] * SHIPPED[name]
-    assert place in done.err
+def test_shipped_sweep_runs_and_shows_its_places(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("+sweep=cameras", "source.root=p", "out=sweep", "n_jobs=1")
+    assert (done.code, "3/4 camera=sony_rx100" in done.err) == (0, True), done.err
+    assert [row["exit"] for row in sweep_rows(tmp_path / "sweep")] == ["0"] * SHIPPED["cameras"]
 
 
 def test_cfg_job_prints_every_job_of_a_sweep(mine: Path, run_main: RunMain) -> None:
@@ -215,8 +191,8 @@ def test_cfg_job_prints_every_job_of_a_sweep(mine: Path, run_main: RunMain) -> N
 def test_primary_config_that_the_built_in_one_hides_is_refused(mine: Path, run_main: RunMain) -> None:
     write(mine / "config.yaml", {"seed": 3}, "")
     done = run_main("--config-dir", "mine", "--config-name", "config", "--cfg", "job")
-    assert (done.code, done.err) == (
+    assert (done.code, done.err.count("\n"), "mine/config.yaml has the name of a built-in file" in done.err) == (
         2,
-        "gen-dataset: --config-name config: mine/config.yaml has the name of a built-in file, which would be used "
-        "instead; rename the file\n",
+        1,
+        True,
     )
