@@ -13,8 +13,8 @@ from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.cli.help import synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_options, default_values
-from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
-from unprocess_gen.config.forms import spelled as spelled_form
+from unprocess_gen.config.distributions import DISTRIBUTIONS, ISO_FORMS
+from unprocess_gen.config.distributions import spelled as spelled_form
 from unprocess_gen.config.interpretation import needed_numbers
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings, group_settings
@@ -115,7 +115,7 @@ def settings_page() -> str:
     for group, contents in ADDED_GROUPS.items():
         text = f"Options for {contents}. They are added with a plus: `+{group}=OPTION`."
         blocks += [f"## `{group}`", text, _options(group, group_options(group), "")]
-    blocks += [DISTRIBUTIONS_INTRODUCTION, _forms(DISTRIBUTION_FORMS), _not_data()]
+    blocks += [DISTRIBUTIONS_INTRODUCTION, _forms(DISTRIBUTIONS), _not_data()]
     return page(*blocks)
 
 
@@ -150,7 +150,7 @@ def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
 
 def _forms(forms: Mapping[str, object]) -> str:
     rows = []
-    for name, form in {**DISTRIBUTION_FORMS, **ISO_FORMS}.items():
+    for name, form in {**DISTRIBUTIONS, **ISO_FORMS}.items():
         if name in forms:
             written = "a number" if name == "constant" else spelled_form(name, form)
             rows.append([code(written), form.meaning])

@@ -19,10 +19,8 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from unprocess_gen.config import distributions
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.distributions import parse_distribution
-from unprocess_gen.config.forms import DISTRIBUTION_FORMS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, all_settings, replaced
 from unprocess_gen.config.serialization import (
@@ -446,7 +444,3 @@ def test_choices_match_their_implementations() -> None:
 def test_every_setting_has_a_meaning_and_none_is_needed_without_docstrings() -> None:
     assert all(setting.meaning for _, _, setting in all_settings())
     subprocess.run([sys.executable, "-OO", "-c", "import unprocess_gen.config.schema"], check=True)
-
-
-def test_forms_match_their_implementations() -> None:
-    assert set(DISTRIBUTION_FORMS) == set(distributions.DISTRIBUTIONS)

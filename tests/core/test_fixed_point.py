@@ -168,7 +168,7 @@ def test_quick_draws_have_the_digits_of_decimal(law: Distribution, count: int) -
         a = math.exp(rng.uniform(-12, 3))
         found = FIXED_POINT[law.kind](uniform, a, *law.numbers)
         undecided += found is None
-        assert found in (None, DISTRIBUTIONS[law.kind](uniform, a, *law.numbers)), (uniform, a)
+        assert found in (None, DISTRIBUTIONS[law.kind].value(uniform, a, *law.numbers)), (uniform, a)
     assert undecided <= 1 + count / 1000
 
 
@@ -178,10 +178,10 @@ def test_undecided_draws_come_from_decimal(law: Distribution, monkeypatch: pytes
     monkeypatch.setattr(fixed_point, "DECIMAL_ERROR", 1 << (BITS - 40))
     for uniform in (0.3, 0.9):
         assert FIXED_POINT[law.kind](uniform, 0.01, *law.numbers) is None
-        assert draw_parameter(law, uniform, 0.01) == DISTRIBUTIONS[law.kind](uniform, 0.01, *law.numbers)
+        assert draw_parameter(law, uniform, 0.01) == DISTRIBUTIONS[law.kind].value(uniform, 0.01, *law.numbers)
 
 
 def test_draws_next_to_a_limit_are_clipped() -> None:
     law = Distribution("truncated_normal", (1.0, 0.1, 0.5, 1.5))
     for uniform in (2.0**-53, 1 - 2.0**-53):
-        assert draw_parameter(law, uniform) == distributions.DISTRIBUTIONS[law.kind](uniform, 0.0, *law.numbers)
+        assert draw_parameter(law, uniform) == distributions.DISTRIBUTIONS[law.kind].value(uniform, 0.0, *law.numbers)

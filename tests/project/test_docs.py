@@ -17,7 +17,7 @@ from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD
 from unprocess_gen.cli.help import global_help
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
-from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
+from unprocess_gen.config.distributions import DISTRIBUTIONS, ISO_FORMS
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
@@ -111,7 +111,7 @@ def test_every_option_form_reason_verb_and_flag_is_explained() -> None:
     for group in (*GROUPS, *ADDED_GROUPS):
         for option in group_options(group):
             assert re.fullmatch(r"[A-Z].*\.", option_summary(group, option)), f"{group}={option}"
-    assert all(form.meaning and form.numbers for form in [*DISTRIBUTION_FORMS.values(), *ISO_FORMS.values()])
+    assert all(form.meaning and form.numbers for form in [*DISTRIBUTIONS.values(), *ISO_FORMS.values()])
     assert all(REASONS.values())
     for verb in VERBS.values():
         summaries = [

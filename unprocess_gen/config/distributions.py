@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
-from unprocess_gen.config.forms import DISTRIBUTION_FORMS, spelled
 from unprocess_gen.config.limits import Drawn
 from unprocess_gen.config.values import refusal
 from unprocess_gen.core import fixed_point
@@ -40,7 +39,7 @@ def draw_parameter(distribution: Distribution, uniform: float, a: float = 0.0) -
         value = FIXED_POINT[kind](uniform, a, *numbers)
         if value is not None:
             return value
-    return DISTRIBUTIONS[kind](uniform, a, *numbers)
+    return DISTRIBUTIONS[kind].value(uniform, a, *numbers)
 
 
 def _constant(u: float, a: float, value: float) -> float:
@@ -87,18 +86,6 @@ def _log_linear_in_a(u: float, a: float, slope: float, intercept: float, std: fl
 def _choice(u: float, a: float, *values: float) -> float:
     """Choose one of the values with equal probability."""
     return values[int(u * len(values))]
-
-
-DISTRIBUTIONS: dict[str, Callable[..., float]] = {
-    "constant": _constant,
-    "choice": _choice,
-    "uniform": _uniform,
-    "log_uniform": _log_uniform,
-    "truncated_normal": _truncated_normal,
-    "inverse_truncated_normal": _inverse_truncated_normal,
-    "log_linear_in_a": _log_linear_in_a,
-}
-"""Each distribution as a function of a uniform in (0, 1), the slope a, and its numbers."""
 
 
 def _nearest_log_uniform(u: float, a: float, low: float, high: float) -> float | None:
@@ -174,30 +161,77 @@ def _check_line(slope: float, intercept: float, std: float) -> str | None:
     return None
 
 
-_PROBLEMS: dict[str, Callable[..., str | None]] = {
-    "constant": lambda value: None,
-    "uniform": _check_increasing,
-    "log_uniform": _check_log_range,
-    "truncated_normal": _check_truncated,
-    "inverse_truncated_normal": _check_truncated,
-    "log_linear_in_a": _check_line,
-    "choice": lambda *values: None if values else "expected at least one value",
+class Form(NamedTuple):
+    """A list ``[name, number, …]``: names of its numbers, its meaning, and how many at the end are ``optional``."""
+
+    numbers: tuple[str, ...]
+    meaning: str
+    optional: int = 0
+
+
+class Kind(NamedTuple):
+    """A distribution: its form, its value at a uniform in (0, 1), a slope a and its numbers, and their `problem`."""
+
+    numbers: tuple[str, ...]
+    meaning: str
+    value: Callable[..., float]
+    problem: Callable[..., str | None] = lambda *numbers: None
+
+
+_TRUNCATED = "mean", "standard deviation", "lowest", "highest"
+
+# fmt: off
+DISTRIBUTIONS = {
+    "constant": Kind(("value",), "a number, written without brackets", _constant),
+    "uniform": Kind(
+        ("lowest", "highest"), "each value in the range with equal probability", _uniform, _check_increasing),
+    "log_uniform": Kind(
+        ("lowest", "highest"), "a value whose logarithm is uniform", _log_uniform, _check_log_range),
+    "truncated_normal": Kind(
+        _TRUNCATED, "a normal distribution limited to a range", _truncated_normal, _check_truncated),
+    "inverse_truncated_normal": Kind(
+        _TRUNCATED, "1 divided by a draw from `truncated_normal`", _inverse_truncated_normal, _check_truncated),
+    "log_linear_in_a": Kind(
+        ("slope", "intercept", "standard deviation"),
+        "b of a noise profile: ln b = slope · ln a + intercept + standard deviation · n, where n is a standard normal "
+        "deviate", _log_linear_in_a, _check_line),
+    "choice": Kind(("value", "…"), "one of the values with equal probability", _choice,
+                   lambda *values: None if values else "expected at least one value"),
 }
-"""A function for each distribution that returns what is wrong with its numbers, or None."""
+"""Distributions that a parameter can be drawn from."""
+
+ISO_FORMS = {
+    "line": Form(
+        ("slope", "intercept", "scatter"),
+        "a gain or standard deviation x with ln x = slope · ln ISO + intercept + scatter · n (0 if it is left out), "
+        "where n is a standard normal deviate, drawn for each camera body with `noise.scatter=unit`", optional=1),
+    "by_iso": Form(
+        ("ISO", "value", "…"),
+        "values at these ISOs in ascending order; between them, gains and standard deviations are interpolated in "
+        "their logarithms, shapes and black-level errors linearly, both against ln ISO; a value of `black_error_dn` is "
+        "one number, or four: R, G of the red rows, B, G of the blue rows"),
+}
+"""Functions of ISO that the number of a branch can be; `planning.noise_profile` evaluates them."""
+# fmt: on
+
+
+def spelled(name: str, form: Form | Kind) -> str:
+    """Return a form as users write it, such as ``[uniform, lowest, highest]``."""
+    return f"[{', '.join((name, *form.numbers))}]"
 
 
 def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distribution:
     """Parse a number (kind ``constant``) or a distribution ``[kind, number, …]`` of an allowed kind."""
-    forms = "; ".join(spelled(kind, DISTRIBUTION_FORMS[kind]) for kind in allowed)
+    forms = "; ".join(spelled(kind, DISTRIBUTIONS[kind]) for kind in allowed)
     if is_number(value):
         return Distribution("constant", (float(value),))
     if not isinstance(value, list | tuple) or not value or value[0] not in allowed:
         raise refusal(key, value, f"expected a finite number or a distribution: {forms}")
     kind, numbers = str(value[0]), value[1:]
-    form = DISTRIBUTION_FORMS[kind]
+    form = DISTRIBUTIONS[kind]
     if (len(numbers) != len(form.numbers) and kind != "choice") or not all(is_number(number) for number in numbers):
         raise refusal(key, value, f"expected finite numbers: {spelled(kind, form)}")
-    problem = _PROBLEMS[kind](*numbers)
+    problem = form.problem(*numbers)
     if problem:
         raise refusal(key, value, problem)
     return Distribution(kind, tuple(float(number) for number in numbers))

@@ -175,7 +175,7 @@ WHITE_LEVEL = LevelRange(
 
 
 class IsoForm(Limit):
-    """A number, or one of `forms.ISO_FORMS`; `noise_validation` checks it."""
+    """A number, or one of `distributions.ISO_FORMS`; `noise_validation` checks it."""
 
     def __init__(self) -> None:
         super().__init__(f"a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: line, by_iso")

@@ -24,6 +24,8 @@ from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.numbers import SHAPE, SITES, Number
 from unprocess_gen.simulation.plan import EXACT, FIELDS
 
+GroupType = TypeVar("GroupType")
+
 
 class FrozenMapping(dict[str, Any]):
     """A mapping inside a config, such as ``{a: 1, b: 2}`` of ``noise.levels``."""
@@ -121,18 +123,15 @@ class SourceConfig(Group):
         the source, down to 0; the column zero_variance counts the sites where the source has as much or more
     """
 
+    # fmt: off
     root: Optional[str] = key(
-        None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic pictures", decides_data=False
-    )
+        None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic pictures", decides_data=False)
     kind: str = key("srgb", Choice("srgb", "raw"))
     list: Optional[str] = key(
-        None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False
-    )
+        None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False)
     include: Optional[tuple[str, ...]] = key(
         ("*.jpg", "*.jpeg", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
-        Limit("a list of at least one pattern such as '*.jpg'"),
-        null="the suffixes of files that kind reads",
-    )
+        Limit("a list of at least one pattern such as '*.jpg'"), null="the suffixes of files that kind reads")
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
@@ -146,6 +145,7 @@ class SourceConfig(Group):
     shrink: int = key(1, of="shrink", unit="sites")
     own_noise: str = key("keep", Choice("keep", "subtract"))
     raw: RawConfig = field(default_factory=RawConfig)
+    # fmt: on
 
     @property
     def place(self) -> str | None:
@@ -173,12 +173,13 @@ class CameraConfig(Group):
         weights of nexus_6p, sony_a7r, olympus_em10 and sony_rx100 in the mix of law=convex, divided by their sum
     """
 
+    # fmt: off
     name: str = key("convex", limits.NAME)
     law: str = key("convex", limits.CAMERA_LAWS)
     xyz2cam: Optional[tuple[float, ...]] = key(
-        None, Limit("nine numbers of an invertible matrix"), null="a law other than custom"
-    )
+        None, Limit("nine numbers of an invertible matrix"), null="a law other than custom")
     weights: Optional[tuple[float, ...]] = key(None, NumberList(4, Numbers(0)), null="drawn for each image")
+    # fmt: on
 
 
 @documented
@@ -243,16 +244,14 @@ CHOSEN, PROFILE = "Chosen for a run", "Every profile"
 TWO_NUMBERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
 """Sections of the keys of `NoiseConfig`."""
 
-BodyGroup = TypeVar("BodyGroup")
-
 Fields = Mapping[str, tuple[Any, Any]]
 """Type and default of each field."""
 
 
-def with_fields(added: Fields, before: str = "") -> Callable[[type[BodyGroup]], type[BodyGroup]]:
+def with_fields(added: Fields, before: str = "") -> Callable[[type[GroupType]], type[GroupType]]:
     """Add fields to the body of a dataclass, at its end or before one of its fields."""
 
-    def add(group: type[BodyGroup]) -> type[BodyGroup]:
+    def add(group: type[GroupType]) -> type[GroupType]:
         types = list(group.__annotations__.items())
         place = list(group.__annotations__).index(before) if before else len(types)
         types[place:place] = [(name, kind) for name, (kind, _) in added.items()]
@@ -321,7 +320,7 @@ SWITCH_FIELDS: Fields = {
 class BranchConfig(EffectGroup):
     """Numbers of a physical noise profile that depend on ISO, for one range of ISO.
 
-    A number may be written as a form of `forms.ISO_FORMS`.
+    A number may be written as a form of `distributions.ISO_FORMS`.
 
     Attributes
     ----------
@@ -408,22 +407,19 @@ class NoiseConfig(EffectGroup):
         source and uncertainty of the numbers, which plan --numbers prints
     """
 
+    # fmt: off
     name: str = key("none", limits.NAME, PROFILE)
     units: Optional[str] = key(None, Choice("dn", "normalized"), PROFILE)
     black: Optional[str] = key(None, Choice("subtracted", "included"), PROFILE)
     bits: Optional[int] = key(None, Integers(1, 32), PROFILE, null="with units=normalized")
     black_level_dn: Optional[int] = key(
-        None, limits.BLACK_LEVEL, PROFILE, unit="DN of the profile", null="with units=normalized"
-    )
+        None, limits.BLACK_LEVEL, PROFILE, unit="DN of the profile", null="with units=normalized")
     white_level_dn: Optional[int] = key(
-        None, limits.WHITE_LEVEL, PROFILE, unit="DN of the profile", null="with units=normalized"
-    )
+        None, limits.WHITE_LEVEL, PROFILE, unit="DN of the profile", null="with units=normalized")
     a: Any = key(
-        None, limits.VARIANCE_SLOPE, TWO_NUMBERS, unit="DN, or 1 with units=normalized", null="a physical profile"
-    )
+        None, limits.VARIANCE_SLOPE, TWO_NUMBERS, unit="DN, or 1 with units=normalized", null="a physical profile")
     b: Any = key(
-        None, limits.VARIANCE_OFFSET, TWO_NUMBERS, unit="DN², or 1 with units=normalized", null="a physical profile"
-    )
+        None, limits.VARIANCE_OFFSET, TWO_NUMBERS, unit="DN², or 1 with units=normalized", null="a physical profile")
     negative_variance: str = key("refuse", Choice("refuse", "clip"), TWO_NUMBERS)
     law: str = key("gaussian", section=CHOSEN, of="noise_law")
     iso: Any = key(None, limits.ISO, CHOSEN, null="the ISO of the scene")
@@ -431,29 +427,19 @@ class NoiseConfig(EffectGroup):
     levels: Any = key(None, limits.LEVELS, CHOSEN, null="one level, as the profile has it")
     draws: int = key(1, Integers(1, limits.MAX_LEVELS), CHOSEN)
     dark_frames: Optional[str] = key(
-        None,
-        Limit("a folder of mosaics: NPY, 16-bit PNG or TIFF, or raw files (extra raw)"),
-        CHOSEN,
-        null="the noise of the profile",
-        decides_data=False,
-    )
+        None, Limit("a folder of mosaics: NPY, 16-bit PNG or TIFF, or raw files (extra raw)"), CHOSEN,
+        null="the noise of the profile", decides_data=False)
     dark_frames_sha256: Optional[str] = key(None, limits.DIGEST, CHOSEN, null="any frames")
     dark_frames_black_dn: Optional[float] = key(
-        None,
-        Numbers(0, 65535),
-        CHOSEN,
-        unit="DN of the profile",
-        null="the black level in the raw files, else the mean of the pixels without 0.01 % at each end",
-    )
+        None, Numbers(0, 65535), CHOSEN, unit="DN of the profile",
+        null="the black level in the raw files, else the mean of the pixels without 0.01 % at each end")
     branches: tuple[BranchConfig, ...] = key((), Limit("a list of mappings with the keys of a branch"), PHYSICAL)
     assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), PHYSICAL)
     unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), PHYSICAL)
     provenance: tuple[ProvenanceConfig, ...] = key(
-        (),
-        Limit("a list of mappings with the keys numbers, iso, source and uncertainty"),
-        PHYSICAL,
-        decides_data=False,
-    )
+        (), Limit("a list of mappings with the keys numbers, iso, source and uncertainty"), PHYSICAL,
+        decides_data=False)
+    # fmt: on
 
 
 PHYSICAL_NUMBERS = tuple(
@@ -564,14 +550,13 @@ class ExecutorConfig(Group):
         time without any Dask worker after which the run ends with exit code 5
     """
 
+    # fmt: off
     kind: str = key("local", Choice("local", "dask"), decides_data=False)
     address: Optional[str] = key(
-        None,
-        limits.text("the address of a Dask scheduler"),
-        null="start a scheduler and n_jobs workers on this machine",
-        decides_data=False,
-    )
+        None, limits.text("the address of a Dask scheduler"),
+        null="start a scheduler and n_jobs workers on this machine", decides_data=False)
     no_workers_s: float = key(300.0, Numbers(0, 86400, open_low=True), unit="seconds", decides_data=False)
+    # fmt: on
 
 
 @documented

@@ -1,7 +1,7 @@
 """Evaluate a physical noise profile for the ISO, exposure and temperature of one image.
 
 Profiles are in electrons before the system gain K, and behind it in DN of the sensor they were calibrated on. A number
-may depend on ISO, in one of `forms.ISO_FORMS`. A profile is valid for the calibrated ISOs only; a dual-gain sensor has
+may depend on ISO (`distributions.ISO_FORMS`). A profile is valid for the calibrated ISOs only; a dual-gain sensor has
 a branch on each side of the switch. Exponentials and logarithms are defined in `decimal` and rounded once, because the
 last bit of libm's results differs between machines. `core.fixed_point` finds those of lines faster.
 """
@@ -108,7 +108,7 @@ class PhysicalNoise:
 
 
 def evaluate(form: Any, iso: float, uniform: float = MIDDLE) -> float:
-    """Evaluate a gain or standard deviation of a branch: a number, or one of `forms.ISO_FORMS`.
+    """Evaluate a gain or standard deviation of a branch: a number, or one of `distributions.ISO_FORMS`.
 
     ``uniform`` draws the scatter of a line.
     """
