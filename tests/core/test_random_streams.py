@@ -80,14 +80,14 @@ def word_by_hand(key: int, y: int, x: int, purpose_word: int, frame: int) -> int
 def test_a_pixels_word_depends_on_position_and_purpose(
     key: int, y: int, x: int, level: int, draw: int, frame: int
 ) -> None:
-    found = words(key, "heteroscedastic", (1, 1), origin=(y, x), frame=frame, level=level, draw=draw)
+    found = words(key, 1, (1, 1), origin=(y, x), frame=frame, level=level, draw=draw)
     assert found.dtype == np.uint32
     assert found.tolist() == [[word_by_hand(key, y, x, 1 << 24 | level << 12 | draw, frame)]]
 
 
 @given(keys, places, places, st.integers(0, 5), st.integers(1, 200))
 def test_a_tile_contains_the_words_of_its_pixels(key: int, y: int, x: int, height: int, width: int) -> None:
-    tile = words(key, "heteroscedastic", (height, width), origin=(y, x))
+    tile = words(key, 1, (height, width), origin=(y, x))
     assert tile.shape == (height, width)
     for row, column in itertools.product(range(height), {0, width // 3, width // 2, width - 1}):
         assert tile[row, column] == word_by_hand(key, y + row, x + column, 1 << 24, 0)
@@ -99,7 +99,10 @@ def test_stream_numbers_never_change() -> None:
         "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10, "patch": 11, "scatter": 12,
         "column_temporal": 13, "dark_frame": 14, "dark_dither": 15, "dsnu": 16,
     }  # fmt: skip
-    assert len(set(streams.STREAMS.values())) == len(streams.STREAMS)
+    with pytest.raises(ValueError, match="stream new, number 2: one of them is taken"):
+        streams.declare_stream("new", 2)
+    with pytest.raises(ValueError, match="stream prnu, number 99: one of them is taken"):
+        streams.declare_stream("prnu", 99)
 
 
 # Independence ---------------------------------------------------------------------------------------------------------
@@ -107,7 +110,7 @@ def test_stream_numbers_never_change() -> None:
 
 def test_streams_levels_and_draws_have_distinct_purposes() -> None:
     corners = (0, 1, 255, 256, 4094, 4095)
-    found = [purpose(*which) for which in itertools.product(streams.STREAMS, corners, corners)]
+    found = [purpose(*which) for which in itertools.product(streams.STREAMS.values(), corners, corners)]
     assert len(set(found)) == len(found)
     assert max(found) < 2**32
 
@@ -115,7 +118,7 @@ def test_streams_levels_and_draws_have_distinct_purposes() -> None:
 @pytest.mark.parametrize(("level", "draw"), [(-1, 0), (4096, 0), (0, -1), (0, 4096)])
 def test_a_level_or_draw_out_of_range_is_refused(level: int, draw: int) -> None:
     with pytest.raises(ValueError, match="expected 0 to 4095"):
-        purpose("heteroscedastic", level, draw)
+        purpose(1, level, draw)
 
 
 # Keys -----------------------------------------------------------------------------------------------------------------
@@ -138,7 +141,7 @@ def test_keys_never_change(key: int, name: str) -> None:
 
 @given(keys, st.integers(0, 50), st.integers(0, 4095), st.integers(0, 2**14 - 1))
 def test_uniform_n_is_the_first_52_bits_of_counter_n(key: int, number: int, level: int, epoch: int) -> None:
-    high, low, _, _ = philox_by_hand((0, number, purpose("parameters", level), frame_word(0, epoch)), key)
+    high, low, _, _ = philox_by_hand((0, number, purpose(0, level), frame_word(0, epoch)), key)
     assert parameter_uniforms(key, (3, number), level, epoch)[1] == ((high << 20 | low >> 12) + 0.5) / 2**52
     high, low, _, _ = philox_by_hand((0, number, STREAMS["scatter"] << 24, 0), key)
     assert scatter_uniforms(key, number + 1)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52

@@ -22,7 +22,7 @@ from helpers.flats import IDENTITY, SILENT, plan_with
 from helpers.promise_report import Figure
 
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16, Srgb
-from unprocess_gen.core.random_streams import words
+from unprocess_gen.core.random_streams import STREAMS, words
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.facts import DarkPixels
@@ -144,7 +144,7 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
 def with_dark_frame(one: Case, dice: Dice) -> Case:
     """Replace the noise of the read-out with a dark frame that is smaller or larger than the image."""
     shape = 2 * int(dice.power(0, 5)), 2 * int(dice.power(0, 7))
-    drawn = words(int(dice.random() * 2**53), "parameters", shape) >> np.uint32(dice.pick((16, 20, 24, 28)))
+    drawn = words(int(dice.random() * 2**53), 0, shape) >> np.uint32(dice.pick((16, 20, 24, 28)))
     plan = one.plan.replace(
         effects=tuple("dark_frame" if on == "read" else on for on in one.plan.noise.effects if on not in REPLACED),
         dark=DarkFramePlan(
@@ -248,7 +248,7 @@ def drawn_image(dice: Dice, even: bool) -> Srgb:
         height, width = height + height % 2, width + width % 2
     dtype = np.dtype(dice.pick((np.uint8, np.uint8, np.uint16)))
     most, kind = np.iinfo(dtype).max, dice.pick(("codes", "dark", "bright", "flat", "ramp", "scene"))
-    drawn = words(int(dice.random() * 2**53), "parameters", (height, 3 * width)).reshape(height, width, 3)
+    drawn = words(int(dice.random() * 2**53), 0, (height, 3 * width)).reshape(height, width, 3)
     codes = (drawn >> np.uint32(32 - 8 * dtype.itemsize)).astype(dtype)
     if kind == "dark":
         codes >>= 4
@@ -404,7 +404,7 @@ RATES_E = [(0, 0.3), (0, 6), (5.9, 9), (9, 66), (60, 65535)]
 
 @functools.lru_cache(maxsize=1)
 def words_of_counts(key: int, height: int, width: int) -> np.ndarray:
-    return words(key, "shot", (height, width))
+    return words(key, STREAMS["shot"], (height, width))
 
 
 @pytest.mark.parametrize("height", [256, pytest.param(1024, marks=pytest.mark.slow)])
@@ -441,7 +441,7 @@ SITES = [(stream, word, at) for stream, places in RARE.items() for word, at in z
 @pytest.mark.parametrize(("stream", "word", "at"), SITES)
 def test_rare_words_are_where_they_were_found(stream: str, word: int, at: tuple[int, int, int]) -> None:
     frame, y, x = at
-    assert words(KEY, stream, (1, 1), origin=(y, x), frame=frame).item() == word
+    assert words(KEY, STREAMS[stream], (1, 1), origin=(y, x), frame=frame).item() == word
 
 
 @pytest.mark.parametrize("dtype", slow_except((UINT16,), (UINT16, FLOAT32, FLOAT_CLEAN)))
@@ -469,7 +469,7 @@ def test_pixels_at_the_limit_of_a_share_equal_the_reference(effect: str) -> None
     plan = one.plan.replace(effects=EFFECTS, layout=MOSAIC, bits=16, black_level_dn=4096, white_level_dn=65535)
     srgb, numbers = np.full((3, 70, 3), 128, dtype=np.uint8), {"dark_e": 0.0, "dn_per_e": 8.0, "read_std_dn": 0.5}
     found = []
-    for word in words(KEY, effect, (3, 70))[:, ::23].ravel().tolist():
+    for word in words(KEY, STREAMS[effect], (3, 70))[:, ::23].ravel().tolist():
         for share in (word / 2**32, (word + 1) / 2**32):
             shares = {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0, "dead_pixel_level": 0.3} | {
                 f"{effect.removesuffix('s')}_share": share

@@ -29,26 +29,20 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-STREAMS = {
-    "parameters": 0,
-    "heteroscedastic": 1,
-    "prnu": 2,
-    "shot": 3,
-    "dark_current": 4,
-    "hot_pixels": 5,
-    "read": 6,
-    "row": 7,
-    "column": 8,
-    "dead_pixels": 9,
-    "dequantize": 10,
-    "patch": 11,
-    "scatter": 12,
-    "column_temporal": 13,
-    "dark_frame": 14,
-    "dark_dither": 15,
-    "dsnu": 16,
-}
-"""Stream numbers by purpose. Every existing dataset depends on them: add new ones, never renumber."""
+STREAMS: dict[str, int] = {}
+"""Numbers of the streams by name, of the modules that are imported."""
+
+
+def declare_stream(name: str, number: int) -> int:
+    """Declare a random stream, once for a name and a number. Datasets depend on the number, so it never changes."""
+    if STREAMS.get(name, number) != number or (name not in STREAMS and number in STREAMS.values()):
+        raise ValueError(f"stream {name}, number {number}: one of them is taken; expected {STREAMS}, or new ones")
+    STREAMS[name] = number
+    return number
+
+
+PARAMETERS, PATCH, SCATTER = declare_stream("parameters", 0), declare_stream("patch", 11), declare_stream("scatter", 12)
+DARK_FRAME = declare_stream("dark_frame", 14)
 
 MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
@@ -87,11 +81,11 @@ def _hash64(name: str) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
-def purpose(stream: str, level: int = 0, draw: int = 0) -> int:
-    """Word 2 of the counter for a stream of `STREAMS`; ValueError unless level and draw are 0 to 4095."""
+def purpose(stream: int, level: int = 0, draw: int = 0) -> int:
+    """Word 2 of the counter; ValueError unless level and draw are 0 to 4095."""
     if not (0 <= level < 4096 and 0 <= draw < 4096):
         raise ValueError(f"level={level}, draw={draw}: out of range; expected 0 to 4095")
-    return STREAMS[stream] << 24 | level << 12 | draw
+    return stream << 24 | level << 12 | draw
 
 
 EPOCHS, CLIP_FRAMES = 2**14, 2**18
@@ -128,7 +122,7 @@ def philox4x32(counter: tuple[NDArray[np.uint64], ...], key: int) -> tuple[Words
 
 def words(
     key: int,
-    stream: str,
+    stream: int,
     shape: tuple[int, int],
     *,
     origin: tuple[int, int] = (0, 0),
@@ -151,7 +145,7 @@ def patch_words(key: int, count: int, epoch: int = 0) -> list[tuple[int, int]]:
 
     Patch n uses counter (0, n) of the stream ``patch``, so that a larger ``count`` does not move the first patches.
     """
-    first, second, _, _ = _outputs(key, range(count), purpose("patch"), frame_word(0, epoch))
+    first, second, _, _ = _outputs(key, range(count), purpose(PATCH), frame_word(0, epoch))
     return list(zip(_split(first, count), _split(second, count), strict=True))
 
 
@@ -174,7 +168,7 @@ def shuffled(length: int, seed: int, epoch: int) -> NDArray[np.int64]:
 
 def dark_frame_words(key: int) -> tuple[int, int, int]:
     """Draw three 32-bit words, which choose a dark frame, its row and its column."""
-    return _outputs(key, range(1), purpose("dark_frame"), 0)[:3]
+    return _outputs(key, range(1), purpose(DARK_FRAME), 0)[:3]
 
 
 def parameter_uniforms(key: int, counters: Sequence[int], level: int = 0, epoch: int = 0) -> list[float]:
@@ -182,7 +176,7 @@ def parameter_uniforms(key: int, counters: Sequence[int], level: int = 0, epoch:
 
     Parameter n uses counter (0, n) of the stream ``parameters``: add new parameters at the end, never renumber.
     """
-    return _uniforms(key, counters, purpose("parameters", level), frame_word(0, epoch))
+    return _uniforms(key, counters, purpose(PARAMETERS, level), frame_word(0, epoch))
 
 
 def scatter_uniforms(key: int, count: int) -> list[float]:
@@ -190,7 +184,7 @@ def scatter_uniforms(key: int, count: int) -> list[float]:
 
     Number n uses counter n of the stream ``scatter``: add new numbers at the end, never renumber.
     """
-    return _uniforms(key, range(count), purpose("scatter"), 0)
+    return _uniforms(key, range(count), purpose(SCATTER), 0)
 
 
 def _uniforms(key: int, counters: Sequence[int], word_2: int, word_3: int) -> list[float]:

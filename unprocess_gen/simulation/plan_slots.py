@@ -6,12 +6,10 @@ import functools
 import math
 from typing import Any
 
+from unprocess_gen.simulation.effects import heteroscedastic, shot
 from unprocess_gen.simulation.effects.order import effects_of
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.slots import Patterns, SiteNoise, Slots
-
-NORMAL_STREAM = "heteroscedastic"
-"""Stream of noise that is one normal deviate per site, with a variance linear in the signal."""
 
 
 @functools.lru_cache(maxsize=1024)
@@ -30,5 +28,5 @@ def slots_of(plan: Plan) -> Slots:
 def _two_numbers(plan: Plan, black_dn: float) -> Slots:
     """Return counts of light and normal noise that have the variance line of the plan."""
     a_dn, b_dn2 = plan.noise.variance_line
-    noise = SiteNoise(NORMAL_STREAM, math.sqrt(max(b_dn2, 0.0)))
-    return Slots(black_dn, a_dn, light_stream="shot", noise=noise)
+    noise = SiteNoise(heteroscedastic.STREAM, math.sqrt(max(b_dn2, 0.0)))
+    return Slots(black_dn, a_dn, light_stream=shot.STREAM, noise=noise)

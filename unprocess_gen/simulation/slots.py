@@ -30,7 +30,7 @@ class NormalPattern(NamedTuple):
     """Fixed value of each pixel of a body: max(mean + std·n, least) for a normal deviate n, float32."""
 
     body_key: int
-    stream: str
+    stream: int
     std: float
     mean: float = 0.0
     least: float = -math.inf
@@ -44,7 +44,7 @@ class BrightPixels(NamedTuple):
     """
 
     body_key: int
-    stream: str
+    stream: int
     share: float
     mean_e: float
 
@@ -53,7 +53,7 @@ class DeadSlot(NamedTuple):
     """Share of the pixels of a body that read ``value_dn``, chosen by words of ``stream``."""
 
     body_key: int
-    stream: str
+    stream: int
     share: float
     value_dn: float = 0.0
 
@@ -84,7 +84,7 @@ class SlotWords(NamedTuple):
     """Random words of a frame, or of a body: their key, stream, level, draw and frame."""
 
     key: int
-    stream: str
+    stream: int
     level: int = 0
     draw: int = 0
     frame: int = 0
@@ -104,7 +104,7 @@ class LineOffsets(NamedTuple):
 class UniformCounts(NamedTuple):
     """Poisson counts of the rate ``rate_e`` at every site, less ``removed_e``."""
 
-    stream: str
+    stream: int
     rate_e: float
     removed_e: float
 
@@ -112,7 +112,7 @@ class UniformCounts(NamedTuple):
 class SiteNoise(NamedTuple):
     """Noise of each site: ``std_dn`` times a deviate of a quantile table (`lookup_tables.quantile_table`)."""
 
-    stream: str
+    stream: int
     std_dn: float
     law: str = "gaussian"
     shape: float = 0.0
@@ -127,8 +127,8 @@ class Slots(NamedTuple):
         Black level, DN, and system gain, DN per electron.
     patterns : Patterns
         Fixed patterns of the body.
-    light_stream : str
-        Stream of the Poisson counts of light; empty if the electrons of light are their mean.
+    light_stream : int
+        Stream of the Poisson counts of light; 0 if the electrons of light are their mean.
     uniform : UniformCounts or None
         Counts of one rate.
     full_well_e : float
@@ -148,7 +148,7 @@ class Slots(NamedTuple):
     black_dn: float
     dn_per_e: float
     patterns: Patterns = Patterns()
-    light_stream: str = ""
+    light_stream: int = 0
     uniform: UniformCounts | None = None
     full_well_e: float = math.inf
     plane_gains: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)

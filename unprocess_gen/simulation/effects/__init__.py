@@ -1,7 +1,6 @@
 """Effects of the sensor: a module for each, with everything that the program knows of it.
 
-To add an effect, write its module, name its class in `EFFECTS`, declare its numbers in `plan.Physics`, and give its
-random stream a number in `random_streams.STREAMS`.
+To add an effect, write its module, name its class in `EFFECTS`, and declare its numbers in `plan.Physics`.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
 from unprocess_gen.simulation.plan import Plan
@@ -16,13 +17,14 @@ class ColumnNoise(Effect):
     """Offset of each column."""
 
     name = "column"
+    stream = declare_stream("column", 8)
     meaning = "an offset of each column; fixed pattern"
     numbers = ("column_std_dn",)
     is_fixed = is_in_dark_frames = True
 
     def column_offset_dn(self, crop: Crop) -> Float:
         """Return the offset of each column, [1, W] DN."""
-        words = crop.body_words("column", (1, crop.shape[1]), (0, crop.origin[1]))
+        words = crop.body_words(self.stream, (1, crop.shape[1]), (0, crop.origin[1]))
         return np.asarray(crop.physics.column_std_dn * normals(words))
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
@@ -32,4 +34,4 @@ class ColumnNoise(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the body."""
         physics = plan.numbers
-        return {"fixed_columns": LineOffsets(SlotWords(physics.body_key, "column"), physics.column_std_dn)}
+        return {"fixed_columns": LineOffsets(SlotWords(physics.body_key, self.stream), physics.column_std_dn)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
 from unprocess_gen.simulation.plan import Plan
@@ -16,13 +17,14 @@ class ColumnTemporal(Effect):
     """Offset of each column in one frame."""
 
     name = "column_temporal"
+    stream = declare_stream("column_temporal", 13)
     meaning = "an offset of each column, new in every frame"
     numbers = ("column_temporal_std_dn",)
     is_in_dark_frames = True
 
     def column_offset_dn(self, crop: Crop) -> Float:
         """Draw the offset of each column, [1, W] DN."""
-        words = crop.frame_words("column_temporal", (1, crop.shape[1]), (0, crop.origin[1]))
+        words = crop.frame_words(self.stream, (1, crop.shape[1]), (0, crop.origin[1]))
         return np.asarray(crop.physics.column_temporal_std_dn * normals(words))
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
@@ -32,4 +34,4 @@ class ColumnTemporal(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the frame."""
         std_dn = plan.numbers.column_temporal_std_dn
-        return {"columns": LineOffsets(slot_words(plan, "column_temporal"), std_dn)}
+        return {"columns": LineOffsets(slot_words(plan, self.stream), std_dn)}

@@ -6,6 +6,7 @@ import numpy as np
 
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.fields import Numbers
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.numbers import Number
@@ -28,6 +29,7 @@ class DarkCurrent(Effect):
     """Dark signal; the camera subtracts its mean with optical-black pixels, unless ``dark_offset`` is ``"kept"``."""
 
     name = "dark_current"
+    stream = declare_stream("dark_current", 4)
     meaning = "Poisson counts of thermal electrons"
     numbers = ("dark_e",)
     keys = HEAT
@@ -36,7 +38,7 @@ class DarkCurrent(Effect):
     def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Add a count to each pixel."""
         physics = crop.physics
-        count = poisson(crop.frame_words("dark_current"), np.full(crop.shape, physics.dark_e))
+        count = poisson(crop.frame_words(self.stream), np.full(crop.shape, physics.dark_e))
         return electrons + (count - (physics.dark_e if physics.dark_offset == "removed" else 0.0))
 
     def mean_electrons(self, crop: Crop) -> float | None:
@@ -57,4 +59,4 @@ class DarkCurrent(Effect):
         """Fill the counts of one rate."""
         physics = plan.numbers
         removed_e = physics.dark_e if physics.dark_offset == "removed" else 0.0
-        return {"uniform": UniformCounts("dark_current", physics.dark_e, removed_e)}
+        return {"uniform": UniformCounts(self.stream, physics.dark_e, removed_e)}

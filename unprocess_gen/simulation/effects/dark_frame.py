@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.lookup_tables import quantile_table
@@ -98,12 +99,13 @@ class DarkFrameNoise(Effect):
     """
 
     name = "dark_frame"
+    stream = declare_stream("dark_dither", 15)
     meaning = "noise of the read-out, sampled from dark frames"
     has_switch = False
 
     def noise_dn(self, crop: Crop) -> Float:
         """Draw the dither, uniform in ±½ DN of the dark frame."""
-        uniform = by_inverse_cdf(crop.frame_words("dark_dither"), quantile_table(DITHER_LAW, DITHER_SHAPE))
+        uniform = by_inverse_cdf(crop.frame_words(self.stream), quantile_table(DITHER_LAW, DITHER_SHAPE))
         return dither_std_dn(crop.plan) * uniform
 
     def site_offset_dn(self, crop: Crop) -> NDArray[np.float32]:
@@ -112,5 +114,5 @@ class DarkFrameNoise(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site with the dither, and the offsets by site."""
-        dither = SiteNoise("dark_dither", dither_std_dn(plan), DITHER_LAW, DITHER_SHAPE)
+        dither = SiteNoise(self.stream, dither_std_dn(plan), DITHER_LAW, DITHER_SHAPE)
         return {"noise": dither, "has_site_offsets": True}

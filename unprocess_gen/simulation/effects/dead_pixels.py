@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.plan import Plan
@@ -24,6 +25,7 @@ class DeadPixels(Effect):
     """
 
     name = "dead_pixels"
+    stream = declare_stream("dead_pixels", 9)
     meaning = "few pixels that record no light; fixed pattern"
     numbers = ("dead_pixel_share", "dead_pixel_level")
     is_fixed = has_outliers = True
@@ -32,7 +34,7 @@ class DeadPixels(Effect):
         """Set dead pixels to their value."""
         physics = crop.physics
         dead_dn = dead_pixel_dn(physics, crop.plan.sensor.black_level_dn)
-        return np.where(is_among(crop.body_words("dead_pixels"), physics.dead_pixel_share), dead_dn, noisy_dn)
+        return np.where(is_among(crop.body_words(self.stream), physics.dead_pixel_share), dead_dn, noisy_dn)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict pixels that lose their signal."""
@@ -48,7 +50,7 @@ class DeadPixels(Effect):
         """Fill the dead pixels."""
         physics = plan.numbers
         dead_dn = dead_pixel_dn(physics, plan.sensor.black_level_dn)
-        return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share, dead_dn)}
+        return {"dead": DeadSlot(physics.body_key, self.stream, physics.dead_pixel_share, dead_dn)}
 
 
 def dead_pixel_dn(physics: Physics, black_dn: float) -> float:

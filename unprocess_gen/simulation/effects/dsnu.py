@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.plan import Plan
@@ -16,6 +17,7 @@ class Dsnu(Effect):
     """Normal offset of each pixel with mean 0, added behind the gain."""
 
     name = "dsnu"
+    stream = declare_stream("dsnu", 16)
     meaning = "unequal offsets of pixels; fixed pattern"
     numbers = ("dsnu_std_e",)
     is_fixed = is_in_dark_frames = True
@@ -23,7 +25,7 @@ class Dsnu(Effect):
     def site_offset_dn(self, crop: Crop) -> Float:
         """Return the offset of each pixel, [H, W] DN; values of float32, in which kernels store the pattern."""
         std_dn = crop.physics.dsnu_std_e * crop.physics.dn_per_e
-        offset_dn = std_dn * normals(crop.body_words("dsnu"))
+        offset_dn = std_dn * normals(crop.body_words(self.stream))
         return offset_dn.astype(np.float32).astype(np.float64)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
@@ -34,4 +36,4 @@ class Dsnu(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets by site of the body."""
         physics = plan.numbers
-        return {"sites_dn": NormalPattern(physics.body_key, "dsnu", physics.dsnu_std_e * physics.dn_per_e)}
+        return {"sites_dn": NormalPattern(physics.body_key, self.stream, physics.dsnu_std_e * physics.dn_per_e)}

@@ -22,7 +22,7 @@ SlotValues = dict[str, Any]
 """What an effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
 
 
-def frame_words(plan: Plan, stream: str, shape: tuple[int, ...], origin: Shape = (0, 0)) -> Words:
+def frame_words(plan: Plan, stream: int, shape: tuple[int, ...], origin: Shape = (0, 0)) -> Words:
     """Return the random words of a plan's frame, level and draw, [H, W]."""
     place = plan.place
     numbers = {"frame": place.frame_word, "level": place.level, "draw": place.draw}
@@ -54,11 +54,11 @@ class Crop:
     dark_pixels: DarkPixels | None = None
     relative_gain: Float | float = 1.0
 
-    def frame_words(self, stream: str, shape: Shape | None = None, origin: Shape | None = None) -> Words:
+    def frame_words(self, stream: int, shape: Shape | None = None, origin: Shape | None = None) -> Words:
         """Return the random words of a frame, [H, W]; of the crop, or of another one."""
         return frame_words(self.plan, stream, shape or self.shape, self.origin if origin is None else origin)
 
-    def body_words(self, stream: str, shape: Shape | None = None, origin: Shape | None = None, draw: int = 0) -> Words:
+    def body_words(self, stream: int, shape: Shape | None = None, origin: Shape | None = None, draw: int = 0) -> Words:
         """Return the random words of a fixed pattern of the camera body, [H, W]; of the crop, or of another one."""
         origin = self.origin if origin is None else origin
         return words(self.physics.body_key, stream, shape or self.shape, origin=origin, draw=draw)
@@ -70,7 +70,7 @@ class Crop:
         return np.asarray(tile[y[:, None], x[None, :]])
 
 
-def slot_words(plan: Plan, stream: str) -> SlotWords:
+def slot_words(plan: Plan, stream: int) -> SlotWords:
     """Return the random words of a plan's frame, level and draw for a slot."""
     return SlotWords(plan.stream_key, stream, plan.place.level, plan.place.draw, plan.place.frame_word)
 
@@ -81,7 +81,9 @@ class Effect:
     Attributes
     ----------
     name : str
-        Name in settings and rows, and of its random stream in `random_streams.STREAMS`.
+        Name in settings and rows.
+    stream : int
+        Number of its random stream, of an effect that has one.
     meaning : str
         One phrase for users.
     numbers : tuple of str
@@ -108,6 +110,7 @@ class Effect:
     """
 
     name: ClassVar[str]
+    stream: ClassVar[int]
     meaning: ClassVar[str]
     numbers: ClassVar[tuple[str, ...]] = ()
     keys: ClassVar[Mapping[str, Number]] = {}

@@ -8,10 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Effect, Shape, frame_words
 from unprocess_gen.simulation.effects.shot import counts
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
+
+STREAM = declare_stream("heteroscedastic", 1)
 
 
 class Heteroscedastic(Effect):
@@ -61,7 +64,7 @@ def heteroscedastic(clean_dn: Float, plan: Plan, origin: Shape = (0, 0)) -> Floa
         Noisy frame, DN, not clipped.
     """
     noise, black_dn = plan.noise, plan.sensor.black_level_dn
-    n = normals(frame_words(plan, "heteroscedastic", clean_dn.shape, origin))
+    n = normals(frame_words(plan, STREAM, clean_dn.shape, origin))
     if noise.noise_law == "gaussian" or noise.a_dn == 0:  # a = 0: no shot noise
         return clean_dn + np.sqrt(noise_variance(clean_dn, plan)) * n
     electrons = counts(plan, (clean_dn - black_dn) / noise.a_dn, origin)

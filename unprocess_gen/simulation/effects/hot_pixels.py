@@ -9,6 +9,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.lookup_tables import exponential_levels
@@ -22,19 +23,20 @@ class HotPixels(Effect):
     """Excess of hot pixels, whose means are exponentially distributed in 1024 equally likely steps."""
 
     name = "hot_pixels"
+    stream = declare_stream("hot_pixels", 5)
     meaning = "few pixels with a far larger dark current; fixed pattern"
     numbers = ("hot_pixel_share", "hot_pixel_e")
     heat = is_fixed = is_before_well = is_in_dark_frames = has_outliers = True
 
     def electrons(self, electrons: Float, crop: Crop) -> Float:
         """Add a Poisson count of its mean to each hot pixel."""
-        return electrons + poisson(crop.frame_words("hot_pixels"), self.mean_electrons(crop))
+        return electrons + poisson(crop.frame_words(self.stream), self.mean_electrons(crop))
 
     def mean_electrons(self, crop: Crop) -> Float:
         """Return the mean excess of each pixel, [H, W] electrons; 0 except for hot pixels."""
         physics = crop.physics
-        hot = is_among(crop.body_words("hot_pixels"), physics.hot_pixel_share)
-        step = crop.body_words("hot_pixels", draw=1) >> np.uint32(22)
+        hot = is_among(crop.body_words(self.stream), physics.hot_pixel_share)
+        step = crop.body_words(self.stream, draw=1) >> np.uint32(22)
         return np.where(hot, physics.hot_pixel_e * exponential_levels()[step], 0.0)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
@@ -53,7 +55,7 @@ class HotPixels(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the bright defects."""
         physics = plan.numbers
-        return {"bright": BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)}
+        return {"bright": BrightPixels(physics.body_key, self.stream, physics.hot_pixel_share, physics.hot_pixel_e)}
 
 
 @functools.lru_cache(maxsize=256)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, independent
 from unprocess_gen.simulation.plan import Plan
@@ -16,6 +17,7 @@ class Prnu(Effect):
     """Relative gain of each pixel with mean 1; if the clean frame contains the fixed patterns, on its light instead."""
 
     name = "prnu"
+    stream = declare_stream("prnu", 2)
     meaning = "unequal response of pixels; fixed pattern"
     numbers = ("prnu_std",)
     is_fixed = is_before_well = True
@@ -25,7 +27,7 @@ class Prnu(Effect):
 
         It is rounded to float32, the dtype in which kernels store the pattern for many frames.
         """
-        n = normals(crop.body_words("prnu"))
+        n = normals(crop.body_words(self.stream))
         return np.maximum(1 + crop.physics.prnu_std * n, 0).astype(np.float32).astype(np.float64)
 
     def light_factor(self, crop: Crop) -> Float | None:
@@ -49,4 +51,4 @@ class Prnu(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the factor on the electrons."""
         physics = plan.numbers
-        return {"electrons": NormalPattern(physics.body_key, "prnu", physics.prnu_std, mean=1.0, least=0.0)}
+        return {"electrons": NormalPattern(physics.body_key, self.stream, physics.prnu_std, mean=1.0, least=0.0)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.lookup_tables import quantile_table
@@ -15,6 +16,7 @@ class ReadNoise(Effect):
     """Independent noise of each site, behind the gain."""
 
     name = "read"
+    stream = declare_stream("read", 6)
     meaning = "noise of the amplifier and the converter"
     numbers = ("read_law", "read_shape", "read_std_dn")
     masks = True
@@ -23,7 +25,7 @@ class ReadNoise(Effect):
         """Draw the noise by the inverse distribution function."""
         physics = crop.physics
         table = quantile_table(physics.read_law, physics.read_shape)
-        return physics.read_std_dn * by_inverse_cdf(crop.frame_words("read"), table)
+        return physics.read_std_dn * by_inverse_cdf(crop.frame_words(self.stream), table)
 
     def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return the square of the standard deviation, DN²."""
@@ -32,4 +34,4 @@ class ReadNoise(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site."""
         physics = plan.numbers
-        return {"noise": SiteNoise("read", physics.read_std_dn, physics.read_law, physics.read_shape)}
+        return {"noise": SiteNoise(self.stream, physics.read_std_dn, physics.read_law, physics.read_shape)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
 from unprocess_gen.simulation.plan import Plan
@@ -21,6 +22,7 @@ class RowNoise(Effect):
     """
 
     name = "row"
+    stream = declare_stream("row", 7)
     meaning = "an offset of each row, new in every frame"
     numbers = ("row_std_dn", "row_correlation")
     is_in_dark_frames = True
@@ -29,8 +31,8 @@ class RowNoise(Effect):
         """Draw the offset of each row, [H, 1] DN."""
         physics, (height, _), (top, _) = crop.physics, crop.shape, crop.origin
         if physics.row_correlation == 0:
-            return np.asarray(physics.row_std_dn * normals(crop.frame_words("row", (height, 1), (top, 0))))
-        independent = normals(crop.frame_words("row", (top + height, 1), (0, 0)))[:, 0]
+            return np.asarray(physics.row_std_dn * normals(crop.frame_words(self.stream, (height, 1), (top, 0))))
+        independent = normals(crop.frame_words(self.stream, (top + height, 1), (0, 0)))[:, 0]
         return (physics.row_std_dn * autoregressive(independent, physics.row_correlation)[top:])[:, None]
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
@@ -46,4 +48,4 @@ class RowNoise(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of rows."""
         physics = plan.numbers
-        return {"rows": LineOffsets(slot_words(plan, "row"), physics.row_std_dn, physics.row_correlation)}
+        return {"rows": LineOffsets(slot_words(plan, self.stream), physics.row_std_dn, physics.row_correlation)}

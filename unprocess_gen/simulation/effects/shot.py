@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.random_streams import declare_stream
 from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues, frame_words
 from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.poisson import poisson
 
+STREAM = declare_stream("shot", 3)
+
 
 def counts(plan: Plan, electrons: Float, origin: Shape = (0, 0)) -> Float:
     """Draw the electrons of light, [H, W]: Poisson counts of their means."""
-    return poisson(frame_words(plan, "shot", electrons.shape, origin), electrons)
+    return poisson(frame_words(plan, STREAM, electrons.shape, origin), electrons)
 
 
 class Shot(Effect):
@@ -32,4 +35,4 @@ class Shot(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the counts of light."""
-        return {"light_stream": "shot"}
+        return {"light_stream": STREAM}

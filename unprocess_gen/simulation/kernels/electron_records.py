@@ -125,11 +125,11 @@ def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
     """Return the members of `Electrons` that a frame whose first row is ``top`` has of its own, without columns."""
     gains, planes_dn = _by_site(slots.plane_gains, top), _by_site(slots.planes_dn, top)
     dn_per_e = slots.dn_per_e * gains
-    noise, uniform = slots.noise or SiteNoise("read", 0.0), slots.uniform or UniformCounts("shot", 0.0, 0.0)
+    noise, uniform = slots.noise or SiteNoise(0, 0.0), slots.uniform or UniformCounts(0, 0.0, 0.0)
     quantiles = _quantiles(noise.law, noise.shape)
     has_thresholds = uniform.rate_e <= MAX_THRESHOLD_RATE
     fewest, ranks = count_thresholds(uniform.rate_e) if has_thresholds else (0, np.zeros(0, dtype=np.uint32))
-    rows, bright = slots.rows or LineOffsets(SlotWords(0, "row"), 0.0), slots.patterns.bright
+    rows, bright = slots.rows or LineOffsets(SlotWords(0, 0), 0.0), slots.patterns.bright
     offset_dn = FARTHEST_NORMAL * rows.std_dn
     offset_dn += slots.black_dn + float(np.abs(planes_dn).max())
     most_dark_e = uniform.rate_e + 8 * math.sqrt(uniform.rate_e) + 40 if uniform.rate_e else 0.0
@@ -138,9 +138,9 @@ def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
         counts_light=bool(slots.light_stream),
         has_dark=uniform.rate_e > 0,
         has_thresholds=has_thresholds,
-        light_stream=_purpose(slots.light_stream or "shot"),
+        light_stream=_purpose(slots.light_stream),
         dark_stream=_purpose(uniform.stream),
-        defect_stream=_purpose(bright.stream if bright else "shot"),
+        defect_stream=_purpose(bright.stream if bright else 0),
         site_stream=_purpose(noise.stream),
         row_stream=_purpose(rows.words.stream),
         dark_e=uniform.rate_e,
@@ -167,7 +167,7 @@ def _by_site(tile: Sequence[float], top: int) -> Float:
     return np.roll(np.tile(np.array(tile).reshape(2, 2), VECTOR_WIDTH // 2), -top, axis=0)
 
 
-def _purpose(stream: str) -> np.uint64:
+def _purpose(stream: int) -> np.uint64:
     return np.uint64(purpose(stream))
 
 

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import purpose
+from unprocess_gen.simulation.effects.heteroscedastic import STREAM
 from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer
 from unprocess_gen.simulation.kernels.strips import SIZE, Buffers, Float32, Strip
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.plan_slots import NORMAL_STREAM
 
-NORMAL_PURPOSE = np.uint64(purpose(NORMAL_STREAM))
+NORMAL_PURPOSE = np.uint64(purpose(STREAM))
 
 ROUNDING_ERROR, RESIDUAL_ERROR_DN = 2.0**-16, 2.0**-22
 """Bounds of the error of float32 noise: this fraction of the standard deviation, plus this many DN."""

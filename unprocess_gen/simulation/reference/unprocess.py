@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.arrays import Float, Srgb
-from unprocess_gen.core.random_streams import words
+from unprocess_gen.core.random_streams import declare_stream, words
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import mosaic, plane_sites
 
@@ -65,6 +65,9 @@ def raw_light(codes: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Floa
     return light
 
 
+DEQUANTIZE = declare_stream("dequantize", 10)
+
+
 def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:
     """Dither 8-bit codes to 16 bits, so that 256 codes do not become 256 levels of raw.
 
@@ -90,7 +93,7 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
         Dithered codes.
     """
     size = (srgb.shape[0], srgb.shape[1])
-    channels = [words(plan.stream_key, "dequantize", size, origin=origin, draw=channel) for channel in range(3)]
+    channels = [words(plan.stream_key, DEQUANTIZE, size, origin=origin, draw=channel) for channel in range(3)]
     kept = (srgb == 0) | (srgb == 255)
     if plan.source.dequantize == "dither_all":
         steps = np.where(srgb == 254, np.uint64(385), np.uint64(257))  # 254 · 257 + 256 is one less than white
