@@ -30,6 +30,7 @@ from unprocess_gen.simulation.effects import EFFECTS, order
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.lookup_tables import exponential_levels
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.plan import DarkFramePlan
 from unprocess_gen.simulation.slots import Patterns, Slots
 
 # Slots ----------------------------------------------------------------------------------------------------------------
@@ -41,7 +42,7 @@ IN_EVERY_PAIR = {"heteroscedastic", "quantise"}
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
 def test_every_physical_effect_fills_a_slot_of_the_kernels(effect: Effect) -> None:
     """Kernels simulate slots only: without one, only the reference would have the effect that a row names."""
-    filled = effect.slots(plan_with(effect.name))
+    filled = effect.slots(plan_with(effect.name).replace(dark=DarkFramePlan("0" * 64, (0, 0), 0.0, 1.0)))
     assert filled.keys() <= {*Slots._fields, *Patterns._fields}
     assert bool(filled) != (effect.name in IN_EVERY_PAIR)
 

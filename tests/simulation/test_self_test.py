@@ -113,7 +113,7 @@ def test_every_law_of_the_noise_has_a_golden_pair() -> None:
     plans = selftest.GOLDEN_PLANS.values()
 
     assert {plan.noise.noise_law for plan in plans} == set(settings_of(NoiseConfig)["law"].limit.words)
-    assert {plan.physics.read_law for plan in plans if plan.physics} == set(NUMBERS["read_law"].words)
+    assert {plan.physics.read_law for plan in plans if plan.physics} == set(NUMBERS["read_law"].limit.words)
 
 
 def test_the_golden_image_reaches_every_limit() -> None:
