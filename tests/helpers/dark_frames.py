@@ -10,17 +10,6 @@ import numpy as np
 from unprocess_gen.core.arrays import Raw
 
 
-class DarkPixelsInMemory:
-    """Hold the pixels of dark frames by name, as `simulation.facts.DarkPixels`."""
-
-    def __init__(self, frames: dict[str, Raw]) -> None:
-        self.frames = frames
-
-    def frame(self, sha256: str) -> Raw:
-        """Return the frame with this name."""
-        return self.frames[sha256]
-
-
 def banded(seed: int, shape: tuple[int, int] = (70, 90), black: int = 512, std: float = 3.0) -> Raw:
     """Return a dark frame with read noise, rows and columns, rounded."""
     rng = np.random.default_rng(seed)

@@ -15,19 +15,18 @@ from helpers.commands import RunMain, messages
 from helpers.configs import with_branch
 from helpers.datasets import Settings
 from helpers.flats import body_part, response
-from helpers.omissions import SCENES, omission
 from helpers.photographs import fill
 from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.planning.effect_selection import EffectRules, Prediction, Selection, facts_of, omit_weakest
 from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.plan import plan_image, plan_levels
-from unprocess_gen.simulation.effects import BY_NAME
+from unprocess_gen.simulation.effects import BY_NAME, order
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.effects.black_error import BlackError
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
@@ -39,6 +38,42 @@ from unprocess_gen.simulation.reference.sensor import to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
 from unprocess_gen.simulation.tone_curves import linear_table
 from unprocess_gen.sources import synthetic
+
+SCENES = ("daylight", "indoor", "low_light", "night", "video_night", "long_exposure")
+
+
+def unrounded(srgb: Srgb, plan: Plan) -> tuple[Float, Float]:
+    """Return the clean and the noisy frame in DN, before rounding."""
+    light = unprocess(srgb, plan) * plan.scene.exposure
+    factor = order.light_factor(plan, light.shape)
+    light = light if factor is None else light * factor
+    clean_dn = to_dn(light, plan.sensor.black_level_dn, plan.sensor.white_level_dn, plan.brightest)
+    return clean_dn, order.noisy(clean_dn, plan)
+
+
+def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[str, Float]:
+    """Return the squared omission of ``auto`` divided by the masking variance, for each statistic.
+
+    One value per pixel, row, column and colour plane of the mean over the ``frames`` of a still clip. The masking
+    variance is that of ``auto`` at the local signal.
+    """
+    clean_dn = unrounded(srgb, auto)[0]
+    clips = ([unrounded(srgb, plan.replace(frame=n))[1] for n in range(frames)] for plan in (everything, auto))
+    with_all, with_some = (np.mean(clip, axis=0) for clip in clips)
+    omitted = with_all - with_some
+    variance = noise_variance(clean_dn, auto) + 1 / 12
+    if auto.physics is not None and "dark_current" in auto.noise.effects:
+        variance = variance + auto.physics.dn_per_e**2 * auto.physics.dark_e
+    variance = variance / frames
+    height, width = omitted.shape
+    planes = [(omitted[y::2, x::2], variance[y::2, x::2]) for y in range(min(height, 2)) for x in range(min(width, 2))]
+    return {
+        "pixel": (omitted**2 / variance).ravel(),
+        "row mean": omitted.mean(1) ** 2 / (variance.mean(1) / width),
+        "column mean": omitted.mean(0) ** 2 / (variance.mean(0) / height),
+        "plane mean": np.array([part.mean() ** 2 / (noise.mean() / part.size) for part, noise in planes]),
+    }
+
 
 RARE = {
     "lens_shading": "lens_shading", "gain_by_colour": "gain_by_colour", "column_temporal": "column_temporal_std_dn",

@@ -17,7 +17,6 @@ from typing import TypeVar
 import numpy as np
 import pytest
 from helpers.cases import slow_except
-from helpers.dark_frames import DarkPixelsInMemory
 from helpers.flats import IDENTITY, SILENT, plan_with
 from helpers.promise_report import Figure
 
@@ -72,6 +71,17 @@ READ_SHAPES = (0.0, -0.1, 0.1571, -0.45, 5.0)
 
 QUICK, SLOW = 8, 500
 """Cases of each kind and dtype."""
+
+
+class DarkPixelsInMemory:
+    """Hold the pixels of dark frames by name, as `simulation.facts.DarkPixels`."""
+
+    def __init__(self, frames: dict[str, np.ndarray]) -> None:
+        self.frames = frames
+
+    def frame(self, sha256: str) -> np.ndarray:
+        """Return the frame with this name."""
+        return self.frames[sha256]
 
 
 class Dice(random.Random):
