@@ -16,7 +16,7 @@ from unprocess_gen.pipeline.verify import have_same_rows
 
 
 def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any]) -> Config:
-    """Return the settings of a dataset with ``changes``, which contain another ``out`` and the dark frames."""
+    """Settings of a dataset with ``changes``, which contain another ``out`` and the dark frames."""
     check_format(folder)
     config, kind = read_dataset_yaml(folder / "config.yaml")
     out = any_path(changes["out"])
@@ -33,7 +33,7 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
 
 
 def _root(folder: AnyPath, kind: str, root: str | None) -> str | None:
-    """Return the root of the sources, given or recorded; None for the synthetic pictures."""
+    """Root of the sources, given or recorded; None for the synthetic pictures."""
     if kind == "synthetic":
         if root is not None:
             raise ConfigError(

@@ -73,7 +73,7 @@ class Build:
         return list(read_rows(self.rows_file))
 
     def photographs_folder(self) -> Path | None:
-        """Return scikit-image's folder of photographs; None if the build needs none.
+        """Find scikit-image's folder of photographs; None if the build needs none.
 
         ConfigError if scikit-image is missing, SourceChangedError if a photograph has other bytes than recorded.
         """
@@ -103,7 +103,7 @@ class Build:
             check_output_folder(folder, option)
 
     def overrides(self, folder: Path, photographs: Path | None) -> list[str]:
-        """Return the settings that make the build in a folder; settings of a sweep have several values."""
+        """Settings that make the build in a folder; settings of a sweep have several values."""
         source = []
         if photographs is not None:
             names = ",".join(self.recipe.photographs)

@@ -190,7 +190,7 @@ class LivePairs:
         return LiveSample(*frames, row, source.name, targets)
 
     def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
-        """Return a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
+        """Make a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
 
         Items are tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets if
         there are any; with ``arrays_only`` of arrays.
@@ -206,7 +206,7 @@ class LivePairs:
     def _prepared(
         self, place: int, image: LiveImage, srgb: Srgb, epoch: int, number: int
     ) -> tuple[Plan, Patch, CropMaker]:
-        """Return the plan of an epoch, without its number, the patch, and what makes crops of the image."""
+        """Find the plan of an epoch, without its number, the patch, and what makes crops of the image."""
         redraws = self._redraw == "all"
         plan_epoch = epoch if redraws or image.plan.dark else 0
         settings, patch, frame = self._sources[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
@@ -226,7 +226,7 @@ class LivePairs:
         return prepared[0], patch, prepared[1]
 
     def _redrawn(self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int) -> Plan:
-        """Return the plan of an epoch, without its number."""
+        """Draw the plan of an epoch, without its number."""
         plan = image.plan
         if self._redraw == "all":
             facts = self._facts.get(number)
@@ -239,7 +239,7 @@ class LivePairs:
         return plan
 
     def _frame(self, frame: Frame, plan: Plan) -> Frame:
-        """Return a frame as light."""
+        """Convert a frame to light."""
         return frame if frame.dtype != np.uint16 else to_light(frame, levels_of(plan))
 
 
@@ -272,12 +272,12 @@ class LiveRow(Mapping[str, Value]):
 def _build_row(
     source: LiveSource, image: LiveImage, plan: Plan, epoch: int, patch: Patch, clean: Frame, noisy: Frame, counts: Any
 ) -> dict[str, Value]:
-    """Return the row of a pair in an epoch."""
+    """Build the row of a pair in an epoch."""
     return source.row(image, plan.replace(epoch=epoch), patch, Pair(clean, noisy, counts()))
 
 
 def _without_none(row: Mapping[str, Value]) -> dict[str, Value]:
-    """Return a row whose columns have one type in every pair: NaN instead of None, text where some pairs have text."""
+    """Give the columns of a row one type in every pair: NaN instead of None, text where some pairs have text."""
     texts = {column.name for column in COLUMNS if column.type is number_or_text}
     cells = {"epoch": 0} | {name: math.nan if value is None else value for name, value in row.items()}
     return {name: str(value) if name in texts else value for name, value in cells.items()}

@@ -39,20 +39,9 @@ KEPT = 4096
 
 @dataclass(frozen=True, slots=True)
 class LiveImage:
-    """All that decides a pair in epoch 0.
+    """All that decides a pair in epoch 0, as `dataset.row.pair_row` takes it.
 
-    Attributes
-    ----------
-    source, sha256, orientation, shard, key
-        As `dataset.manifest.pair_row` takes them.
-    plan : Plan
-        All parameters of the pair.
-    patch : Patch
-        Part of the image that the pair shows.
-    source_noise_dn : float or None
-        As `dataset.manifest.pair_row` takes it.
-    offset : int or None
-        Place of the pair's row in the manifest of a dataset, if the row has digests.
+    ``offset`` is the place of the pair's row in the manifest of a dataset, if the row has digests.
     """
 
     source: Source
@@ -134,7 +123,7 @@ class RecordedPairs(LiveSource):
         return dict(read_row(self._manifest, offset, self._columns))
 
     def image(self, number: int) -> LiveImage:
-        """Return all that decides the pair of a row."""
+        """Read all that decides the pair of a row."""
         image = self._kept.get(number)
         if image is None:
             offset = int(self._offsets[number])
@@ -151,7 +140,7 @@ class RecordedPairs(LiveSource):
         return self._sources.photograph(image.source, image.sha256, image.plan.source).srgb
 
     def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
-        """Return the row of a pair; the recorded one in epoch 0."""
+        """Build the row of a pair, or read the recorded one in epoch 0."""
         if image.offset is None or plan.place.epoch or patch != image.patch:
             return image.row(plan, patch, pair)
         return self._read(image.offset)

@@ -34,17 +34,7 @@ from unprocess_gen.sources.patches import crop_patch, list_patches
 
 @dataclass(frozen=True, slots=True)
 class PairSettings:
-    """Settings that all pairs of a run share: the config, and its dark frames if it names any.
-
-    Attributes
-    ----------
-    config : Config
-        The config, with the digests of the dark frames.
-    dark_frames : DarkFrames or None
-        What plans need of the dark frames.
-    dark_folder : DarkFolder or None
-        Access to their pixels.
-    """
+    """A config with the digests of its dark frames, what plans need of them, and access to their pixels."""
 
     config: Config
     dark_frames: DarkFrames | None = None
@@ -58,22 +48,10 @@ class PairSettings:
 
 @dataclass(frozen=True, slots=True)
 class PlannedImage:
-    """The pixels of an image and all that decides its pairs.
+    """A decoded image and all that decides its pairs: a plan for each draw of each noise level, and patches.
 
-    Attributes
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        The decoded image.
-    plans : tuple of Plan
-        A plan for each draw of each noise level.
-    patches : tuple of Patch
-        The parts of the image that become samples.
-    facts : Facts or None
-        Facts about the pixels, for physical noise profiles.
-    dark_folder : DarkFolder or None
-        Access to the dark frames that the plans name.
-    config : Config or None
-        The config of the image; None if the plans are recorded.
+    ``facts`` are those about the pixels, for physical noise profiles; ``dark_folder`` gives access to the dark frames
+    that the plans name. ``config`` is None if the plans are recorded.
     """
 
     srgb: Srgb
@@ -126,12 +104,12 @@ def targets_of(
 
 
 def levels_of(plan: Plan) -> dict[str, Value]:
-    """Return the levels of a plan as columns of a row."""
+    """Levels of a plan as columns of a row."""
     return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
 
 
 def kernels_for(names: Sequence[str], plan: Plan) -> list[str]:
-    """Return the sets of kernels that simulate a plan and its targets (`self_test.kernels`)."""
+    """Sets of kernels that simulate a plan and its targets (`self_test.kernels`)."""
     own = self_test.kernels(plan)
     if LINEAR_RGB not in names:
         return [own]

@@ -132,7 +132,7 @@ class Progress:
 
 
 def with_bar(items: Iterable[Item], unit: str, total: int | None = None) -> Iterable[Item]:
-    """Return the items; iterating over them shows a bar on a terminal if it takes longer than `BAR_DELAY_S`."""
+    """Iterate over items, and show a bar on a terminal if it takes longer than `BAR_DELAY_S`."""
     is_shown = LOGGER.isEnabledFor(logging.INFO) and sys.stderr is not None and sys.stderr.isatty()
     return tqdm(items, total=total, unit=unit, file=_Unfailing(), leave=False, delay=BAR_DELAY_S, disable=not is_shown)
 

@@ -48,20 +48,10 @@ ADVICE = "restore the file, or regenerate the dataset"
 
 @dataclass(frozen=True, slots=True)
 class ReplayResult:
-    """Outcome of regenerating one row.
+    """The outcome for one row.
 
-    Attributes
-    ----------
-    key, source : str
-        Key and source of the row.
-    complaint : str
-        What differs; empty if the pair is the same, bit for bit.
-    source_changed : bool
-        Whether the source was changed or deleted, so that the row could not be checked.
-    written : bool
-        Whether the arrays were written.
-    compared : bool
-        False if the row has no digests.
+    ``complaint`` says what differs; it is empty if the pair is the same, bit for bit. With ``source_changed`` the
+    source was changed or deleted, so that the row could not be checked. ``compared`` is False without digests.
     """
 
     key: str
@@ -101,13 +91,13 @@ def source_root(manifest: AnyPath, root: str | None) -> str | None:
 
 
 def source_changes(root: str | None, folder: AnyPath) -> dict[str, Any]:
-    """Return the settings that give the place of the sources, and the list that ``dataset.json`` records."""
+    """Settings that give the place of the sources, and the list that ``dataset.json`` records."""
     recorded = _recorded_places(folder / "manifest.csv").source.list
     return {"source.root": root, "source.list": recorded if root else None}
 
 
 def dark_frames_root(manifest: AnyPath, given: str | None = None) -> str | None:
-    """Return the folder of the dark frames of a dataset: the given one, else the recorded one; None without one."""
+    """Folder of the dark frames of a dataset: the given one, else the recorded one; None without one."""
     return given or (_recorded_places(manifest).dark_frames or DarkFrameFacts()).root
 
 
@@ -207,7 +197,7 @@ class PairRegenerator:
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
     def regenerate(self, row: Row) -> Targets:
-        """Return the frames and targets of a row by name, without comparing their digests.
+        """Make the frames and targets of a row by name, without comparing their digests.
 
         Raises SourceChangedError if the source was changed or deleted, DamageError if the row has no valid plan,
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
@@ -229,7 +219,7 @@ class PairRegenerator:
         return {"clean": pair.clean, "noisy": pair.noisy, **targets}
 
     def photograph(self, source: Source, recorded: str, prepared: SourcePlan) -> Photograph:
-        """Return the decoded source of a row with this SHA-256; raise as `regenerate`."""
+        """Decode the source of a row with this SHA-256; raise as `regenerate`."""
         if self._root is None and source.size_bytes != 0:
             raise ConfigError(
                 f"source.root is missing: row {source.index:08d} was generated from the file {source.name}; "
@@ -247,7 +237,7 @@ class PairRegenerator:
         return photograph
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
-        """Return access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
+        """Give access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
         if plan.dark is None:
             return None
         if self._dark_frames is None:
@@ -261,7 +251,7 @@ class PairRegenerator:
             raise SourceChangedError(str(error)) from error
 
     def regenerate_exactly(self, row: Row) -> Targets:
-        """Return the arrays of a row; raise as `regenerate`, and DamageError if they have other digests."""
+        """Make the arrays of a row; raise as `regenerate`, and DamageError if they have other digests."""
         arrays = self.regenerate(row)
         if difference := _difference(arrays, row):
             raise DamageError(difference)
@@ -288,7 +278,7 @@ class PairRegenerator:
 
 
 def recorded_source(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
-    """Return the settings with which the source of a row is decoded again."""
+    """Settings with which the source of a row is decoded."""
     place = None if source.size_bytes == 0 else root  # synthetic pictures have no bytes
     config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
     if not prepared.is_raw:
@@ -319,7 +309,7 @@ def _save(arrays: Targets, to: Path, key: str) -> None:
 
 
 def source_of(row: Row) -> Source:
-    """Return the source that a row was made from."""
+    """Source that a row was made from."""
     name, size = str(row["source"]), row["source_bytes"]
     path = decode_name(name)
     size, frame = size if isinstance(size, int) else None, int(row["frame"] or 0)
