@@ -250,23 +250,12 @@ def test_source_that_changes_during_a_run_stops_it(make: Make, tmp_path: Path, m
 # The three files ------------------------------------------------------------------------------------------------------
 
 
-def test_dataset_json_records_the_digests_of_sha256sum(dataset: Path) -> None:
+def test_dataset_json_records_digests_source_and_versions(dataset: Path, photos: Path) -> None:
     known = facts(dataset)
-    assert known["manifest_sha256"] == sha256(dataset / "manifest.csv")
-    assert known["config_sha256"] == sha256(dataset / "config.yaml")
-    assert [entry["sha256"] for entry in known["shards"]] == [
-        sha256(dataset / entry["file"]) for entry in known["shards"]
-    ]
-
-
-def test_fingerprint_is_the_digest_of_config_and_manifest(dataset: Path) -> None:
-    known = facts(dataset)
-    text = f"{known['config_sha256']}\n{known['manifest_sha256']}\n"
-    assert known["fingerprint"] == hashlib.sha256(text.encode()).hexdigest()
-
-
-def test_dataset_json_records_source_and_versions(dataset: Path, photos: Path) -> None:
-    known = facts(dataset)
+    digests = [sha256(dataset / name) for name in ("config.yaml", "manifest.csv")]
+    assert [known["config_sha256"], known["manifest_sha256"]] == digests
+    assert known["fingerprint"] == hashlib.sha256("{}\n{}\n".format(*digests).encode()).hexdigest()
+    assert all(entry["sha256"] == sha256(dataset / entry["file"]) for entry in known["shards"])
     assert sorted(os.listdir(dataset)) == ["config.yaml", "dataset.json", "manifest.csv", "shards"]
     assert (known["not_matched"], known["skipped_links"]) == (1, 0)
     assert known["source"] == {"kind": "folder", "root": str(photos)}
@@ -320,11 +309,8 @@ def test_shards_split_the_listing_in_order(count: int, per_shard: int, lengths: 
     assert [source for task in tasks for source in task.sources] == [*sources]
 
 
-def test_no_more_workers_than_tasks_and_at_least_one() -> None:
+def test_number_of_workers_follows_from_tasks_and_allowed_cores() -> None:
     assert [local.effective_jobs(4, tasks) for tasks in (0, 1, 3, 9)] == [1, 1, 3, 4]
-
-
-def test_n_jobs_minus_one_uses_all_allowed_cores() -> None:
     assert local.effective_jobs(-1, 10**6) == len(os.sched_getaffinity(0))
 
 
