@@ -37,7 +37,12 @@ BANNED = {
 }
 """Words of the 0.1 dialect, as regular expressions that match complete words, and what to write instead."""
 
-BAD_STARTS = re.compile(r"(As|Of|Do so|The same|By|Where|What|Whether|Which|How|That)\b")
+BAD_STARTS = re.compile(
+    r"(As|Of|Do so|The same|By|Where|What|Whether|Which|How|That|Also|These|Those|It|Hold)\b"
+    r"|(Return|Yield|Give) (what|by how|how much|that of|those of|the same)\b"
+)
+"""Openings that need the docstring before them, or say what names and types say."""
+
 NUMPYDOC_CODES = {"PR01", "PR02", "PR03", "RT01", "GL06", "GL07", "SS03"}
 """Parameters documented, known and in order; returns documented; sections known and in order; summary with a period."""
 

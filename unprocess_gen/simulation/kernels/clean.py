@@ -64,7 +64,7 @@ def is_steep(plan: Plan) -> bool:
 
 
 class Unprocessing(NamedTuple):
-    """Hold the parameters of a clean frame in float64."""
+    """Parameters of a clean frame in float64."""
 
     products: NDArray[Any]  # [3, 3, codes]: matrix entry (c, j) times the curve at code k; [4, 3, codes] of raw sources
     code_count: int
@@ -91,7 +91,7 @@ class Unprocessing(NamedTuple):
 
 
 class Unprocessing32(Unprocessing):
-    """Hold the parameters of a clean frame in float32; DN count from the black level, and ``clipped`` has a margin.
+    """Parameters of a clean frame in float32; DN count from the black level, and ``clipped`` has a margin.
 
     ``products`` are scaled to DN, except with gray_mean, which compares channels.
     """

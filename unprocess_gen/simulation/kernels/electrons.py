@@ -64,7 +64,7 @@ _RATE_ERROR32 = np.float32(FLOAT32_RATE)
 
 
 class Electrons(NamedTuple):
-    """Hold the slots of N frames of one sensor unit; P is the number of columns of complete blocks."""
+    """The slots of N frames of one sensor unit; P is the number of columns of complete blocks."""
 
     numbers: Float  # [N, len(PLACES)]: see `FrameNumbers`
     site_lines: NDArray[np.uint64]  # [N, 4097]: quantiles of the noise of a site
@@ -89,7 +89,7 @@ class Electrons(NamedTuple):
 
 
 class FrameNumbers(NamedTuple):
-    """Hold the numbers of one frame; `load_frame` reads them from an array, in this order."""
+    """Numbers of one frame; `load_frame` reads them from an array, in this order."""
 
     counts_light: bool  # otherwise the electrons of light are their mean
     has_dark: bool  # counts of one rate at every site

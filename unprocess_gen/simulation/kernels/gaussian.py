@@ -36,7 +36,7 @@ _8, _ONE_BITS = np.uint64(8), np.uint32(0x3F800000)
 
 
 class Gaussian(NamedTuple):
-    """Hold the variance lines of N frames."""
+    """Variance lines of N frames."""
 
     line: Float  # [N, 2]: a and b
     black_dn: float
@@ -46,7 +46,7 @@ class Gaussian(NamedTuple):
 
 
 class Gaussian32(NamedTuple):
-    """Hold the variance lines of N frames in float32."""
+    """Variance lines of N frames in float32."""
 
     line: Float32  # [N, 2]
     black_dn: NDArray[np.float32]  # [SIZE] equal values

@@ -43,7 +43,7 @@ _ONE_BITS, _FIRST_ROW = np.uint64(0x3FF0000000000000), np.uint64(1022 * SEGMENTS
 
 
 class Quantiles(NamedTuple):
-    """Hold the exact and the approximate quantiles of a symmetric distribution.
+    """Exact and approximate quantiles of a symmetric distribution.
 
     Attributes
     ----------

@@ -47,7 +47,7 @@ _COEFFICIENTS = np.array([(*series, *(0.0,) * (_POWERS - len(series))) for serie
 
 
 class CountTables(NamedTuple):
-    """Hold the tables of approximate and exact counts.
+    """Tables of approximate and exact counts.
 
     Attributes
     ----------

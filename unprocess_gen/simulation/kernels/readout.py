@@ -49,7 +49,7 @@ _8 = np.uint64(8)
 
 
 class ReadOut(NamedTuple):
-    """Hold what the read-out of N frames needs; a subclass selects the compiled code."""
+    """Levels and limits for the read-out of N frames; a subclass selects the compiled code."""
 
     limits_dn: Float  # [N, 4]: lowest and highest DN, pinned level, and clean value from which sites are pinned
     variance_lines: NDArray[Any]  # [N, 2]: a and b

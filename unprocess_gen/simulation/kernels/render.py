@@ -124,7 +124,7 @@ Noise = Gaussian | Gaussian32 | Electrons
 
 
 class _Form(NamedTuple):
-    """Hold what all crops of one size share, wherever they are: looked up once for each, because records are hashed."""
+    """Records that all crops of one size share, wherever they are: kept for each size, because records are hashed."""
 
     shape: tuple[int, ...]
     clean_dtype: Any

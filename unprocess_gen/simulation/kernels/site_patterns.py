@@ -42,7 +42,7 @@ Shape = tuple[int, int]
 
 
 class SitePatterns(NamedTuple):
-    """Hold the fixed patterns of a sensor unit for a crop."""
+    """Fixed patterns of a sensor unit for a crop."""
 
     response: SiteMap  # float32: factor on the electrons of light
     sites_dn: SiteMap  # float32: offsets by site
@@ -232,7 +232,7 @@ computed for each crop; and the multiple to which sides of frames are rounded up
 
 
 class _Frame(NamedTuple):
-    """Hold a pattern of the complete frame, from which live crops cut theirs.
+    """A pattern of the complete frame, from which live crops cut theirs.
 
     Live crops are at new places in each epoch. To compute their patterns would take a quarter of a crop of 128 x 128.
     """
