@@ -260,12 +260,9 @@ def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     sizes = Counter(source.size_bytes for source in sources)
     suspects = [source for source in sources if source.size_bytes is not None and sizes[source.size_bytes] > 1]
     place = any_path(root)
-    tails = place.map(partial(_digest, root, tail=TAIL_BYTES), suspects)
-    groups: dict[tuple[int | None, bytes], list[Source]] = {}
-    for source, end in zip(suspects, tails, strict=True):
-        if end is not None:
-            groups.setdefault((source.size_bytes, end), []).append(source)
-    alike = [source for group in groups.values() if len(group) > 1 for source in group]
+    tails = list(place.map(partial(_digest, root, tail=TAIL_BYTES), suspects))
+    counts = Counter(tails)
+    alike = [source for source, tail in zip(suspects, tails, strict=True) if tail is not None and counts[tail] > 1]
     numbered, seen = list(sources), Counter[bytes]()
     for source, digest in zip(alike, place.map(partial(_digest, root), alike), strict=True):
         if digest is not None:
@@ -274,11 +271,14 @@ def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     return tuple(numbered)
 
 
-def _digest(root: str, source: Source, tail: int | None = None) -> bytes | None:
-    """SHA-256 of a file, or of its last ``tail`` bytes; None if it cannot be read."""
-    start = 0 if tail is None else max(0, (source.size_bytes or 0) - tail)
-    with suppress(SourceError), opened(root, source, start) as file:
-        return hashlib.file_digest(file, "sha256").digest()  # type: ignore[arg-type]
+def _digest(root: str, source: Source, tail: int = 0) -> bytes | None:
+    """SHA-256 of a file, or of its last ``tail`` bytes and its size; None if it cannot be read."""
+    size_bytes = source.size_bytes or 0
+    with suppress(SourceError), opened(root, source, max(0, size_bytes - tail) if tail else 0) as file:
+        digest = hashlib.file_digest(file, "sha256")  # type: ignore[arg-type]
+        if tail:
+            digest.update(b"%d" % size_bytes)
+        return digest.digest()
     return None
 
 
