@@ -30,7 +30,7 @@ class Distribution:
 
 
 def draw_parameter(distribution: Distribution, uniform: float, a: float = 0.0) -> float:
-    """Return the value of a distribution at a uniform in (0, 1), correctly rounded; ``uniform`` within three roundings.
+    """Value of a distribution at a uniform in (0, 1), correctly rounded; ``uniform`` within three roundings.
 
     ``a`` is the slope of the noise variance, for ``log_linear_in_a``.
     """
@@ -216,7 +216,7 @@ ISO_FORMS = {
 
 
 def spelled(name: str, form: Form | Kind) -> str:
-    """Return a form as users write it, such as ``[uniform, lowest, highest]``."""
+    """Form as users write it, such as ``[uniform, lowest, highest]``."""
     return f"[{', '.join((name, *form.numbers))}]"
 
 
@@ -251,12 +251,12 @@ def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
 
 
 def lowest(distribution: Distribution) -> float:
-    """Return a lower limit of all draws from a validated distribution; -inf if there is none."""
+    """Lower limit of all draws from a validated distribution; -inf if there is none."""
     return _limits(distribution)[0]
 
 
 def highest(distribution: Distribution) -> float:
-    """Return an upper limit of all draws from a validated distribution; inf if there is none."""
+    """Upper limit of all draws from a validated distribution; inf if there is none."""
     return _limits(distribution)[1]
 
 

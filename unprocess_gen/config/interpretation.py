@@ -55,7 +55,7 @@ def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]
 
 
 def lights(config: Config) -> tuple[tuple[str, float], ...]:
-    """Return the lights from which the gains follow, and their shares; none if the gains are drawn by themselves."""
+    """Lights from which the gains follow, and their shares; none if the gains are drawn by themselves."""
     gains, scene = config.gains, config.scene
     if gains.light != "scene":
         return () if gains.light is None else ((gains.light, 1.0),)
@@ -105,19 +105,19 @@ def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
 
 
 def provenance_at(noise: NoiseConfig, isos: Sequence[float]) -> list[ProvenanceConfig]:
-    """Return the statements about the source of a physical profile's numbers at some ISOs."""
+    """Statements about the source of a physical profile's numbers at some ISOs."""
     return [fact for fact in noise.provenance if not fact.iso or any(fact.iso[0] <= iso <= fact.iso[1] for iso in isos)]
 
 
 @functools.cache
 def needed_numbers(effect: str) -> tuple[str, ...]:
-    """Return the keys of a profile that must have a number for an effect to be simulated."""
+    """Keys of a profile that must have a number for an effect to be simulated."""
     declared = BY_NAME[effect].declared
     return tuple(number.key or name for name, number in declared.items() if not number.optional)
 
 
 def missing_number(noise: NoiseConfig, effect: str) -> str | None:
-    """Return the first key that a physical profile lacks to simulate an effect; None if it has all."""
+    """First key that a physical profile lacks to simulate an effect; None if it has all."""
     for key in needed_numbers(effect):
         groups = noise.branches if key in BRANCH_FIELDS else (noise,)
         if any(getattr(group, key) is None for group in groups):
@@ -131,7 +131,7 @@ def uses_dark_frames(noise: NoiseConfig) -> bool:
 
 
 def assumed_numbers(noise: NoiseConfig, effect: str) -> tuple[str, ...]:
-    """Return the keys of a physical profile that an effect depends on and that the profile marks as assumed."""
+    """Keys of a physical profile that an effect depends on and that the profile marks as assumed."""
     keys = (*needed_numbers(effect), *(HEAT if BY_NAME[effect].heat else ()))
     return tuple(key for key in keys if key in noise.assumed)
 
@@ -187,7 +187,7 @@ UNCLIPPED = "none"
 
 
 def saturated_as(config: Config) -> str:
-    """Return the noisy value of sites whose clean frame is saturated.
+    """Noisy value of sites whose clean frame is saturated.
 
     Without a full well, and without clipping of the noisy frame, nothing stops noise above white. Otherwise half of it
     is cut off, and the mean of the noisy frame at white is below white.
@@ -199,7 +199,7 @@ def saturated_as(config: Config) -> str:
 
 
 def effect_switch(effects: EffectsConfig, effect: str) -> str:
-    """Return the switch of an effect."""
+    """Switch of an effect."""
     return str(getattr(effects, effect) or effects.all)
 
 

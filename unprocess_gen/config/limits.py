@@ -15,7 +15,7 @@ from unprocess_gen.simulation.reference.light import LIGHTS
 
 
 def text(what: str) -> Limit:
-    """Return the limit of a text that is not empty; ``what`` names it."""
+    """Limit of a text that is not empty; ``what`` names it."""
     return Limit(what, bool, repr)
 
 

@@ -83,7 +83,7 @@ def _check_calibration(noise: NoiseConfig) -> None:
 
 
 def _span(noise: NoiseConfig) -> int:
-    """Return white above black, in the units of the profile."""
+    """White above black, in the units of the profile."""
     return 1 if noise.units == "normalized" else (noise.white_level_dn or 0) - (noise.black_level_dn or 0)
 
 
@@ -199,7 +199,7 @@ def _check_shape(key: str, branch: BranchConfig) -> None:
 
 
 def _table_values(key: str, value: Any, branch: BranchConfig) -> Sequence[Any]:
-    """Return the values of a table ``by_iso``, whose ISOs are checked, or the value itself."""
+    """Values of a table ``by_iso``, whose ISOs are checked, or the value itself."""
     if not isinstance(value, list | tuple) or value[:1] not in (["by_iso"], ("by_iso",)):
         return [value]
     _check_isos(key, value, branch)
@@ -280,7 +280,7 @@ def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
 
 
 def value_at(form: Any, iso: float) -> float:
-    """Return a gain or standard deviation at an ISO without scatter, to the precision of the C library."""
+    """Gain or standard deviation at an ISO without scatter, to the precision of the C library."""
     match form:
         case ["line", slope, intercept, *_]:
             return math.exp(slope * math.log(iso) + intercept)

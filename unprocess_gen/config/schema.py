@@ -35,7 +35,7 @@ class FrozenMapping(dict[str, Any]):
 
 
 def frozen(value: Any) -> Any:
-    """Return a value of a config in a hashable form."""
+    """Value of a config in a hashable form."""
     if isinstance(value, list | tuple):
         return tuple(map(frozen, value))
     return FrozenMapping({name: frozen(item) for name, item in value.items()}) if isinstance(value, dict) else value
@@ -272,7 +272,7 @@ class EffectGroup(Group):
 
 
 def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
-    """Return type and default of the key of a number."""
+    """Type and default of the key of a number."""
     kind: Any
     null, kind, limit = "", float, _limit(number)
     if number.may_be_unknown:
@@ -286,7 +286,7 @@ def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
 
 
 def _limit(number: Number) -> Limit:
-    """Return the values that the key of a number allows."""
+    """Values that the key of a number allows."""
     if number.kind in (SHAPE, SITES):
         return limits.READ_SHAPE if number.kind == SHAPE else limits.BLACK_ERROR
     if isinstance(number.limit, Choice):
@@ -298,7 +298,7 @@ def _limit(number: Number) -> Limit:
 
 
 def _number_fields(in_branch: bool) -> Fields:
-    """Return the keys of the numbers of a branch, or of the profile."""
+    """Keys of the numbers of a branch, or of the profile."""
     declared = profile_keys().items()
     return {name: _number_field(*number) for name, number in declared if number[1].in_branch == in_branch}
 
@@ -640,7 +640,7 @@ NESTED: dict[str, type[Any]] = {"source.raw": RawConfig}
 
 
 def group_settings(group: str) -> dict[str, Setting]:
-    """Return the settings of a group by key, and those of the groups inside of it: ``raw.pattern``."""
+    """Settings of a group by key, and those of the groups inside of it: ``raw.pattern``."""
     inside = {place.removeprefix(f"{group}."): kind for place, kind in NESTED.items() if place.startswith(f"{group}.")}
     nested = {f"{place}.{key}": setting for place, kind in inside.items() for key, setting in settings_of(kind).items()}
     return {**settings_of(GROUPS[group]), **nested}
@@ -654,7 +654,7 @@ def all_settings() -> Iterator[tuple[str, str, Setting]]:
 
 
 def replaced(config: Config, changes: Mapping[str, Any]) -> Config:
-    """Return a copy of a config with other values: ``{"source.root": "photos", "seed": 3}``."""
+    """Copy of a config with other values: ``{"source.root": "photos", "seed": 3}``."""
     for setting, value in changes.items():
         group, _, name = setting.rpartition(".")
         if group:

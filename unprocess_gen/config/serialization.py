@@ -48,21 +48,21 @@ SOURCE_KINDS = ("folder", "synthetic", "raw")
 
 
 def source_kind(config: Config) -> str:
-    """Return the kind of source that ``config.yaml`` records."""
+    """Kind of source that ``config.yaml`` records."""
     if config.source.kind == "raw":
         return "raw"
     return "synthetic" if config.source.place is None else "folder"
 
 
 def dataset_yaml(config: Config) -> str:
-    """Return the text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
+    """Text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
     settings = recorded(config)
     settings["source"] |= {"kind": source_kind(config), "patch": canonical_patch(config.source)}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
 
 
 def recorded(value: Any, is_float: bool = False) -> Any:
-    """Return a value of a config as ``config.yaml`` has it: mappings, lists, and numbers of one type.
+    """Value of a config as ``config.yaml`` has it: mappings, lists, and numbers of one type.
 
     Floats are written as floats (``is_float``), because users may write 1 or 1.0.
     """
@@ -109,7 +109,7 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
 
 
 def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
-    """Return a dataclass of the schema from a mapping; ``prefix`` is its dotted path, with a dot at the end."""
+    """Dataclass of the schema from a mapping; ``prefix`` is its dotted path, with a dot at the end."""
     if not isinstance(loaded, dict):
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
     fields = set(data_keys(group))
@@ -122,7 +122,7 @@ def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
 
 
 def _convert(kind: Any, value: Any, key: str) -> Any:
-    """Return a value as the type of its field; ConfigError if the type does not fit."""
+    """Value as the type of its field; ConfigError if the type does not fit."""
     if kind is Any:
         return value
     if get_origin(kind) is Union:
@@ -143,7 +143,7 @@ def _convert(kind: Any, value: Any, key: str) -> Any:
 
 
 def writable_node(group: type[Any]) -> DictConfig:
-    """Return OmegaConf's node of a dataclass, which accepts overrides although the dataclass is frozen."""
+    """OmegaConf's node of a dataclass, which accepts overrides although the dataclass is frozen."""
     from omegaconf import OmegaConf
 
     def unlock(node: Any) -> None:

@@ -41,13 +41,13 @@ class Setting:
 
     @property
     def allowed(self) -> str:
-        """Return the allowed values in words, as after "expected" in a message."""
+        """Allowed values in words, as after "expected" in a message."""
         text = str(self.limit)
         return f"{text} or null" if self.null and "null" not in text else text
 
     @property
     def description(self) -> str:
-        """Return meaning, unit, allowed values and the meaning of null in one line."""
+        """Meaning, unit, allowed values and the meaning of null in one line."""
         unit = f", in {self.unit}" if self.unit else ""
         null = f"; null: {self.null}" if self.null else ""
         return f"{self.meaning}{unit}. Allowed: {self.limit}{null}"
@@ -59,7 +59,7 @@ class Setting:
 
 
 def key(default: Any, limit: Limit | None = None, section: str = "", of: str = "", **details: Any) -> Any:
-    """Return a field of the schema with its description; ``details`` are other fields of `Setting`.
+    """Field of the schema with its description; ``details`` are other fields of `Setting`.
 
     A key ``of`` a field of the plan has the field's meaning, unit and allowed values, unless others are given.
     """
@@ -71,7 +71,7 @@ def key(default: Any, limit: Limit | None = None, section: str = "", of: str = "
 
 
 def settings_of(group: Any) -> Mapping[str, Setting]:
-    """Return the settings of a group by key."""
+    """Settings of a group by key."""
     return {field.name: field.metadata[METADATA] for field in dataclasses.fields(group) if METADATA in field.metadata}
 
 

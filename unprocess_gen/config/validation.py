@@ -253,7 +253,7 @@ def _check_lights(config: Config) -> None:
 
 
 def _named_switch(config: Config, effect: str) -> str:
-    """Return the switch of an effect, empty unless it is set by name."""
+    """Switch of an effect, empty unless it is set by name."""
     return effect_switch(config.effects, effect) if getattr(config.effects, effect) else ""
 
 

@@ -13,7 +13,7 @@ LONGEST_VALUE = 80
 
 
 def refusal(key: str, value: Any, problem: str) -> ConfigError:
-    """Return the error about the value of a key: ``key=value: problem``."""
+    """Error about the value of a key: ``key=value: problem``."""
     text = value_text(value)
     return ConfigError(f"{key}={text[:LONGEST_VALUE]}{'…' * (len(text) > LONGEST_VALUE)}: {problem}")
 
@@ -25,11 +25,11 @@ def one_of(key: str, value: Any, allowed: Collection[str]) -> None:
 
 
 def error_in_one_line(error: BaseException) -> str:
-    """Return the message of an exception with each run of white space replaced by one space."""
+    """Message of an exception with each run of white space replaced by one space."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def value_range(values: Sequence[float], digits: int = 6) -> str:
-    """Return the smallest and largest of some numbers as text."""
+    """Smallest and largest of some numbers as text."""
     low, high = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
     return low if low == high else f"{low} to {high}"

@@ -41,7 +41,7 @@ class Column(NamedTuple):
         return "" if self.limit.kind is str else None
 
     def parse(self, cell: str) -> Value:
-        """Return the value of a cell; ValueError for another type, and for a value that is not allowed."""
+        """Value of a cell; ValueError for another type, and for a value that is not allowed."""
         if not cell:
             return self.empty
         try:
@@ -82,7 +82,7 @@ class FieldColumns(NamedTuple):
 
 @functools.cache
 def places_of(record: type[msgspec.Struct], needs: Condition = ALWAYS) -> tuple[FieldColumns, ...]:
-    """Return the fields of a record that have columns."""
+    """Fields of a record that have columns."""
     given = record.__struct_defaults__  # of the last fields
     defaults: dict[str, Any] = dict.fromkeys(record.__struct_fields__, msgspec.NODEFAULT)
     defaults |= zip(record.__struct_fields__[len(defaults) - len(given) :], given, strict=True)
@@ -104,7 +104,7 @@ def places_of(record: type[msgspec.Struct], needs: Condition = ALWAYS) -> tuple[
 
 
 def flatten(record: msgspec.Struct, unused: Collection[Condition] = ()) -> dict[str, Value]:
-    """Return the cells of a record and of the records in it that are not empty; ``unused`` conditions have none."""
+    """Cells of a record and of the records in it that are not empty; ``unused`` conditions have none."""
     return _cells(record, places_of(type(record)), unused)
 
 
@@ -124,7 +124,7 @@ def _cells(record: msgspec.Struct, places: Sequence[FieldColumns], unused: Colle
 
 
 def rebuild(record: type[RecordType], row: Row) -> RecordType:
-    """Return the record that the cells of a row hold; ValueError names a column that is missing or not allowed."""
+    """Record that the cells of a row hold; ValueError names a column that is missing or not allowed."""
     return record(**_fields(places_of(record), row))
 
 

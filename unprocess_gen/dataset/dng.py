@@ -62,7 +62,7 @@ D65 = 21
 
 
 class DngSummary(NamedTuple):
-    """Count the files written, those that existed with the same bytes, and noisy ones without NoiseProfile."""
+    """Numbers of files written, of files that existed with the same bytes, and of noisy ones without NoiseProfile."""
 
     written: int
     present: int
@@ -82,33 +82,10 @@ class _File(NamedTuple):
 
 
 def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> DngSummary:
-    """Write frames of a dataset's pairs as ``to/KEY.FRAME.dng``.
+    """Write frames (names of `FRAMES`) of the pairs that ``keys`` select as ``to/KEY.FRAME.dng``.
 
-    Parameters
-    ----------
-    folder : Path or ObjectPath
-        Folder of the dataset.
-    keys : str
-        Pairs to write (`selection.parse_keys`).
-    frames : sequence of str
-        Names of `FRAMES`.
-    to : Path
-        Folder for the files. An existing file is kept if it has the bytes that would be written.
-
-    Returns
-    -------
-    DngSummary
-        Numbers of files.
-
-    Raises
-    ------
-    ConfigError
-        If a key does not exist or failed, a noisy frame is not of uint16, a frame is too small or large for a DNG,
-        another file of that name exists, the folder cannot be written, or tifffile is missing. Nothing is written then.
-    DamageError
-        If a frame differs from its row.
-    MachineError
-        If writing fails.
+    A file that has the bytes to be written is kept. Nothing is written if a key does not exist or failed, a noisy frame
+    is not of uint16, a frame is too small or large for a DNG, or another file of that name exists (ConfigError).
     """
     require("tifffile", "dng: tifffile is missing", "dng")
     check_output_folder(to, f"--to {to}")
@@ -130,7 +107,7 @@ def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> DngSu
 
 
 def _writable(row: Row) -> Row:
-    """Return the row if its frames can be DNG files; otherwise ConfigError gives the reason."""
+    """Row if its frames can be DNG files; otherwise ConfigError gives the reason."""
     key, width, height = row["key"], int(row["width"] or 0), int(row["height"] or 0)
     if row["dtype"] != UINT16:
         raise ConfigError(
@@ -189,7 +166,7 @@ BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 10, 12
 
 
 def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
-    """Return the DNG file of the frame ``name`` (``clean`` or ``noisy``) of a row's pair.
+    """DNG file of the frame ``name`` (``clean`` or ``noisy``) of a row's pair.
 
     Raises ConfigError if the frame is not a uint16 mosaic [H, W], or a colour value of the row exceeds 2^30.
     """
@@ -216,7 +193,7 @@ def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
 
 
 def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
-    """Return the tags that TIFF itself does not require, by increasing code; ``shape`` is (height, width)."""
+    """Tags that TIFF itself does not require, by increasing code; ``shape`` is (height, width)."""
     plan, (height, width) = plan_from_row(row), shape
     profile = noise_profile(plan) if name == "noisy" else None
     return [
@@ -246,7 +223,7 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
 
 
 def _exposure(row: Row) -> list[Tag]:
-    """Return the EXIF tags of exposure time and ISO, which rows of physical profiles have."""
+    """EXIF tags of exposure time and ISO, which rows of physical profiles have."""
     iso, seconds = float(row.get("iso") or 0), float(row.get("exposure_s") or 0)
     if not iso or not seconds:
         return []
@@ -256,30 +233,30 @@ def _exposure(row: Row) -> list[Tag]:
 
 
 def color_matrix(plan: Plan) -> Matrix:
-    """Return the row-major matrix from XYZ under D65 to native camera values, white-balance gains included."""
+    """Row-major matrix from XYZ under D65 to native camera values, white-balance gains included."""
     native = matrix([as_shot_neutral(plan)[i // 3] * entry for i, entry in enumerate(plan.camera.rgb2cam)])
     return multiply(native, invert(RGB2XYZ))
 
 
 def as_shot_neutral(plan: Plan) -> tuple[float, float, float]:
-    """Return the native camera values of a neutral colour, relative to green."""
+    """Native camera values of a neutral colour, relative to green."""
     return 1 / plan.camera.red_gain, 1.0, 1 / plan.camera.blue_gain
 
 
 def baseline_exposure_ev(plan: Plan) -> float:
-    """Return the stops by which a reader brightens the frame to the brightness of the photograph."""
+    """Stops by which a reader brightens the frame to the brightness of the photograph."""
     return -math.log2(plan.scene.exposure * max(plan.camera.inverse_gains))
 
 
 def noise_profile(plan: Plan) -> tuple[float, float] | None:
-    """Return S and O of variance = S·x + O, x = 0 at black and 1 at white; None if readers would refuse them."""
+    """S and O of variance = S·x + O, x = 0 at black and 1 at white; None if readers would refuse them."""
     span_dn = plan.sensor.white_level_dn - plan.sensor.black_level_dn
     scale, offset = plan.noise.variance_line[0] / span_dn, dark_variance_dn2(plan) / span_dn**2
     return (scale, offset) if scale > 0 and offset >= 0 else None
 
 
 def rational(value: float) -> tuple[int, int]:
-    """Return the nearest fraction of two signed 32-bit integers whose denominator is a power of two.
+    """Nearest fraction of two signed 32-bit integers whose denominator is a power of two.
 
     The error is at most 2^-31, or 2^-30 of the value if it exceeds 1. Raises ConfigError from 2^30 on.
     """

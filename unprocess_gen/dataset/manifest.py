@@ -41,14 +41,14 @@ def _write_lines(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> N
 
 
 def rows_text(rows: Iterable[Row], names: Sequence[str]) -> str:
-    """Return the lines that `write_rows` writes for some rows, without the header."""
+    """Lines that `write_rows` writes for some rows, without the header."""
     stream = io.StringIO()
     _write_lines(stream, rows, names)
     return stream.getvalue()
 
 
 def header_text(names: Sequence[str]) -> str:
-    """Return the first line of a manifest; no name of a column needs quotes."""
+    """First line of a manifest; no name of a column needs quotes."""
     return ",".join(names) + "\n"
 
 
@@ -120,7 +120,7 @@ def _cells_of(line: bytes) -> list[str]:
 
 
 def _typed(header: Sequence[str], line: bytes) -> Row:
-    """Return the row of a line; ValueError or csv.Error names what is wrong with it."""
+    """Row of a line; ValueError or csv.Error names what is wrong with it."""
     if not line.endswith(b"\n"):
         long = f"a line has more than {MAX_LINE_BYTES} bytes" if len(line) > MAX_LINE_BYTES else "the last line is cut"
         raise ValueError(long)

@@ -78,27 +78,14 @@ class Sample(_Frames):
         dataset: str = "",
         targets: Mapping[str, NDArray[Any]] = MappingProxyType({}),
     ) -> Self:
-        """Return a tuple of three items with two more attributes."""
+        """Tuple of three items with two more attributes."""
         sample = super().__new__(cls, clean, noisy, row)
         sample.dataset, sample.targets = dataset, dict(targets)
         return sample
 
 
 def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
-    """Return a frame as a mosaic in DN.
-
-    Parameters
-    ----------
-    frame : ndarray of uint16 or float32
-        Clean or noisy frame of a pair, mosaic or packed planes.
-    row : Row
-        Manifest row of the pair.
-
-    Returns
-    -------
-    ndarray of uint16 or float64, [H, W]
-        uint16 values unchanged; float32 values scaled from 0 at black and 1 at white to DN.
-    """
+    """Mosaic [H, W] of a frame in DN: uint16 values unchanged, float32 values scaled from 0 at black and 1 at white."""
     mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
     is_float_clean = row.get("clean_dtype") == FLOAT32 and mosaic.dtype == np.float32
     if row["dtype"] == UINT16 and not is_float_clean:
@@ -181,7 +168,7 @@ class RawPairs:
 
     @property
     def dataset(self) -> tuple[str, ...]:
-        """Return the folder name of each pair's dataset."""
+        """Folder name of each pair's dataset."""
         return tuple(self._datasets[number].name for number in self._dataset_of)
 
     def __len__(self) -> int:
@@ -225,7 +212,7 @@ class _Dataset:
         self.splits: set[str] = set()
 
     def offsets(self, split: str | None = None) -> NDArray[np.int64]:
-        """Return the offsets of the rows of all pairs, or of those in a split; note all formats and splits."""
+        """Offsets of the rows of all pairs, or of those in a split; note all formats and splits."""
         self._columns = read_columns(self._manifest)
         rows = rows_with_offsets(self._manifest)
         return np.fromiter((place for place, row in rows if self._is_pair(row, split)), dtype=np.int64)
@@ -244,7 +231,7 @@ class _Dataset:
         return split in (None, row["split"])
 
     def read(self, offset: int) -> Sample:
-        """Return the pair whose row begins at a byte."""
+        """Pair whose row begins at a byte."""
         row = dict(read_row(self._manifest, offset, self._columns))
         shard = int(row["shard"] or 0)
         arrays = {
@@ -261,7 +248,7 @@ class _Dataset:
         return map_array(path, member, form)
 
     def _index(self, shard: int, path: AnyPath) -> dict[str, Member]:
-        """Return the members of a shard; keep the members of shards that were read before, up to `MAX_MEMBERS`."""
+        """Members of a shard; keep the members of shards that were read before, up to `MAX_MEMBERS`."""
         index = self._indexes.get(shard)
         if index is None:
             index = read_index(path)
@@ -309,7 +296,7 @@ def check_split(reader: str, split: str, datasets: Sequence[Folder]) -> None:
 
 
 def dataset_folders(path: AnyPath) -> list[AnyPath]:
-    """Return the folder of a dataset, or the folders of the finished datasets of a sweep."""
+    """Folder of a dataset, or the folders of the finished datasets of a sweep."""
     table = path / SWEEP_TABLE
     if (path / "manifest.csv").exists() or not table.exists():
         return [path]
@@ -317,12 +304,12 @@ def dataset_folders(path: AnyPath) -> list[AnyPath]:
 
 
 def sweep_folders(table: AnyPath) -> list[str]:
-    """Return the names of the folders of the finished datasets of a sweep; raise as `read_sweep_table`."""
+    """Names of the folders of the finished datasets of a sweep; raise as `read_sweep_table`."""
     return [job["folder"] for job in read_sweep_table(table) if job["exit"] in FINISHED]
 
 
 def read_sweep_table(table: AnyPath) -> list[dict[str, str]]:
-    """Return the row of every job of a ``sweep.csv``.
+    """Row of every job of a ``sweep.csv``.
 
     Raises DamageError if the file cannot be read, lacks a column, or names a folder elsewhere.
     """

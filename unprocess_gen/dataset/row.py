@@ -142,7 +142,7 @@ variances too."""
 
 
 def _in_order(records: Iterable[type[msgspec.Struct]]) -> tuple[Column, ...]:
-    """Return the columns of records, moved behind those of `AFTER`."""
+    """Columns of records, moved behind those of `AFTER`."""
     columns = {column.name: column for record in records for place in places_of(record) for column in place.columns}
     names = [name for name in columns if name not in AFTER]
     for name, before in AFTER.items():
@@ -157,7 +157,7 @@ COLUMN_NAMES = tuple(column.name for column in COLUMNS)
 
 
 def columns_of(config: Any) -> tuple[str, ...]:
-    """Return the names of the columns of a manifest: those that the settings of a config can fill."""
+    """Names of the columns of a manifest: those that the settings of a config can fill."""
     return tuple(column.name for column in COLUMNS if column.needs.holds(config))
 
 
@@ -176,7 +176,7 @@ def pair_row(
     patch: Patch,
     source_noise_dn: float | None = None,
 ) -> Row:
-    """Return the row of a pair.
+    """Row of a pair.
 
     ``sha256`` is that of the source's bytes, ``orientation`` the EXIF orientation that was applied, ``digests`` the
     XXH3-128 of the clean and of the noisy array. A manifest without frames has no pair and empty digests.
@@ -208,7 +208,7 @@ def pair_row(
 def failed_row(
     source: Source, sha256: str | None, shard: int, seed: int, reason: str, detail: str = "", status: str = "failed"
 ) -> Row:
-    """Return the row of a source that could not be used (``reason`` is one of `errors.REASONS`) or was filtered."""
+    """Row of a source that could not be used (``reason`` is one of `errors.REASONS`) or was filtered."""
     origin = Origin(
         key=key_text(source.index),
         source=source.name,
@@ -227,7 +227,7 @@ def _complete(cells: Mapping[str, Value]) -> Row:
 
 
 def detail_text(text: str) -> str:
-    """Return an explanation as one line of at most `MAX_DETAIL` characters, none of them control or bidirectional.
+    """Explanation as one line of at most `MAX_DETAIL` characters, none of them control or bidirectional.
 
     A space precedes a leading ``= + - @``, so that spreadsheets do not run it.
     """
@@ -240,7 +240,7 @@ _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\
 
 
 def plan_from_row(row: Row) -> Plan:
-    """Return the plan that a row of a pair holds; with the pixels of its source it gives the arrays.
+    """Plan that a row of a pair holds; with the pixels of its source it gives the arrays.
 
     DamageError if a value is missing, of another type or not allowed.
     """
@@ -260,7 +260,7 @@ def plan_from_row(row: Row) -> Plan:
 
 
 def patch_from_row(row: Row) -> Patch:
-    """Return the part of the full frame that a row's pair shows; DamageError if a value is not allowed."""
+    """Part of the full frame that a row's pair shows; DamageError if a value is not allowed."""
     try:
         region = rebuild(Region, row)
     except ValueError as error:
@@ -309,7 +309,7 @@ OTHERS = "others"
 
 
 def row_json(rows: Sequence[Row]) -> bytes:
-    """Return the JSON of a sample in ASCII: its first row without empty cells, and in `OTHERS` how others differ."""
+    """JSON of a sample in ASCII: its first row without empty cells, and in `OTHERS` how others differ."""
     first, *others = rows
     content: dict[str, Any] = without_empty(first)
     if others:
@@ -318,5 +318,5 @@ def row_json(rows: Sequence[Row]) -> bytes:
 
 
 def without_empty(row: Row) -> dict[str, Value]:
-    """Return the cells of a row that are not empty."""
+    """Cells of a row that are not empty."""
     return {name: value for name, value in row.items() if value not in (None, "")}

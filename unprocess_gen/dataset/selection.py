@@ -24,62 +24,30 @@ _INDEX = re.compile(r"\d{1,12}")
 
 
 class KeySelection(NamedTuple):
-    """Source indices and keys that ``--keys`` names.
-
-    Attributes
-    ----------
-    names : dict of str to str
-        Keys of images, patches and pairs, and how the user wrote each.
-    ranges : dict of str to range
-        Source indices, by how the user wrote each range.
-    """
+    """Names and ranges in ``--keys``: keys, and source indices, with what the user wrote for each."""
 
     names: dict[str, str]
     ranges: dict[str, range]
 
     def named(self, row: Row) -> set[str]:
-        """Return the names that select a row: its own key, or the key of its patch or image."""
+        """Names that select a row: its own key, or the key of its patch or image."""
         return self.names.keys() & {str(row["key"]), sample_key(row), image_key(row)}
 
     def in_ranges(self, row: Row) -> set[str]:
-        """Return the ranges that a row's source index is in."""
+        """Ranges that a row's source index is in."""
         index = int(image_key(row))
         return {text for text, indices in self.ranges.items() if index in indices}
 
 
 class SelectedPairs(NamedTuple):
-    """Selected pairs of a dataset.
-
-    Attributes
-    ----------
-    rows : dict of int to Row
-        Row of each pair by its number in `RawPairs`, in the order of the manifest.
-    failed : int
-        Failed rows that were skipped because a range contains them.
-    """
+    """Rows of selected pairs by their number in `RawPairs`, and number of failed rows in a range, which are skipped."""
 
     rows: dict[int, Row]
     failed: int
 
 
 def parse_keys(text: str) -> KeySelection:
-    """Read the value of ``--keys``.
-
-    Parameters
-    ----------
-    text : str
-        Comma-separated source indices, ranges with both ends included, and keys: ``3,7-9,00000003-p0007``.
-
-    Returns
-    -------
-    KeySelection
-        The selection.
-
-    Raises
-    ------
-    ConfigError
-        If an item is neither, or a range ends before it begins.
-    """
+    """Read ``--keys``: comma-separated source indices, ranges with both ends, and keys: ``3,7-9,00000003-p0007``."""
     names: dict[str, str] = {}
     ranges: dict[str, range] = {}
     for item in map(str.strip, text.split(",")):
@@ -98,29 +66,10 @@ def parse_keys(text: str) -> KeySelection:
 
 
 def select_rows(manifest: AnyPath, keys: str | None = None, skipped: list[Row] | None = None) -> Iterator[Row]:
-    """Select rows of a manifest.
+    """Select rows of a manifest, all of them without ``keys``, in its order.
 
-    Parameters
-    ----------
-    manifest : Path or ObjectPath
-        A ``manifest.csv``.
-    keys : str, optional
-        See `parse_keys`. None: all rows.
-    skipped : list, optional
-        Failed rows that a range of ``keys`` contains are skipped and appended here. A failed row that is named by its
-        own index or key is selected.
-
-    Yields
-    ------
-    Row
-        Rows in the order of the manifest.
-
-    Raises
-    ------
-    ConfigError
-        If ``keys`` cannot be read, or the manifest has no row for an index, a key or a complete range.
-    DamageError
-        If the manifest cannot be read.
+    Failed rows in a range are skipped and appended to ``skipped``; a failed row is selected by its own index or key.
+    ConfigError if the manifest has no row for an index, a key or a complete range.
     """
     if keys is None:
         yield from read_rows(manifest)
@@ -143,27 +92,7 @@ def select_rows(manifest: AnyPath, keys: str | None = None, skipped: list[Row] |
 
 
 def select_pairs(manifest: AnyPath, keys: str) -> SelectedPairs:
-    """Select pairs of a dataset.
-
-    Parameters
-    ----------
-    manifest : Path or ObjectPath
-        The dataset's ``manifest.csv``.
-    keys : str
-        See `parse_keys`.
-
-    Returns
-    -------
-    SelectedPairs
-        Rows by their number in `RawPairs`.
-
-    Raises
-    ------
-    ConfigError
-        As `select_rows`, and if a failed row is named by its own index or key.
-    DamageError
-        If the manifest cannot be read.
-    """
+    """Select pairs of a dataset; ConfigError as `select_rows`, and if a failed row is named by its own index or key."""
     skipped: list[Row] = []
     rows = {str(row["key"]): row for row in select_rows(manifest, keys, skipped)}
     for row in rows.values():

@@ -39,17 +39,17 @@ ROW = "json"
 
 
 def member_of(name: str, level: int, draw: int) -> str:
-    """Return the member, without the key, of a frame or target of a pair."""
+    """Member, without the key, of a frame or target of a pair."""
     return f"{name}.l{level:02d}d{draw:02d}.npy" if name == "noisy" and (level or draw) else f"{name}.npy"
 
 
 def targets_cell(targets: Mapping[str, Array]) -> str:
-    """Return the cell of a row that names and identifies its target."""
+    """Cell of a row that names and identifies its target."""
     return "".join(f"{name}:{FLOAT32}:{array_xxh3(array)}" for name, array in targets.items())
 
 
 def shard_name(number: int) -> str:
-    """Return the file name of a shard."""
+    """File name of a shard."""
     return f"shard-{number:05d}.tar"
 
 
@@ -61,17 +61,17 @@ class ArrayFormat(NamedTuple):
 
     @property
     def description(self) -> str:
-        """Return the dtype as the npy format spells it."""
+        """Dtype as the npy format spells it."""
         return DESCRIPTIONS[self.dtype]
 
     @property
     def size(self) -> int:
-        """Return the bytes of the array without its npy header."""
+        """Bytes of the array without its npy header."""
         return np.dtype(self.description).itemsize * math.prod(self.shape)
 
     @property
     def header(self) -> bytes:
-        """Return the npy header."""
+        """Npy header."""
         stream = io.BytesIO()
         facts = {"descr": self.description, "fortran_order": False, "shape": self.shape}
         np.lib.format.write_array_header_1_0(stream, facts)
@@ -83,7 +83,7 @@ class ArrayFormat(NamedTuple):
 
 
 def array_format(dtype: str, layout: str, height: int, width: int) -> ArrayFormat:
-    """Return the format of a frame."""
+    """Format of a frame."""
     shape = (4, height // 2, width // 2) if layout == PACKED else (height, width)
     return ArrayFormat(dtype, shape)
 
@@ -140,7 +140,7 @@ class ShardWriter:
 
     @property
     def sha256(self) -> str:
-        """Return the SHA-256 of the bytes written so far, 64 hexadecimal digits."""
+        """SHA-256 of the bytes written so far, 64 hexadecimal digits."""
         self._wait(-1)
         return self._hash.hexdigest()
 
@@ -202,7 +202,7 @@ class Member(NamedTuple):
 
 
 def read_index(path: AnyPath) -> dict[str, Member]:
-    """Return the members of a shard by name; DamageError unless it is a complete tar archive."""
+    """Members of a shard by name; DamageError unless it is a complete tar archive."""
     index: dict[str, Member] = {}
     try:
         with path.open("rb") as stream:
@@ -220,7 +220,7 @@ def read_index(path: AnyPath) -> dict[str, Member]:
 
 
 def map_array(path: AnyPath, member: Member, array: ArrayFormat) -> Frame:
-    """Return an array of a shard, mapped copy-on-write: writing to it does not change the file.
+    """Array of a shard, mapped copy-on-write: writing to it does not change the file.
 
     The array of an object is a copy, read with one range request. Raises DamageError if the member is not an array of
     this format, or the file was deleted or truncated.
@@ -248,7 +248,7 @@ class ExpectedFrame(NamedTuple):
 
 
 def arrays_of(row: Row) -> dict[str, ExpectedFrame]:
-    """Return the frames and the target of a row by name, in the order of their members."""
+    """Frames and the target of a row by name, in the order of their members."""
     layout, height, width = str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0)
     dtype, clean_dtype = str(row["dtype"]), str(row["clean_dtype"] or row["dtype"])
     arrays = {"clean": (str(row["clean_xxh3"]), array_format(clean_dtype, layout, height, width))}
