@@ -63,30 +63,10 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), dark_pix
 def make_pairs(
     srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None
 ) -> Iterator[Pair]:
-    """Simulate several pairs of one image that share the clean frame.
+    """Simulate several pairs of one image that share the clean frame, in the order of their plans.
 
-    Each pair equals that of `make_pair`, but the image is unprocessed once for several pairs.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes, R, G, B.
-    plans : sequence of Plan
-        Plans that differ in noise, level and draw only.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-    dark_pixels : DarkPixels, optional
-        Access to the dark frames that the plans name.
-
-    Returns
-    -------
-    iterator of Pair
-        One pair for each plan, in order; their clean frames can be one array.
-
-    Raises
-    ------
-    ValueError
-        If the clean frames of the plans differ, or as in `make_pair`.
+    Each pair equals that of `make_pair`, but the image is unprocessed once for several pairs. Raises ValueError as
+    `make_pair`, and if the plans differ in more than noise, level and draw.
     """
     for plan in plans:
         _check_image(srgb, plan, origin)
@@ -130,25 +110,8 @@ def crop_maker(
 ) -> CropMaker:
     """Return a function that simulates crops of one image in any epoch, with little fixed cost for each.
 
-    Parameters
-    ----------
-    plan : Plan
-        All parameters of the pairs but their epoch.
-    shape : (int, int)
-        Height and width of all crops.
-    frame : (int, int)
-        Height and width of the image.
-    corner : (int, int)
-        Row and column of any crop; all others have the same parities.
-    codes : int
-        Number of codes of the image, 256 or 65,536.
-    dark_pixels : DarkPixels, optional
-        As for `make_pair`.
-
-    Returns
-    -------
-    callable
-        `CropMaker`, whose pairs are those of `make_pair` with ``plan.replace(epoch=epoch)``.
+    All crops have one ``shape`` and the parities of ``corner``; ``frame`` is the height and width of the image, which
+    has ``codes`` codes. Pairs are those of `make_pair` with ``plan.replace(epoch=epoch)``.
     """
     if plan.dark or plan.accuracy == REFERENCE:
 
@@ -165,28 +128,11 @@ def crop_maker(
 
 
 def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:
-    """Compute the scene before the mosaic: the clean frame with all three channels at every site.
+    """Compute the scene before the mosaic: the clean frame with all three channels at every site, [H, W, 3].
 
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes, R, G, B.
-    plan : Plan
-        All parameters of the pair.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-
-    Returns
-    -------
-    ndarray of float32, [H, W, 3]
-        Camera RGB with all that the clean frame contains, 0 at black and 1 at white. The channel of a site's filter is
-        its unrounded clean value. If clean frames are rounded, all values round to the DN of the exact light; a few
-        are therefore the second nearest float32. ``accuracy=fast`` changes clean frames, and not these values.
-
-    Raises
-    ------
-    ValueError
-        As `make_pair`.
+    Camera RGB with all that the clean frame contains, 0 at black and 1 at white, float32. The channel of a site's
+    filter is its unrounded clean value. If clean frames are rounded, all values round to the DN of the exact light; a
+    few are therefore the second nearest float32. ``accuracy=fast`` changes clean frames, and not these values.
     """
     _check_image(srgb, plan, origin)
     srgb, levels_dn = _dequantise(srgb, plan, origin), (plan.sensor.black_level_dn, plan.sensor.white_level_dn)
@@ -223,26 +169,7 @@ def reference_pair(
 ) -> Pair:
     """Simulate a pair with the NumPy reference: Algorithm 1, exposure of the scene, noise, rounding.
 
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes, R, G, B.
-    plan : Plan
-        All parameters of the pair.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-    dark_pixels : DarkPixels, optional
-        As for `make_pair`.
-
-    Returns
-    -------
-    Pair
-        As `make_pair`.
-
-    Raises
-    ------
-    ValueError
-        As `make_pair`.
+    Arguments, result and errors are those of `make_pair`.
     """
     _check_image(srgb, plan, origin)
     return _reference_pair(_dequantise(srgb, plan, origin), plan, origin, dark_pixels=dark_pixels)

@@ -37,10 +37,10 @@ class NormalPattern(NamedTuple):
 
 
 class BrightPixels(NamedTuple):
-    """Share of the pixels of a body with additional electrons, chosen by words of ``stream``.
+    """Share of the pixels of a sensor unit with additional electrons, chosen by words of ``stream``.
 
-    Their means are exponentially distributed with mean ``mean_e``; words of draw 1 select them. In each frame a Poisson
-    count of its mean is drawn for each of them, from words of the same stream.
+    Their means are exponentially distributed with mean ``mean_e``; words of draw 1 select them. Each frame has Poisson
+    counts of these means, from words of the same stream.
     """
 
     body_key: int
@@ -59,23 +59,11 @@ class DeadSlot(NamedTuple):
 
 
 class Patterns(NamedTuple):
-    """Fixed patterns that all frames of a pass share.
+    """Fixed patterns that all frames of a pass share."""
 
-    Attributes
-    ----------
-    light : RadialFactor or None
-        Factor on the light, in the clean frame too.
-    electrons : NormalPattern or None
-        Factor on the electrons of light; if the clean frame contains the fixed patterns, on its light instead.
-    sites_dn : NormalPattern or None
-        Offsets by site, DN; the clean frame can contain them.
-    bright, dead : BrightPixels or None, DeadSlot or None
-        Defects: pixels with additional electrons, and pixels of one value.
-    """
-
-    light: RadialFactor | None = None
-    electrons: NormalPattern | None = None
-    sites_dn: NormalPattern | None = None
+    light: RadialFactor | None = None  # in the clean frame too
+    electrons: NormalPattern | None = None  # factor on the electrons of light, or on a clean frame's light
+    sites_dn: NormalPattern | None = None  # offsets by site; the clean frame can contain them
     bright: BrightPixels | None = None
     dead: DeadSlot | None = None
 
@@ -119,42 +107,18 @@ class SiteNoise(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """The filled slots of a frame.
-
-    Attributes
-    ----------
-    black_dn, dn_per_e : float
-        Black level, DN, and system gain, DN per electron.
-    patterns : Patterns
-        Fixed patterns of the body.
-    light_stream : int
-        Stream of the Poisson counts of light; 0 if the electrons of light are their mean.
-    uniform : UniformCounts or None
-        Counts of one rate.
-    full_well_e : float
-        Limit of the well, electrons, of a plane whose relative gain is 1.
-    plane_gains : tuple of four floats
-        Gain by plane, relative to ``dn_per_e``, of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the frame's tile.
-    noise : SiteNoise or None
-        Noise of each site.
-    rows, columns, fixed_columns : LineOffsets or None
-        Offsets by row and by column that are new in every frame, and offsets by column of the body.
-    planes_dn : tuple of four floats
-        Offsets by plane, of the same sites as ``plane_gains``.
-    has_site_offsets : bool
-        Whether the frame has offsets by site of its own (`dark_frame.dark_frame_offsets`).
-    """
+    """The filled slots of a frame; values by plane are of the sites (0, 0), (0, 1), (1, 0), (1, 1) of its tile."""
 
     black_dn: float
     dn_per_e: float
     patterns: Patterns = Patterns()
-    light_stream: int = 0
+    light_stream: int = 0  # of the counts of light; 0 if the electrons are their mean
     uniform: UniformCounts | None = None
-    full_well_e: float = math.inf
-    plane_gains: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+    full_well_e: float = math.inf  # of a plane whose relative gain is 1
+    plane_gains: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  # relative to dn_per_e
     noise: SiteNoise | None = None
     rows: LineOffsets | None = None
     fixed_columns: LineOffsets | None = None
     columns: LineOffsets | None = None
     planes_dn: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    has_site_offsets: bool = False
+    has_site_offsets: bool = False  # of its own (`dark_frame.dark_frame_offsets`)

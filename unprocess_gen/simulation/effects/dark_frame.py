@@ -39,32 +39,10 @@ def dark_frame_offsets(
     origin: Shape = (0, 0),
     out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """Return the dark frame's contribution, (frame - black level) · scale.
+    """Return the dark frame's contribution in ``out``, (frame - black level) · scale, [H, W] DN of the sensor.
 
     Frames smaller than the image are repeated: rows and columns count modulo the size of the frame, which is even.
-
-    Parameters
-    ----------
-    plan : Plan
-        Parameters of a pair with a dark frame.
-    dark_pixels : DarkPixels or None
-        Access to the pixels of the frame.
-    shape : (int, int)
-        Height and width.
-    origin : (int, int)
-        Row and column of the first pixel in the full frame.
-    out : ndarray of float32, [H, W], optional
-        Where the result is written.
-
-    Returns
-    -------
-    ndarray of float32, [H, W]
-        DN of the sensor.
-
-    Raises
-    ------
-    ValueError
-        If ``dark_pixels`` is None.
+    Raises ValueError if ``dark_pixels`` is None.
     """
     dark = dark_of(plan)
     if dark_pixels is None:

@@ -44,24 +44,10 @@ def noise_variance(clean_dn: Float, plan: Plan) -> Float:
 
 
 def heteroscedastic(clean_dn: Float, plan: Plan, origin: Shape = (0, 0)) -> Float:
-    """Add shot and read noise of a two-parameter profile.
+    """Add shot and read noise of a two-parameter profile to the unrounded clean frame, [H, W] DN, not clipped.
 
     For ``law="gaussian"``, the noise is one normal deviate of variance `noise_variance`. For ``"poisson"``, it is a
     times a Poisson count of mean (x - black) / a, plus a normal deviate of variance b.
-
-    Parameters
-    ----------
-    clean_dn : ndarray of float64, [H, W]
-        Unrounded clean frame x, DN.
-    plan : Plan
-        Parameters of the pair.
-    origin : (int, int)
-        Row and column of ``clean_dn[0, 0]`` in the full frame.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        Noisy frame, DN, not clipped.
     """
     noise, black_dn = plan.noise, plan.sensor.black_level_dn
     n = normals(frame_words(plan, STREAM, clean_dn.shape, origin))

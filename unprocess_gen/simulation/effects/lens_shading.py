@@ -43,22 +43,7 @@ def illumination_at(square: Float, coefficients: Coefficients) -> Float:
 def illumination(
     coefficients: Coefficients, frame_size: Shape, shape: Shape, origin: Shape = (0, 0)
 ) -> NDArray[np.float32]:
-    """Return the relative illumination of each pixel.
-
-    Parameters
-    ----------
-    coefficients : tuple of three floats
-        As in `illumination_at`.
-    frame_size, shape : (int, int)
-        Height and width of the full frame and of the crop.
-    origin : (int, int)
-        Row and column of the crop's first pixel in the full frame.
-
-    Returns
-    -------
-    ndarray of float32, [H, W]
-        At most 1.
-    """
+    """Return the relative illumination of each pixel of a crop at ``origin`` of the full frame, [H, W], at most 1."""
     # Twice the distance from the centre is an integer, so that its square is exact.
     rows, columns = (
         2 * (np.arange(start, start + count) - 0.0) - (full - 1)

@@ -22,23 +22,9 @@ from unprocess_gen.simulation.plan import Plan
 
 
 def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: DarkPixels | None = None) -> Float:
-    """Add the plan's effects to the unrounded clean frame.
+    """Add the plan's effects to the unrounded clean frame, [H, W] DN; the result is not clipped.
 
-    Parameters
-    ----------
-    clean_dn : ndarray of float64, [H, W]
-        Clean frame, DN.
-    plan : Plan
-        Parameters of the pair.
-    origin : (int, int)
-        Row and column of ``clean_dn[0, 0]`` in the full frame.
-    dark_pixels : DarkPixels, optional
-        Access to the dark frame that the plan names.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        Noisy frame, DN, not clipped.
+    ``origin`` is the row and column of ``clean_dn[0, 0]`` in the full frame; ``dark_pixels`` has the plan's dark frame.
     """
     if plan.physics is None:
         return heteroscedastic(clean_dn, plan, origin) if "heteroscedastic" in plan.noise.effects else clean_dn
@@ -66,24 +52,7 @@ def effects_of(plan: Plan) -> list[Effect]:
 
 
 def crop_of(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0), dark_pixels: DarkPixels | None = None) -> Crop:
-    """Return a crop of a frame with a physical profile.
-
-    Parameters
-    ----------
-    plan : Plan
-        Parameters of the pair.
-    shape : (int, int)
-        Height and width.
-    origin : (int, int)
-        Row and column of the first pixel in the full frame.
-    dark_pixels : DarkPixels, optional
-        Access to the dark frame that the plan names.
-
-    Returns
-    -------
-    Crop
-        With the gains of its sites.
-    """
+    """Return a crop of a frame with a physical profile, with the gains of its sites; arguments as for `noisy`."""
     physics = plan.numbers
     crop = Crop(plan, physics, (shape[0], shape[1]), origin, dark_pixels)
     for effect in effects_of(plan):
@@ -93,21 +62,9 @@ def crop_of(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0), dark_pix
 
 
 def offsets(crop: Crop, effects: list[Effect], fixed_only: bool = False) -> Float:
-    """Return the sum of the offsets of rows, columns and planes, [H, W] DN.
+    """Return the sum of the offsets of rows, columns and planes, [H, W] DN; bytes depend on the order of the sums.
 
-    Parameters
-    ----------
-    crop : Crop
-        Crop of the frame.
-    effects : list of Effect
-        Simulated effects; recorded bytes depend on the order of the sums.
-    fixed_only : bool
-        Omit offsets that are new in every frame.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        DN.
+    ``fixed_only`` omits offsets that are new in every frame.
     """
     height, width = crop.shape
     rows, columns, planes = np.zeros((height, 1)), np.zeros((1, width)), np.zeros((1, 1))
@@ -122,19 +79,7 @@ def offsets(crop: Crop, effects: list[Effect], fixed_only: bool = False) -> Floa
 def light_factor(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0)) -> Float | None:
     """Return the gain of each site in the clean frame: lens shading, and PRNU if the frame has the fixed patterns.
 
-    Parameters
-    ----------
-    plan : Plan
-        Parameters of a pair.
-    shape : (int, int)
-        Height and width.
-    origin : (int, int)
-        Row and column of the first pixel in the full frame.
-
-    Returns
-    -------
-    ndarray of float64, [H, W], or None
-        Values of float32; None if nothing changes the light.
+    Values of float32, [H, W]; None if nothing changes the light.
     """
     if plan.physics is None:
         return None
@@ -144,23 +89,10 @@ def light_factor(plan: Plan, shape: tuple[int, ...], origin: Shape = (0, 0)) -> 
 
 
 def average(clean_dn: Float, plan: Plan, origin: Shape = (0, 0)) -> Float:
-    """Add fixed patterns except PRNU, and a kept dark offset, to the unrounded clean frame.
+    """Add fixed patterns except PRNU, and a kept dark offset, to the unrounded clean frame, [H, W] DN.
 
-    The sum of light, dark signal and hot pixels is limited by the full well, as in each frame of a real average.
-
-    Parameters
-    ----------
-    clean_dn : ndarray of float64, [H, W]
-        Clean frame with its `light_factor`, DN.
-    plan : Plan
-        Parameters of the pair.
-    origin : (int, int)
-        Row and column of ``clean_dn[0, 0]`` in the full frame.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        DN, not clipped.
+    The sum of light, dark signal and hot pixels is limited by the full well, as in each frame of a real average. The
+    frame has its `light_factor` already; the result is not clipped.
     """
     crop, effects = crop_of(plan, clean_dn.shape, origin), effects_of(plan)
     gain = crop.physics.dn_per_e * crop.relative_gain

@@ -38,25 +38,10 @@ class Contribution(NamedTuple):
 
 
 class FrameFacts:
-    """Facts of a frame on which predictions depend.
+    """Facts of a frame on which predictions depend; levels are DN, that of the converter above black.
 
-    A photograph is a clip of one frame, so only the first half of `STATISTICS` is computed for it.
-
-    Parameters
-    ----------
-    physics : Physics
-        Numbers of the sensor.
-    facts : Facts
-        Size and number of frames.
-    black_level_dn : float
-        Black level of the sensor, DN.
-    converter_dn : float
-        Highest value of the converter, DN above black; infinity if it limits nothing.
-
-    Attributes
-    ----------
-    per_frame, counts : PerStatistic
-        Number of sites that each statistic is a mean of, in one frame and in all frames of the clip.
+    A photograph is a clip of one frame, so only the first half of `STATISTICS` is computed for it. ``per_frame`` and
+    ``counts`` are the numbers of sites that each statistic is a mean of, in one frame and in all frames of the clip.
     """
 
     def __init__(self, physics: Physics, facts: Facts, black_level_dn: float, converter_dn: float = math.inf) -> None:
@@ -73,19 +58,7 @@ def independent(
 ) -> Contribution:
     """Predict an effect that is independent from pixel to pixel.
 
-    Parameters
-    ----------
-    frame : FrameFacts
-        The frame.
-    variance, fixed_variance : float
-        Variances of the part that is new in every frame, and of the part that all frames share, DN².
-    offset_dn : float
-        Offset of all pixels, DN.
-
-    Returns
-    -------
-    Contribution
-        In each statistic.
+    ``variance`` is that of the part that is new in every frame, ``fixed_variance`` of the part that all share, DN².
     """
     if fixed_variance:
         pairs = zip(frame.counts, frame.per_frame, strict=True)

@@ -81,20 +81,10 @@ def count_tables() -> CountTables:
 
 @functools.lru_cache(maxsize=8)
 def count_thresholds(rate: float) -> tuple[int, NDArray[np.uint32]]:
-    """Return the smallest count of a rate, and the last rank of each count except the largest.
+    """Smallest count of a rate, and the last rank of each count except the largest, in ascending order.
 
     The rank of a word is its place among all words, ordered by their normals. A count is the smallest one plus the
     number of ranks that the word's rank exceeds: exactly the count of `reference.poisson`, by comparisons only.
-
-    Parameters
-    ----------
-    rate : float
-        Mean count, from 0 to `MAX_THRESHOLD_RATE`.
-
-    Returns
-    -------
-    (int, ndarray of uint32)
-        Smallest count and last ranks, in ascending order.
     """
     tables = poisson_tables()
     cell = int(np.sqrt(rate) * RATE_CELLS)

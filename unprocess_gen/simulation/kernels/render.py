@@ -61,24 +61,7 @@ def render_pairs(
     origin: tuple[int, int] = (0, 0),
     dark_pixels: DarkPixels | None = None,
 ) -> list[Pair]:
-    """Simulate pairs that share the clean frame, in one pass.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes.
-    plans : sequence of Plan
-        Plans that differ only in noise, level, draw and frame.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-    dark_pixels : DarkPixels, optional
-        Access to the dark frames that the plans name.
-
-    Returns
-    -------
-    list of Pair
-        One pair per plan; all share the clean array.
-    """
+    """Simulate pairs that share the clean frame, in one pass; arguments as for `pair.make_pairs`."""
     clean, noisy, numbers = _frames_of(srgb, tuple(plans), len(plans), origin, dark_pixels)
     counts = _counts_of(numbers, plans[0])
     return [Pair(clean, frame, counted) for frame, counted in zip(noisy, counts, strict=True)]

@@ -80,22 +80,7 @@ def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int
 
 
 def mosaic(camera_rgb: Float | Srgb, pattern: str, origin: tuple[int, int] = (0, 0)) -> Float:
-    """Sample one channel per CFA site.
-
-    Parameters
-    ----------
-    camera_rgb : ndarray of float64 or uint16, [H, W, 3]
-        Camera RGB.
-    pattern : str
-        One of `PATTERNS`.
-    origin : (int, int)
-        Row and column of the first pixel in the full frame.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        Mosaic; values are not changed.
-    """
+    """Sample one channel per CFA site, [H, W, 3] to [H, W]; ``origin`` is the first pixel's place in the full frame."""
     raw = np.empty(camera_rgb.shape[:2])
     sites = tile(pattern, origin)
     for y in (0, 1):
@@ -134,26 +119,9 @@ def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[i
 
 
 def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame:
-    """Convert a mosaic to packed planes.
+    """Convert a mosaic [H, W] to planes [4, H / 2, W / 2] in the order of `plane_sites`, a copy of the same dtype.
 
-    Parameters
-    ----------
-    mosaic : ndarray, [H, W]
-        Mosaic with even height and width.
-    pattern : str
-        One of `PATTERNS`.
-    origin : (int, int)
-        Row and column of the first site in the full frame.
-
-    Returns
-    -------
-    ndarray, [4, H / 2, W / 2]
-        Planes in the order of `plane_sites`; a copy of the same dtype.
-
-    Raises
-    ------
-    ValueError
-        If a side is odd.
+    Raises ValueError if a side is odd.
     """
     height, width = mosaic.shape
     if height % 2 or width % 2:

@@ -110,20 +110,7 @@ def transform(entries: Matrix, vector: Sequence[float]) -> tuple[float, float, f
 
 
 def mix(matrices: Sequence[Matrix], weights: Sequence[float]) -> Matrix:
-    """Return the weighted sum of XYZ → camera matrices; Brooks et al. mix before they normalise.
-
-    Parameters
-    ----------
-    matrices : sequence of Matrix
-        XYZ → camera matrices.
-    weights : sequence of float
-        One weight for each matrix.
-
-    Returns
-    -------
-    Matrix
-        The sum, added in order.
-    """
+    """Return the weighted sum of XYZ → camera matrices, added in order; Brooks et al. mix before they normalise."""
     mixed = [0.0] * 9
     for weight, entries in zip(weights, matrices, strict=True):
         mixed = [*map(add, mixed, map(mul, repeat(weight), entries))]
@@ -133,20 +120,8 @@ def mix(matrices: Sequence[Matrix], weights: Sequence[float]) -> Matrix:
 def rgb2cam(xyz2cam: Matrix) -> Matrix:
     """Compute the linear sRGB → camera matrix whose rows sum to exactly 1, so that white stays white.
 
-    Parameters
-    ----------
-    xyz2cam : Matrix
-        XYZ (D65) → camera matrix.
-
-    Returns
-    -------
-    Matrix
-        Normalised product with the sRGB → XYZ matrix.
-
-    Raises
-    ------
-    ValueError
-        If the matrix is not finite, not invertible (`MAX_CONDITION`), or has a row that sums to 0.
+    Raises ValueError if the matrix from XYZ (D65) is not finite, not invertible (`MAX_CONDITION`), or has a row that
+    sums to 0.
     """
     return normalise_rows(multiply(xyz2cam, RGB2XYZ))
 
@@ -154,20 +129,7 @@ def rgb2cam(xyz2cam: Matrix) -> Matrix:
 def normalise_rows(entries: Matrix) -> Matrix:
     """Divide each row by its sum, and round it to a grid on which its entries sum to exactly 1 in any order.
 
-    Parameters
-    ----------
-    entries : Matrix
-        Any matrix.
-
-    Returns
-    -------
-    Matrix
-        The normalised matrix.
-
-    Raises
-    ------
-    ValueError
-        As `rgb2cam`.
+    Raises ValueError as `rgb2cam`.
     """
     if not _is_well_conditioned(entries):
         if not all(map(math.isfinite, entries)):

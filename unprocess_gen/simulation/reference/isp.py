@@ -55,18 +55,7 @@ def render(camera_rgb: Float, plan: Plan) -> Float:
 
 
 def cam2rgb(plan: Plan) -> Matrix:
-    """Return the matrix from camera RGB to linear sRGB; the identity for a sensor without colour filters.
-
-    Parameters
-    ----------
-    plan : Plan
-        Parameters of the pair.
-
-    Returns
-    -------
-    tuple of nine floats
-        Matrix, row by row.
-    """
+    """Return the matrix from camera RGB to linear sRGB; the identity for a sensor without colour filters."""
     return IDENTITY if plan.sensor.pattern == MONO else invert(plan.camera.rgb2cam)
 
 
@@ -133,20 +122,7 @@ def to_light(dn: Frame | Float, plan: Plan) -> Float:
 
 
 def to_codes(srgb: Float, codes: int = 256) -> Float:
-    """Round display-referred values to codes.
-
-    Parameters
-    ----------
-    srgb : ndarray of float64
-        Values in [0, 1], any shape.
-    codes : int
-        Number of codes.
-
-    Returns
-    -------
-    ndarray of float64
-        Integers from 0 to ``codes`` - 1, same shape.
-    """
+    """Round display-referred values in [0, 1] to integers from 0 to ``codes`` - 1."""
     return np.rint(srgb * (codes - 1))
 
 
@@ -180,30 +156,12 @@ GREEN = 1
 
 
 def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0), method: str = "malvar") -> Float:
-    """Interpolate the missing channels of a mosaic.
+    """Interpolate the missing channels of a mosaic of at least 2 x 2 sites, [H, W] to [H, W, 3], of the same dtype.
 
-    Parameters
-    ----------
-    values : ndarray of float64 or float32, [H, W]
-        Mosaic of at least 2 x 2 sites.
-    pattern : str
-        One of `cfa.PATTERNS`, or `cfa.MONO`, whose channels are all equal to the values.
-    origin : (int, int)
-        Row and column of ``values[0, 0]`` in the full frame.
-    method : str
-        One of `DEMOSAICS`.
-
-    Returns
-    -------
-    ndarray of the dtype of ``values``, [H, W, 3]
-        All channels; recorded values are unchanged. Flat colours are exact up to rounding. Linear ramps are too, except
-        in the two outermost rows and columns, where the frame is mirrored about its edge sites (which preserves the
-        phase of the pattern).
-
-    Raises
-    ------
-    ValueError
-        If the pattern is unknown or the mosaic is smaller than 2 x 2.
+    Recorded values are unchanged. Flat colours are exact up to rounding. Linear ramps are too, except in the two
+    outermost rows and columns, where the frame is mirrored about its edge sites (which preserves the phase of the
+    pattern). With `cfa.MONO` all channels equal the values. Raises ValueError for an unknown pattern or a smaller
+    mosaic.
     """
     if min(values.shape) < 2:
         raise ValueError(f"mosaic={list(values.shape)}: channels are missing; expected at least 2 x 2 sites")
@@ -229,18 +187,7 @@ def _filter(values: Float, sixteenths: tuple[tuple[int, ...], ...]) -> Float:
 
 
 def smoothstep(y: Float) -> Float:
-    """Apply the tone curve 3y² - 2y³ (Brooks et al. 2019).
-
-    Parameters
-    ----------
-    y : ndarray of float64
-        Values in [0, 1], any shape.
-
-    Returns
-    -------
-    ndarray of float64
-        Values in [0, 1], same shape.
-    """
+    """Apply the tone curve 3y² - 2y³ to values in [0, 1] (Brooks et al. 2019)."""
     return np.asarray(y * y * (3 - 2 * y))
 
 
@@ -253,20 +200,7 @@ TONES: dict[str, Callable[[Float], Float]] = {"smoothstep": smoothstep, "none": 
 
 
 def compress_gamma(u: Float, gamma: float | str) -> Float:
-    """Apply the gamma: u**(1 / gamma), or the piecewise curve of sRGB (IEC 61966-2-1).
-
-    Parameters
-    ----------
-    u : ndarray of float64
-        Linear light in [0, 1], any shape.
-    gamma : float or str
-        Exponent, or ``"srgb"``.
-
-    Returns
-    -------
-    ndarray of float64
-        Values in [0, 1], same shape.
-    """
+    """Apply the gamma to light in [0, 1]: u**(1 / gamma), or the piecewise curve of sRGB (IEC 61966-2-1)."""
     if gamma == "srgb":
         return np.where(u <= 0.04045 / 12.92, u * 12.92, 1.055 * u ** (1 / 2.4) - 0.055)
     return np.asarray(u ** (1 / float(gamma)))

@@ -18,18 +18,10 @@ XY = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Range of a light.
+    """Range of a light, in kelvin; its locus is that of daylight, or Planck's.
 
-    Attributes
-    ----------
-    low_k, high_k : float
-        Lowest and highest colour temperature, kelvin.
-    on_daylight : bool
-        Whether the locus is the daylight locus; else it is Planck's.
-    offset : float
-        Distance from the locus in CIE 1960 uv, towards green.
-    scatter : float
-        Largest deviation from that distance, of a uniform distribution.
+    ``offset`` is the distance from the locus in CIE 1960 uv, towards green, and ``scatter`` the largest deviation from
+    it.
     """
 
     low_k: float
@@ -39,38 +31,14 @@ class Light:
     scatter: float = 0.0
 
     def kelvin(self, share: float) -> float:
-        """Return the colour temperature at a share of the range, counted in its reciprocal.
-
-        Parameters
-        ----------
-        share : float
-            0 for the highest, 1 for the lowest colour temperature.
-
-        Returns
-        -------
-        float
-            Colour temperature, kelvin.
-        """
+        """Return the colour temperature at a share of the range of its reciprocal; 0 for the highest."""
         if self.low_k == self.high_k:
             return self.low_k
         coolest, warmest = 1e6 / self.high_k, 1e6 / self.low_k
         return 1e6 / (coolest + share * (warmest - coolest))
 
     def xy(self, kelvin: float, side: float) -> XY:
-        """Return a chromaticity of the light.
-
-        Parameters
-        ----------
-        kelvin : float
-            Colour temperature.
-        side : float
-            Deviation from ``offset`` in units of ``scatter``, -1 to 1.
-
-        Returns
-        -------
-        XY
-            The chromaticity.
-        """
+        """Return a chromaticity of the light; ``side`` is the deviation in units of ``scatter``, -1 to 1."""
         return chromaticity(self, kelvin, self.offset + side * self.scatter)
 
 
@@ -96,17 +64,9 @@ LIGHTS: Mapping[str, Light] = {
 
 
 def daylight_xy(kelvin: float) -> XY:
-    """Return the chromaticity of a phase of daylight (CIE 15:2004, section 3.1).
+    """Return the chromaticity of a phase of daylight of 4000 to 25000 K (CIE 15:2004, section 3.1).
 
-    Parameters
-    ----------
-    kelvin : float
-        Colour temperature, 4000 to 25000.
-
-    Returns
-    -------
-    XY
-        x_D by two cubics in 1/T, and y_D = −3 x² + 2.87 x − 0.275.
+    x_D by two cubics in 1/T, and y_D = −3 x² + 2.87 x − 0.275.
     """
     t = 1000.0 / kelvin
     if kelvin <= 7000:
@@ -117,17 +77,9 @@ def daylight_xy(kelvin: float) -> XY:
 
 
 def planckian_xy(kelvin: float) -> XY:
-    """Return the chromaticity of a black body.
+    """Return the chromaticity of a black body of 1000 to 15000 K.
 
-    Parameters
-    ----------
-    kelvin : float
-        Temperature, 1000 to 15000.
-
-    Returns
-    -------
-    XY
-        By the rational functions of Krystek (Color Research and Application 10, 1985), within 8e-5 in u and 6e-5 in v.
+    Rational functions of Krystek (Color Research and Application 10, 1985), within 8e-5 in u and 6e-5 in v.
     """
     t = kelvin
     u = (0.860117757 + t * (1.54118254e-4 + t * 1.28641212e-7)) / (1.0 + t * (8.42420235e-4 + t * 7.08145163e-7))
@@ -136,21 +88,9 @@ def planckian_xy(kelvin: float) -> XY:
 
 
 def chromaticity(light: Light, kelvin: float, distance: float) -> XY:
-    """Return the chromaticity at a distance from the locus of a light.
+    """Return the chromaticity at a distance from the locus of a light, in CIE 1960 uv; above 0 towards green.
 
-    Parameters
-    ----------
-    light : Light
-        The light, of which the locus is used.
-    kelvin : float
-        Colour temperature.
-    distance : float
-        Distance from the locus in CIE 1960 uv; above 0 towards green.
-
-    Returns
-    -------
-    XY
-        The point on the normal of the locus, whose direction is that between 5 K less and 5 K more.
+    The point is on the normal of the locus, whose direction is that between 5 K less and 5 K more.
     """
     locus = daylight_xy if light.on_daylight else planckian_xy
     (u, v), (u0, v0), (u1, v1) = (_uv(*locus(kelvin + step)) for step in (0.0, -5.0, 5.0))

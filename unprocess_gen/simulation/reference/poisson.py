@@ -108,18 +108,7 @@ class Tables(NamedTuple):
 
 @functools.lru_cache(maxsize=1)
 def poisson_tables() -> Tables:
-    """Compute the tables once per process.
-
-    Returns
-    -------
-    Tables
-        Read-only tables.
-
-    Raises
-    ------
-    MachineError
-        If the tables do not have the published SHA-256.
-    """
+    """Compute the read-only tables once per process; MachineError if they do not have the published SHA-256."""
     root = (2 * np.arange(CELLS) + 1) / (2 * RATE_CELLS)
     middle = root * root
     polynomials = _cdf_polynomials(middle)
@@ -226,20 +215,7 @@ def _by_expansion(words: Words, rate: Float) -> Float:
 
 
 def expansion(rate: Float, w: Float) -> Float:
-    """Return x of the module's docstring.
-
-    Parameters
-    ----------
-    rate : ndarray of float64
-        Rates from `LIMIT`.
-    w : ndarray of float64
-        Normal deviates, at most 6.34 in magnitude, same shape.
-
-    Returns
-    -------
-    ndarray of float64
-        x, same shape.
-    """
+    """Return x of the module's docstring, for rates from `LIMIT` and normal deviates of at most 6.34."""
     root = np.sqrt(rate)
     s = w / root
     c, d, e = _powers(C, s), _powers(D, s), _powers(E, s)

@@ -12,22 +12,7 @@ from unprocess_gen.core.arrays import FLOAT32, Float, Frame, Normalised, Raw
 
 
 def to_dn(light: Float, black_level_dn: int, white_level_dn: int, brightest: float = 1.0) -> Float:
-    """Clip light and convert it to DN, without rounding.
-
-    Parameters
-    ----------
-    light : ndarray of float64, [H, W]
-        Normalised light, 0 at black and 1 at white.
-    black_level_dn, white_level_dn : int
-        Levels of the sensor.
-    brightest : float
-        Light at which the frame saturates, at most 1.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        DN between the levels.
-    """
+    """Clip light to 0 and ``brightest``, at most 1, and convert it to DN between the levels, without rounding."""
     return np.clip(light, 0, brightest) * float(white_level_dn - black_level_dn) + float(black_level_dn)
 
 
@@ -73,22 +58,7 @@ def quantise(value_dn: Float, low: float, high: float) -> Raw:
 
 
 def normalise(value_dn: Float, low: float, high: float, levels_dn: tuple[int, int]) -> Normalised:
-    """Clip to [low, high], map black and white to 0 and 1 in float64, then round once to float32.
-
-    Parameters
-    ----------
-    value_dn : ndarray of float64
-        DN, any shape.
-    low, high : float
-        Limits in DN.
-    levels_dn : (int, int)
-        Black and white level.
-
-    Returns
-    -------
-    ndarray of float32
-        Normalised values, same shape.
-    """
+    """Clip DN to [low, high], map black and white to 0 and 1 in float64, then round once to float32."""
     black_dn, white_dn = levels_dn
     return ((np.clip(value_dn, low, high) - float(black_dn)) / float(white_dn - black_dn)).astype(np.float32)
 

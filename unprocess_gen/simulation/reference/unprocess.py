@@ -19,7 +19,7 @@ from unprocess_gen.simulation.reference.cfa import mosaic, plane_sites
 
 
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: Float | None = None) -> Float:
-    """Compute the clean mosaic before clipping.
+    """Compute the clean mosaic before clipping: normalised light, 0 at black and 1 at white, [H, W].
 
     Parameters
     ----------
@@ -31,11 +31,6 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: F
         Row and column of ``srgb[0, 0]`` in the full frame, for the phase of the CFA pattern.
     curve : ndarray of float64, optional
         Linear light of every code (`tone_curves.linear_table`). By default the formulas are used.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        Normalised light, 0 at black and 1 at white.
     """
     if plan.source.is_raw:
         return raw_light(srgb, plan, origin)
@@ -45,19 +40,8 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: F
 def raw_light(codes: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
     """Compute the clean mosaic of a raw source before clipping: (code - black) / (white - black), plane by plane.
 
-    Parameters
-    ----------
-    codes : ndarray of uint16, [H, W, 3]
-        Codes of the camera RGB of a raw source; each site uses the channel of its filter.
-    plan : Plan
-        Parameters of the pair, with the levels of the codes.
-    origin : (int, int)
-        Row and column of ``codes[0, 0]`` in the full frame.
-
-    Returns
-    -------
-    ndarray of float64, [H, W]
-        Normalised light, 0 at black and 1 at white.
+    Of the camera RGB ``codes``, [H, W, 3], each site uses the channel of its filter. The light is 0 at black, 1 at
+    white.
     """
     light = mosaic(codes, plan.sensor.pattern, origin)
     for (y, x), black, white in zip(plane_sites(plan.sensor.pattern, origin), *plan.source.code_levels, strict=True):
@@ -69,28 +53,13 @@ DEQUANTIZE = declare_stream("dequantize", 10)
 
 
 def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:
-    """Dither 8-bit codes to 16 bits, so that 256 codes do not become 256 levels of raw.
+    """Dither 8-bit codes to 16 bits, [H, W, 3], so that 256 codes do not become 256 levels of raw.
 
     Each channel of each pixel gets an offset from the random stream ``dequantize``: one of the 257 integers within half
     an 8-bit code. Codes 0 and 255 get none. For ``dither``, highlights get none either, because half a code is hundreds
-    of DN there. For ``dither_all`` they do, and code 254 gets one of 385 integers up to white, which it does not reach:
-    so the 16-bit codes have no gaps, white stays white, and codes keep their order.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8, [H, W, 3]
-        Display-referred codes.
-    plan : Plan
-        Parameters of the pair.
-    curve : ndarray of float64, [256]
-        Linear light of each code; codes above ``plan.highlight_threshold`` are highlights.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-
-    Returns
-    -------
-    ndarray of uint16, [H, W, 3]
-        Dithered codes.
+    of DN there: codes whose linear light in ``curve`` is above the threshold of highlights. For ``dither_all`` they do,
+    and code 254 gets one of 385 integers up to white, which it does not reach: so the 16-bit codes have no gaps, white
+    stays white, and codes keep their order.
     """
     size = (srgb.shape[0], srgb.shape[1])
     channels = [words(plan.stream_key, DEQUANTIZE, size, origin=origin, draw=channel) for channel in range(3)]
@@ -127,45 +96,18 @@ def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
 
 
 def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:
-    """Invert the tone curve and the gamma by their formulas.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16
-        Codes, any shape.
-    tone : str
-        Key of `INVERSE_TONES`.
-    gamma : float or str
-        Exponent, or ``"srgb"``.
-
-    Returns
-    -------
-    ndarray of float64
-        Linear light in [0, 1], same shape.
-    """
+    """Invert the tone curve (key of `INVERSE_TONES`) and the gamma (exponent, or ``srgb``) by their formulas."""
     white = np.float64(np.iinfo(srgb.dtype).max)
     return expand_gamma(INVERSE_TONES[tone](srgb / white, (white - srgb) / white), gamma)
 
 
 def inverse_smoothstep(x: Float, rest: Float) -> Float:
-    """Invert the tone curve x = 3y² - 2y³ without cancellation.
+    """Invert the tone curve x = 3y² - 2y³ without cancellation; ``rest`` is 1 - x, both in [0, 1].
 
     The article's formula ½ - sin(asin(1 - 2x) / 3) cancels near black. This function avoids the subtraction: for
     x ≤ ½ it is sin t · (√3 cos t + sin t) with t = asin(√x) / 3, and for larger x it is mirrored. The curve is steep at
     white, so the caller computes ``rest`` from the integer codes, as (N - k) / N. The error is at most 6 units in the
     last place for all 8- and 16-bit codes; NumPy's arcsin, sin and cos differ between processors (5.2 with AVX-512).
-
-    Parameters
-    ----------
-    x : ndarray of float64
-        Values in [0, 1], any shape.
-    rest : ndarray of float64
-        1 - x, same shape.
-
-    Returns
-    -------
-    ndarray of float64
-        y in [0, 1], same shape.
     """
     t = np.arcsin(np.sqrt(np.minimum(x, rest))) / 3
     y = np.sin(t) * (np.sqrt(3) * np.cos(t) + np.sin(t))
@@ -181,20 +123,7 @@ INVERSE_TONES = {"smoothstep": inverse_smoothstep, "none": inverse_no_tone}
 
 
 def expand_gamma(v: Float, gamma: float | str) -> Float:
-    """Invert the gamma: v**gamma, or the piecewise curve of sRGB (IEC 61966-2-1).
-
-    Parameters
-    ----------
-    v : ndarray of float64
-        Values in [0, 1], any shape.
-    gamma : float or str
-        Exponent, or ``"srgb"``.
-
-    Returns
-    -------
-    ndarray of float64
-        Linear light in [0, 1], same shape.
-    """
+    """Invert the gamma of values in [0, 1]: v**gamma, or the piecewise curve of sRGB (IEC 61966-2-1)."""
     if gamma == "srgb":
         return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     return np.asarray(v ** float(gamma))
@@ -212,23 +141,10 @@ def apply_ccm(linear: Float, ccm: tuple[float, ...]) -> Float:
 def invert_gains(
     camera_rgb: Float, inverse_gains: tuple[float, float, float], highlight: str, threshold: float
 ) -> Float:
-    """Invert white balance and brightness gains without clipping.
+    """Invert white balance and brightness gains, [..., 3], without clipping.
 
-    Parameters
-    ----------
-    camera_rgb : ndarray of float64, [..., 3]
-        White-balanced camera RGB, 0 at black and 1 at white.
-    inverse_gains : tuple of three floats
-        Factors of the red, green and blue channels.
-    highlight : str
-        Key of `INVERSE_HIGHLIGHTS`: the method for highlights of channels with an inverse gain below 1.
-    threshold : float
-        Intensity above which it acts, in [0, 1).
-
-    Returns
-    -------
-    ndarray of float64
-        Light before the gains, same shape.
+    ``highlight`` names the method for highlights of channels with an inverse gain below 1 (`INVERSE_HIGHLIGHTS`), and
+    ``threshold`` the intensity above which it acts, in [0, 1).
     """
     invert = INVERSE_HIGHLIGHTS[highlight]
     return invert(camera_rgb, np.array(inverse_gains), threshold)
@@ -239,20 +155,6 @@ def invert_gains_per_channel(i: Float, k: Float, threshold: float) -> Float:
 
     m = max(0, i - threshold) / (1 - threshold). At threshold 0.9 the second term is the article's
     100·i·(i - 0.9)²·(1 - k). Unlike 100·(1 - 0.9)², m² is exactly 1 at white, so white stays exactly 1.
-
-    Parameters
-    ----------
-    i : ndarray of float64
-        Intensities, any shape.
-    k : ndarray of float64
-        Inverse gains; shape that broadcasts.
-    threshold : float
-        Intensity from which highlights are preserved, in [0, 1).
-
-    Returns
-    -------
-    ndarray of float64
-        Intensities before the gains, not clipped.
     """
     return i * k + i * highlight_mask(i, threshold) * np.maximum(1 - k, 0)
 
