@@ -41,4 +41,4 @@ def digests(name: str, folder: Path) -> dict[str, str]:
 def test_pinned_dataset_has_the_recorded_bytes(name: str, tmp_path: Path, figure: Figure) -> None:
     recorded = json.loads(RECORDED.read_text())[name]
     assert digests(name, tmp_path / "ds") == recorded
-    figure("pinned-builds", f"{name}: {len(recorded)} of {len(recorded)} files have the recorded SHA-256")
+    figure("pinned-datasets", f"{name}: {len(recorded)} of {len(recorded)} files have the recorded SHA-256")
