@@ -10,7 +10,6 @@ from scene_page import scenes_page
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Flag, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
-from unprocess_gen.cli.help import synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_options, default_values
 from unprocess_gen.config.distributions import DISTRIBUTIONS, ISO_FORMS
@@ -237,14 +236,14 @@ def command_line_page() -> str:
     verbs = [[f"[`{verb.name}`](#{verb.name})", verb.summary] for verb in VERBS.values()]
     blocks = [COMMAND_LINE_INTRODUCTION, table(["verb", "effect"], verbs)]
     for verb in VERBS.values():
-        blocks += [f"## {verb.name}", f"    {synopsis(verb)}", _summary(verb)]
+        blocks += [f"## {verb.name}", f"    {_synopsis(verb)}", _summary(verb)]
         arguments = [[code(verb.place.metavar), verb.place.expected]] if verb.place else []
         arguments += [_argument(flag) for flag in verb.flags]
         arguments += [[code(key), text] for key, text in verb.keys.items()]
         if arguments:
             blocks.append(table(["argument", "meaning"], arguments))
     flags = [_argument(flag) for flag in STANDARD]
-    flags += [["`-h, --help`", "print the help of the verb"], ["`--version`", "print the version"]]
+    flags += [["`--version`", "print the version"]]
     hydra = [_argument(flag) for flag in HYDRA_FLAGS]
     codes = [[code, meaning] for code, meaning in EXIT_CODES.items()]
     blocks += ["## Flags of every verb", table(["flag", "meaning"], flags)]
@@ -258,8 +257,20 @@ def _summary(verb: Verb) -> str:
     return f"{verb.summary[0].upper()}{verb.summary[1:]}."
 
 
+def _synopsis(verb: Verb) -> str:
+    """Return the command line of a verb with its required arguments."""
+    words = [f"[{verb.place.metavar}]" if verb.place.optional else verb.place.metavar] if verb.place else []
+    words += [_spelled(flag) for flag in verb.flags if flag.options.get("required")]
+    words += ["[key=value ...]"] if verb.composes else []
+    return " ".join(["gen-dataset", verb.name, *words, "[flags]"])
+
+
+def _spelled(flag: Flag) -> str:
+    return f"{', '.join(flag.names)} {flag.options.get('metavar', '')}".rstrip()
+
+
 def _argument(flag: Flag) -> list[str]:
-    return [code(flag.spelled), flag.summary]
+    return [code(_spelled(flag)), flag.options["help"] + (" (required)" if flag.options.get("required") else "")]
 
 
 PAGES = {

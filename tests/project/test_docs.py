@@ -116,7 +116,7 @@ def test_every_option_form_reason_verb_and_flag_is_explained() -> None:
     for verb in VERBS.values():
         summaries = [
             verb.summary,
-            *(flag.summary for flag in (*verb.flags, *STANDARD, *HYDRA_FLAGS)),
+            *(flag.options["help"] for flag in (*verb.flags, *STANDARD, *HYDRA_FLAGS)),
             *verb.keys.values(),
         ]
         assert all(summaries) and f"  {verb.name} " in HELP, verb.name

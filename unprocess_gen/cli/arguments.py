@@ -7,6 +7,7 @@ settings and flags may be mixed in any order.
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,9 @@ from unprocess_gen.core.suggestions import did_you_mean
 if TYPE_CHECKING:
     from unprocess_gen.core.object_store import ObjectPath
     from unprocess_gen.core.paths import LocalPath
+
+
+HELP_WIDTH = 100
 
 
 def text(value: str) -> str:
@@ -48,16 +52,6 @@ class Flag(NamedTuple):
     names: list[str]
     options: dict[str, Any]
 
-    @property
-    def spelled(self) -> str:
-        """Spelling with the name of the value, such as ``--to FOLDER``."""
-        return f"{', '.join(self.names)} {self.options.get('metavar', '')}".rstrip()
-
-    @property
-    def summary(self) -> str:
-        """Sentence about the flag for ``--help``."""
-        return f"{self.options['help']}{' (required)' if self.options.get('required') else ''}"
-
 
 def flag(names: str, metavar: str, summary: str, read: Callable[[str], Any] = text, **options: Any) -> Flag:
     """Describe a flag with a value; ``options`` are others of argparse."""
@@ -69,7 +63,10 @@ def switch(names: str, summary: str) -> Flag:
     return Flag(names.split(), {"action": "store_true", "help": summary})
 
 
-STANDARD = (switch("-q --quiet", "show only warnings and errors on stderr; results still go to stdout"),)
+STANDARD = (
+    switch("-q --quiet", "show only warnings and errors on stderr; results still go to stdout"),
+    switch("-h --help", "show this help"),
+)
 """Flags of every verb."""
 
 HYDRA_FLAGS = (
@@ -112,6 +109,15 @@ class Verb(NamedTuple):
         return (*self.flags, *STANDARD, *(HYDRA_FLAGS if self.composes else ()))
 
     @property
+    def parser(self) -> argparse.ArgumentParser:
+        """Parser of the flags, which knows no words."""
+        form = functools.partial(argparse.HelpFormatter, width=HELP_WIDTH, max_help_position=34)
+        parser = _Parser(f"gen-dataset {self.name}", formatter_class=form, add_help=False, allow_abbrev=False)
+        for names, options in self.all_flags:
+            parser.add_argument(*names, **options)
+        return parser
+
+    @property
     def own_keys(self) -> list[str]:
         """Settings of the verb itself, without the names of their values."""
         return [key.partition("=")[0] for key in self.keys]
@@ -147,10 +153,7 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
     from unprocess_gen.core.paths import any_path  # --help needs no paths
 
     cut = arguments.index("--") if "--" in arguments else len(arguments)
-    parser = _Parser(prog=f"gen-dataset {verb.name}", add_help=False, allow_abbrev=False)
-    for names, options in verb.all_flags:
-        parser.add_argument(*names, **options)
-    call, rest = parser.parse_known_args(arguments[:cut], Call(verb=verb, words=list(arguments)))
+    call, rest = verb.parser.parse_known_args(arguments[:cut], Call(verb=verb, words=list(arguments)))
     for word in rest:
         if word.startswith("-") and word != "-":
             raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}{_setting_hint(verb, word)}")

@@ -7,13 +7,12 @@ import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 
-from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Verb
+from unprocess_gen.cli.arguments import HELP_WIDTH, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir, group_options, option_summary
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.suggestions import did_you_mean
 
-WIDTH = 100
 COLUMN = 34
 
 INTRODUCTION = """\
@@ -30,7 +29,7 @@ SETTINGS_HELP = """\
 Settings are key=value, in any order. group=option selects an option, group.key=value changes one
 value. gen-dataset --help GROUP explains the options and keys of a group:"""
 
-OTHER_FLAGS = (
+FLAGS = (
     ("-h, --help [VERB or GROUP]", "show this help, or that of a verb or group"),
     ("--version", "show the version"),
     ("--", "everything after it is a file or folder, even with a leading hyphen"),
@@ -62,13 +61,12 @@ def asked_help(verbs: Mapping[str, Verb], verb: Verb | None, flags: Sequence[str
 
 def global_help(verbs: Mapping[str, Verb]) -> str:
     """Help of ``gen-dataset``: verbs, groups with their options, top-level keys, flags and exit codes."""
-    flags = [(flag.spelled, flag.summary) for flag in (*HYDRA_FLAGS, *STANDARD)]
     blocks = [
         INTRODUCTION,
         _section("Verbs", ((verb.name, verb.summary) for verb in verbs.values()), 16),
         "\n".join([SETTINGS_HELP, *(_columns(*line, 16) for line in _group_lines())]) + "\n",
         "Keys at the top level:\n" + "".join(key_help("")),
-        _section("Flags", (*flags, *OTHER_FLAGS)),
+        _section("Flags, besides those of the verb", FLAGS),
         _section("Exit codes", EXIT_CODES.items(), 16),
     ]
     return "\n".join(blocks)
@@ -114,34 +112,25 @@ def group_help(group: str) -> str:
         inside = {f"{key}.{name}": value for key in nested for name, value in default_values(f"{group}.{key}").items()}
         values, option = default_values(group) | inside, default_options().get(group) or "default"
         chosen = f" with {group}={option}" if option != "default" else ""
-        spelled = ((f"{name}={value_text(values[name])}"[: WIDTH - 2], settings[name].description) for name in settings)
+        spelled = (
+            (f"{name}={value_text(values[name])}"[: HELP_WIDTH - 2], settings[name].description) for name in settings
+        )
         parts.append(_section(f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}", spelled))
     return "\n".join(parts)
 
 
 def verb_help(verb: Verb) -> str:
-    """Help of one verb."""
-    flags = [(flag.spelled, flag.summary) for flag in (*verb.flags, *STANDARD)]
-    blocks = [
-        f"usage: {synopsis(verb)}\n",
-        textwrap.fill(f"{verb.summary[0].upper()}{verb.summary[1:]}.", WIDTH) + "\n",
-        _section("Arguments", [verb.place[:2]] if verb.place else []),
-        _section("Flags and settings", [*flags, *verb.keys.items(), ("-h, --help", "show this help")]),
-    ]
+    """Help of one verb, as argparse formats it."""
+    parser = verb.parser
+    parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
+    if verb.place is not None:
+        parser.add_argument(verb.place.metavar, help=verb.place.expected, nargs="?" if verb.place.optional else None)
     if verb.composes:
-        blocks += [
-            _section("Hydra's flags", ((flag.spelled, flag.summary) for flag in HYDRA_FLAGS)),
-            "Settings are listed by gen-dataset --help, and explained by gen-dataset --help GROUP.\n",
-        ]
-    return "\n".join(filter(None, blocks))
-
-
-def synopsis(verb: Verb) -> str:
-    """Command line of a verb with its required arguments."""
-    words = [f"[{verb.place.metavar}]" if verb.place.optional else verb.place.metavar] if verb.place else []
-    words += [flag.spelled for flag in verb.flags if flag.options.get("required")]
-    words += ["[key=value ...]"] if verb.composes else []
-    return " ".join(["gen-dataset", verb.name, *words, "[flags]"])
+        settings = "settings: gen-dataset --help lists them, and gen-dataset --help GROUP explains them"
+        parser.add_argument("key=value", nargs="*", help=settings)
+    for spelled, summary in verb.keys.items():
+        parser.add_argument(spelled, nargs="?", help=summary)
+    return parser.format_help()
 
 
 def _section(title: str, lines: Iterable[tuple[str, str]], column: int = COLUMN) -> str:
@@ -154,5 +143,5 @@ def _columns(left: str, right: str, column: int = COLUMN) -> str:
     """Two columns; the right one begins in a line of its own if the left one is long."""
     start = f"  {left}".ljust(column)
     indent, break_after = " " * column, len(left) + 4 > column
-    lines = textwrap.fill(right, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    lines = textwrap.fill(right, HELP_WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
     return f"  {left}\n{lines}" if break_after else start + lines[column:]
