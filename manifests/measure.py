@@ -25,13 +25,12 @@ from skimage.restoration import denoise_nl_means
 import unprocess_gen as ug
 from unprocess_gen.cli.main import run
 from unprocess_gen.cli.runs import make_build
-from unprocess_gen.config.option_files import build_names
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.manifest import read_columns, read_rows, write_rows
 from unprocess_gen.dataset.row import COLUMN_NAMES
-from unprocess_gen.pipeline.builds import MANIFEST, Build, read_build
+from unprocess_gen.pipeline.builds import MANIFEST, Build, build_names, read_build
 from unprocess_gen.simulation.reference.cfa import unpack
 
 FOLDER = Path(__file__).resolve().parent

@@ -11,9 +11,9 @@ from helpers.commands import RunMain
 from helpers.datasets import Settings
 
 import unprocess_gen as ug
-from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.serialization import dataset_yaml, read_option
+from unprocess_gen.planning.bodies import body_sentence
 from unprocess_gen.planning.dark_scene import physical_profiles
 
 BODIES = group_options("body")

@@ -280,15 +280,19 @@ def test_finished_dataset_needs_no_part(part: Part, run_main: RunMain, tmp_path:
 # Refusals -------------------------------------------------------------------------------------------------------------
 
 
+K_OF_N = (
+    "expected K/N, part K (from 0 to N - 1) of N, or /N with K in SLURM_ARRAY_TASK_ID, PBS_ARRAY_INDEX, "
+    "JOB_COMPLETION_INDEX"
+)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("part", *SETTINGS), "part: expected K/N, part K (from 0) of N; or /N in a job of an array"),
-        (("part", "x/6", *SETTINGS), "part: x/6: expected K/N, part K (from 0) of N, or /N with K in one of "
-         "SLURM_ARRAY_TASK_ID, PBS_ARRAY_INDEX, JOB_COMPLETION_INDEX"),
-        (("part", "/6", *SETTINGS), "part: its number is missing; expected K/N, or one of SLURM_ARRAY_TASK_ID, "
-         "PBS_ARRAY_INDEX, JOB_COMPLETION_INDEX"),
-        (("part", "6/6", *SETTINGS), "part: 6/6: out of range; expected K from 0 to N - 1"),
+        (("part", "x/6", *SETTINGS), f"part: x/6: {K_OF_N}"),
+        (("part", "/6", *SETTINGS), f"part: /6 (K is missing): {K_OF_N}"),
+        (("part", "6/6", *SETTINGS), f"part: 6/6: {K_OF_N}"),
         (("part", "0/5", *SETTINGS), "part K/5: ds was begun with 6 parts; expected K/6; choose another out"),
         (("part", "0/13", *SETTINGS, "out=new"), "part 0/13: this dataset has 12 shards; expected N from 1 to 12; "
          "lower N or output.pairs_per_shard"),

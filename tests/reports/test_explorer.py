@@ -19,10 +19,10 @@ import pytest
 
 import unprocess_gen as ug
 from unprocess_gen.config.option_files import OptionFolders
-from unprocess_gen.config.overrides import overrides_of
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.reports.explorer.exploration import Exploration, open_place
+from unprocess_gen.reports.explorer.overrides import overrides_of
 
 pytest.importorskip("bokeh", reason="the explorer needs the extra explore")
 

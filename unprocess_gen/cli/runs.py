@@ -15,7 +15,7 @@ from unprocess_gen.cli.jobs import Job, checked_jobs, composed_jobs
 from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import result_cells, worst, write_row
-from unprocess_gen.config.option_files import OptionFolders, build_names
+from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.reports.formatting import counted
 
@@ -96,25 +96,12 @@ def part(call: Call) -> int:
 def _part(text: str) -> tuple[int, int]:
     """Read ``K/N``, or ``/N`` with K from the batch system."""
     written = re.fullmatch(r"(\d*)/(\d+)", text)
-    if written is None:
-        raise ConfigError(
-            f"part: {text or 'K/N is missing'}: expected K/N, part K (from 0) of N, or /N with K in one of "
-            f"{', '.join(PART_VARIABLES)}"
-        )
-    number, parts = int(written[1] or _number_of_environment()), int(written[2])
-    if number >= parts:
-        raise ConfigError(f"part: {number}/{parts}: out of range; expected K from 0 to N - 1")
-    return number, parts
-
-
-def _number_of_environment() -> str:
-    """Number of the part that a batch system gives."""
-    for variable in PART_VARIABLES:
-        if (text := os.environ.get(variable)) is not None:
-            if not text.isdecimal():
-                raise ConfigError(f"part: {variable}={text}: expected an integer from 0")
-            return text
-    raise ConfigError(f"part: its number is missing; expected K/N, or one of {', '.join(PART_VARIABLES)}")
+    given = written and (written[1] or next(filter(None, map(os.environ.get, PART_VARIABLES)), ""))
+    if written is None or not given or not given.isdecimal() or int(given) >= int(written[2]):
+        found = "" if written is None or written[1] else f" (K is {given or 'missing'})"
+        expected = f"expected K/N, part K (from 0 to N - 1) of N, or /N with K in {', '.join(PART_VARIABLES)}"
+        raise ConfigError(f"part: {text}{found}: {expected}")
+    return int(given), int(written[2])
 
 
 def merge(call: Call) -> int:
@@ -152,7 +139,7 @@ def again(call: Call) -> int:
 
 def build(call: Call) -> int:
     """Make a benchmark build, or compare an existing one; list all builds."""
-    from unprocess_gen.pipeline.builds import read_build
+    from unprocess_gen.pipeline.builds import build_names, read_build
 
     if call.list:
         if call.place or call.to:

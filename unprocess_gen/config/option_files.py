@@ -28,7 +28,7 @@ PACKAGE_DIRECTIVE = "# @package"
 
 def conf_dir() -> Path:
     """Return the folder of the built-in option files."""
-    return _shipped_folder("conf", "config.yaml")
+    return shipped_folder("conf", "config.yaml")
 
 
 class OptionFolders(NamedTuple):
@@ -44,17 +44,7 @@ class OptionFolders(NamedTuple):
         return self.given_main or conf_dir()
 
 
-def manifests_dir() -> Path:
-    """Return the folder of the benchmark builds."""
-    return _shipped_folder("manifests", "README.md")
-
-
-def build_names() -> list[str]:
-    """Return the names of the benchmark builds."""
-    return group_options("recipes", manifests_dir())
-
-
-def _shipped_folder(name: str, file: str) -> Path:
+def shipped_folder(name: str, file: str) -> Path:
     """Return a folder by a file in it: an installed package contains it, in a source tree it is next to the package."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / name, package.parent / name):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from unprocess_gen.config.option_files import build_names, manifests_dir
+from unprocess_gen.config.option_files import group_options, shipped_folder
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.files import file_sha256
@@ -35,6 +35,16 @@ BESIDE = ("dataset.json", ".work", REPORT, "sweep.csv", "sweep.csv.lock")
 
 PHOTOGRAPHS_FROM = "scikit-image 0.24.0, 0.25.2 and 0.26.0"
 """Versions whose photographs have the recorded bytes."""
+
+
+def manifests_dir() -> Path:
+    """Folder of the benchmark builds."""
+    return shipped_folder("manifests", "README.md")
+
+
+def build_names() -> list[str]:
+    """Names of the benchmark builds."""
+    return group_options("recipes", manifests_dir())
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

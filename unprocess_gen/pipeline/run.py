@@ -26,7 +26,6 @@ import msgspec
 import numpy as np
 from yaml import YAMLError
 
-from unprocess_gen.config.bodies import body_sentence
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, differences, source_kind
 from unprocess_gen.config.values import error_in_one_line
@@ -41,6 +40,7 @@ from unprocess_gen.pipeline.deaths import DEATHS
 from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.tasks import ShardTask
+from unprocess_gen.planning.bodies import body_sentence
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.sensor_levels import sensor_warning
 from unprocess_gen.sources.listing import Listing, list_photographs

@@ -7,10 +7,10 @@ from typing import Any
 from bokeh.models import InputWidget, Select, Slider, TextInput
 
 from unprocess_gen.config.option_files import conf_dir, group_options, option_summary
-from unprocess_gen.config.overrides import override_text
 from unprocess_gen.config.schema import Config, all_settings
 from unprocess_gen.config.settings import Setting
 from unprocess_gen.core.fields import Choice
+from unprocess_gen.reports.explorer.overrides import override_text
 from unprocess_gen.simulation.effects import EFFECTS
 from unprocess_gen.simulation.plan import Plan
 

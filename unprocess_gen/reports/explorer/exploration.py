@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.composition import composed_config
 from unprocess_gen.config.option_files import OptionFolders
-from unprocess_gen.config.overrides import override_text, overrides_of
 from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.config.serialization import read_dataset_yaml
@@ -32,6 +31,7 @@ from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_root
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.estimate import SourceEstimate
+from unprocess_gen.reports.explorer.overrides import override_text, overrides_of
 from unprocess_gen.reports.panels import MosaicArray
 from unprocess_gen.reports.plan_text import noise_lines
 from unprocess_gen.simulation import self_test
