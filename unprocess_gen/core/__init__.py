@@ -1,1 +1,1 @@
-"""Provide types, errors, random streams, lookup tables, compilation and files to all other packages."""
+"""Provide errors, random streams, exact distributions, limits of fields, and local and remote files to all packages."""
