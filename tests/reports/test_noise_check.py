@@ -20,6 +20,7 @@ from helpers.promise_report import Figure
 from numpy.typing import NDArray
 
 from unprocess_gen import RawPairs, make_pair
+from unprocess_gen.calibration.scores import FALSE_ALARM, Score, alarm_limit
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
@@ -39,7 +40,6 @@ from unprocess_gen.reports.noise_check.checks import (
 from unprocess_gen.reports.noise_check.scores import Scores, scores_of
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources import synthetic
-from unprocess_gen.statistics.scores import FALSE_ALARM, Score, alarm_limit
 
 NIGHT_A7S2 = ("noise=sony_a7s2", "scene=night", "effects.row=on")
 NIGHT_D850 = ("noise=nikon_d850", "scene=night", "effects.row=on")

@@ -14,8 +14,8 @@ import numpy as np
 
 from unprocess_gen.calibration.captures import Capture, Sensor
 from unprocess_gen.calibration.frame_sums import ROUNDING_DN2, Measured
+from unprocess_gen.calibration.scores import UNFORESEEN, Score, alarm_limit
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.statistics.scores import UNFORESEEN, Score, alarm_limit
 
 
 class Limits(NamedTuple):

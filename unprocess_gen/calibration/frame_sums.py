@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.calibration.planes import TILE, neighbour_products, planes_of
+from unprocess_gen.calibration.scores import Score
 from unprocess_gen.core.arrays import Float
-from unprocess_gen.statistics.mosaics import TILE, neighbour_products, planes_of
-from unprocess_gen.statistics.scores import Score
 
 ROUNDING_DN2 = 1 / 12
 """Variance of the rounding of values whose noise is not weak."""

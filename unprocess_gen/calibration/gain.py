@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unprocess_gen.calibration.scores import NORMAL_95, influence
 from unprocess_gen.core.arrays import Float
-from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 RANGES = (0.1, 0.3)
 """Largest signals of the fits, as fractions of white above black; the second range has `LEAST_LEVELS` or more."""

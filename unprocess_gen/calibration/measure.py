@@ -30,10 +30,10 @@ from unprocess_gen.calibration.gain import (
     root_estimate,
     weighted_mean,
 )
+from unprocess_gen.calibration.planes import planes_of
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fill_histogram, fit_shape
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.statistics.mosaics import planes_of
 
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""

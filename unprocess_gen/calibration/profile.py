@@ -20,6 +20,7 @@ from unprocess_gen.calibration.calibrate import NULL, Calibration
 from unprocess_gen.calibration.captures import Sensor
 from unprocess_gen.calibration.gain import SIGNIFICANT, Estimate, combined, estimate
 from unprocess_gen.calibration.measure import IsoResult
+from unprocess_gen.calibration.planes import plane_names
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 from unprocess_gen.config.limits import NAME
 from unprocess_gen.core.errors import ConfigError
@@ -27,7 +28,6 @@ from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.simulation.reference.cfa import MONO
-from unprocess_gen.statistics.mosaics import plane_names
 
 MARK = "by gen-dataset calibrate"
 """Part of the first line of a profile, by which a later run recognises it."""

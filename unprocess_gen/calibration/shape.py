@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from unprocess_gen.calibration.frame_sums import Measured
 from unprocess_gen.calibration.gain import Estimate
+from unprocess_gen.calibration.planes import planes_of
+from unprocess_gen.calibration.scores import NORMAL_95
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.statistics.mosaics import planes_of
-from unprocess_gen.statistics.scores import NORMAL_95
 
 NORMAL_SHAPE = 0.1349
 """Shape at which Tukey's lambda is nearest to the normal distribution."""

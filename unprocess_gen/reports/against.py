@@ -22,6 +22,7 @@ from unprocess_gen.calibration.profile import (
     estimates,
     site_names,
 )
+from unprocess_gen.calibration.scores import NORMAL_95, Score, alarm_limit
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 from unprocess_gen.config.interpretation import is_physical, noise_distributions
 from unprocess_gen.config.noise_validation import check_noise
@@ -33,7 +34,6 @@ from unprocess_gen.planning.plan import TwoNumberLevel
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.simulation.effects import profile_keys
 from unprocess_gen.simulation.plan import Physics
-from unprocess_gen.statistics.scores import NORMAL_95, Score, alarm_limit
 
 EFFECT_OF_NUMBER = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
 """Effect of each number that is compared, by its name in the list of estimates."""

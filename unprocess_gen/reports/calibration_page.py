@@ -10,6 +10,7 @@ import numpy as np
 from unprocess_gen.calibration.calibrate import Calibration
 from unprocess_gen.calibration.measure import IsoResult
 from unprocess_gen.calibration.profile import ENDS, estimates, site_names
+from unprocess_gen.calibration.scores import NORMAL_95
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import check_output_file
@@ -17,7 +18,6 @@ from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.pictures import figure_png, new_figure
 from unprocess_gen.reports.report_files import require_libraries, write_files
-from unprocess_gen.statistics.scores import NORMAL_95
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

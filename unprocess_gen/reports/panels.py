@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.calibration.planes import planes_of
 from unprocess_gen.core.arrays import Float, Frame
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import MONO, tile
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
-from unprocess_gen.statistics.mosaics import planes_of
 
 Picture = NDArray[np.uint8]
 

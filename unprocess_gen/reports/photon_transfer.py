@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unprocess_gen.calibration.scores import NORMAL_95, influence
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.reports.noise_check.repeat import Noise
 from unprocess_gen.reports.noise_check.scores import Bins, residual_of
 from unprocess_gen.reports.pictures import figure_png, new_figure
-from unprocess_gen.statistics.scores import NORMAL_95, influence
 
 LEAST_SITES_OF_POINT = 16
 """Fewest sites of a clean DN whose variance is drawn."""

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.calibration.planes import planes_of
 from unprocess_gen.core.arrays import PACKED, Float
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.explorer.exploration import Shown
 from unprocess_gen.reports.noise_check.repeat import measure_noise
 from unprocess_gen.reports.photon_transfer import NoiseFit, fit_noise
 from unprocess_gen.simulation.reference import unprocess
-from unprocess_gen.statistics.mosaics import planes_of
 
 PICTURES = {
     "source": "Source",

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unprocess_gen.calibration.scores import Score, alarm_limit
 from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.reports.noise_check.repeat import Noise, measure_noise
 from unprocess_gen.reports.noise_check.scores import Residual, Scores, scores_of
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.statistics.scores import Score, alarm_limit
 
 LEAST_SITES = 64
 """Fewest sites of a pair that is checked."""

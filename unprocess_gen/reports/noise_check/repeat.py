@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.calibration.planes import TILE
 from unprocess_gen.core.arrays import Float, Frame
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.reader import mosaic_dn
@@ -22,7 +23,6 @@ from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.sensor import noisy_limits
-from unprocess_gen.statistics.mosaics import TILE
 
 EPOCH = 2**14 - 1
 """Epoch of the random numbers; that of datasets is 0."""

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unprocess_gen.calibration.planes import NEIGHBOURS, TILE, plane_names
+from unprocess_gen.calibration.scores import Score
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.reports.noise_check.repeat import Noise, Single
-from unprocess_gen.statistics.mosaics import NEIGHBOURS, TILE, plane_names
-from unprocess_gen.statistics.scores import Score
 
 SHARED_ROUNDING = 0.15
 """Fraction of the rounding error that all clean values of a frame share."""

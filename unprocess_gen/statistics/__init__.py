@@ -1,1 +1,0 @@
-"""Score statistics of frames: what ``verify --noise``, ``verify --against`` and ``calibrate`` share."""
