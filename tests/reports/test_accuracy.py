@@ -161,7 +161,6 @@ def test_ended_measurement_leaves_nothing(folder: Path, settings: Settings, monk
 
 def test_built_in_scenes_are_read_from_files(settings: Settings, tmp_path: Path) -> None:
     inputs = measure.select_inputs(settings("source.limit=2", "source.downscale=2"), tmp_path)
-
     assert [source.path[-4:] for source in list_photographs(inputs.source).sources] == [".jpg"] * 2
 
 
@@ -185,19 +184,14 @@ def test_photographs_end_with_enough_pixels(
 
 
 @pytest.mark.parametrize(("pixels", "runs"), [(24_000_000, 1), (24_000_001, 0)])
-def test_reference_runs_once_on_few_pixels(
+def test_reference_runs_once_on_few_pixels_and_stages_count_with_their_shortest_time(
     pixels: int, runs: int, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(measure, "time_run", lambda *_: RunTimes(1.0, 2.0, 3.0))
+    monkeypatch.setattr(measure, "time_run", lambda *_: RunTimes(1.0, 4.0, 4.0))
     config = settings()
     times = measure.measure_runs(config, Inputs(config.source, 1, pixels, ()), Path())
-
     assert {tier: len(of_tier) for tier, of_tier in times.items()} == {REFERENCE: runs, EXACT: 2, FAST: 2}
-
-
-def test_time_of_a_stage_is_its_shortest() -> None:
-    stages = measure.stages_ns([RunTimes(1.0, 4.0, 4.0), RunTimes(2.0, 2.0, 1.0)], clean_share=0.25)
-
+    stages = measure.stages_ns([*times[EXACT], RunTimes(2.0, 2.0, 1.0)], clean_share=0.25)
     assert stages == {"decode": 1, "clean": 0.5, "noise": 1.5, "write": 1, "run": 4}
 
 

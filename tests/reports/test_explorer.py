@@ -61,16 +61,18 @@ def row_of_command(command: str, key: str, out: Path) -> dict[str, Any]:
     return next(dict(row) for row in read_rows(out / "manifest.csv") if row["key"] == key)
 
 
-CASES = {
-    "scene": (None, 2, ["source.downscale=4", "gains.red=2.05", "camera.weights=[1,2,0,1]"]),
-    "photograph": ("photos", 1, ["body=sony_a7s2", "scene=night", "effects.prnu=on"]),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_command_generates_the_pair_shown(case: str, photos: Path, tmp_path: Path) -> None:
-    place, number, overrides = CASES[case]
-    state = explorations(None if place is None else photos, *overrides)[number]
+@pytest.mark.parametrize(
+    ("is_folder", "number", "overrides"),
+    [
+        (False, 2, ["source.downscale=4", "gains.red=2.05", "camera.weights=[1,2,0,1]"]),
+        (True, 1, ["body=sony_a7s2", "scene=night", "effects.prnu=on"]),
+    ],
+    ids=["scene", "photograph"],
+)
+def test_command_generates_the_pair_shown(
+    is_folder: bool, number: int, overrides: list[str], photos: Path, tmp_path: Path
+) -> None:
+    state = explorations(photos if is_folder else None, *overrides)[number]
     shown = state.shown()
     row = row_of_command(state.command, str(shown.row["key"]), tmp_path / "out")
     assert {name: row[name] for name in ON_PAGE} == {name: shown.row[name] for name in ON_PAGE}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -190,30 +189,24 @@ def test_overview_without_photographs_shows_the_reason_and_the_frames(few: Path,
     np.testing.assert_array_equal(without[-height:, left:], with_source[-height:, left:])
 
 
-def test_eight_evenly_spaced_pairs_are_shown_by_default(dataset: Path, tmp_path: Path) -> None:
-    shown = [drawn.key for drawn in sheets.write_sheets(dataset, tmp_path)]
-
+def test_frames_of_any_size_are_shown(dataset: Path, tmp_path: Path) -> None:
+    """The sizes include 1 x 1 and 3 x 40; by default, eight evenly spaced pairs are shown."""
+    keys = [str(pair.row["key"]) for pair in RawPairs(dataset)]
+    drawn = list(sheets.write_sheets(dataset, tmp_path, ",".join(keys), with_stages=True))
+    assert [pair.key for pair in drawn] == keys
+    assert all(pair.missing_source == "" and len(pair.files) == 2 for pair in drawn)
+    shown = [pair.key for pair in sheets.write_sheets(dataset, tmp_path)]
     assert shown == [f"{i * len(PHOTOS) // 8:08d}" for i in range(8)]
 
 
-def test_frames_of_any_size_are_shown(dataset: Path, tmp_path: Path) -> None:
-    """The sizes include 1 x 1 and 3 x 40."""
-    keys = [str(pair.row["key"]) for pair in RawPairs(dataset)]
-
-    drawn = list(sheets.write_sheets(dataset, tmp_path, ",".join(keys), with_stages=True))
-
-    assert [one.key for one in drawn] == keys
-    assert all(one.missing_source == "" and len(one.files) == 2 for one in drawn)
-
-
 def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Path) -> None:
-    one = ("source.include=[large.png]", "output.layout=packed")
-    make(gray_world, tmp_path / "whole", *one)
-    make(gray_world, tmp_path / "float", *one, "output.dtype=float32")
-    wholes, floats = (next(iter(sheets.selected_pairs(tmp_path / name, "", None))) for name in ("whole", "float"))
-
-    assert np.abs(floats.clean - wholes.clean.astype(np.float64)).max() <= 0.5 + 1e-3  # rounding, and float32
-    assert np.abs(floats.noisy - wholes.noisy.astype(np.float64)).max() <= 0.5 + 1e-3
+    pairs = []
+    for dtype in ("uint16", "float32"):
+        settings = ("source.include=[large.png]", "output.layout=packed", f"output.dtype={dtype}")
+        make(gray_world, tmp_path / dtype, *settings)
+        pairs.append(next(iter(sheets.selected_pairs(tmp_path / dtype, "", None))))
+    for rounded, exact in zip(*((pair.clean, pair.noisy) for pair in pairs), strict=True):
+        assert np.abs(exact - rounded.astype(np.float64)).max() <= 0.5 + 1e-3  # rounding, and float32
 
 
 @pytest.mark.parametrize("key", ["00000000", "00000000-p0001"])
@@ -232,27 +225,19 @@ def test_patch_is_shown_with_its_part_of_the_source(key: str, gray_world: Path, 
 # The command ----------------------------------------------------------------------------------------------------------
 
 
-def test_preview_writes_the_sheets_of_the_keys(few: Path, run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("preview", few, "--keys", "00000000,00000003", "--to", "sheets", "--stages")
-
-    assert (done.code, done.err) == (0, "")
-    assert done.out == "4 pictures in sheets\n"
-    names = {path.name for path in (tmp_path / "sheets").iterdir()}
-    assert names == {f"{key}{kind}.png" for key in ("00000000", "00000003") for kind in ("", ".stages")}
-
-
-def test_preview_refuses_a_folder_with_sheets_of_another_dataset(
+def test_preview_writes_the_sheets_of_the_keys_of_one_dataset(
     few: Path, dataset: Path, run_main: RunMain, tmp_path: Path
 ) -> None:
-    assert run_main("preview", few, "--keys", "3", "--to", "sheets").code == 0
-    assert run_main("preview", few, "--keys", "0", "--to", "sheets").code == 0  # more sheets of the same dataset
+    done = run_main("preview", few, "--keys", "00000000,00000003", "--to", "sheets", "--stages")
+    assert (done.code, done.out, done.err) == (0, "4 pictures in sheets\n", "")
     before = {path.name: path.read_bytes() for path in (tmp_path / "sheets").iterdir()}
+    assert before.keys() == {f"{key}{kind}.png" for key in ("00000000", "00000003") for kind in ("", ".stages")}
 
     done = run_main("preview", dataset, "--keys", "3", "--to", "sheets")
-
     assert (done.code, done.err.count("\n")) == (2, 1)
     assert done.err.startswith(f"gen-dataset: --to sheets: 00000000.png is not a sheet of {dataset}; ")
     assert {path.name: path.read_bytes() for path in (tmp_path / "sheets").iterdir()} == before
+    assert run_main("preview", few, "--keys", "1", "--to", "sheets").code == 0  # more sheets of the same dataset
 
 
 @pytest.mark.parametrize("inside", ["", "sheets"])
@@ -266,23 +251,16 @@ def test_preview_refuses_the_folder_of_the_photographs(
     assert sorted(gray_world.rglob("*")) == before
 
 
-Spoil = Callable[[Path], None]
-
-
-def deleted(folder: Path) -> None:
-    (folder / "a.png").unlink()
-
-
-def changed(folder: Path) -> None:
-    (folder / "a.png").write_bytes(b"x" * (folder / "a.png").stat().st_size)
-
-
-@pytest.mark.parametrize(("spoil", "reason"), [(deleted, "No such file"), (changed, "a.png")])
+@pytest.mark.parametrize(("content", "reason"), [(None, "No such file"), (b"x", "a.png")])
 def test_changed_photograph_is_named_and_its_panel_omitted(
-    few: Path, gray_world: Path, run_main: RunMain, tmp_path: Path, spoil: Spoil, reason: str
+    few: Path, gray_world: Path, run_main: RunMain, tmp_path: Path, content: bytes | None, reason: str
 ) -> None:
     shutil.copytree(gray_world, tmp_path / "moved")
-    spoil(tmp_path / "moved")
+    photograph = tmp_path / "moved" / "a.png"
+    size = photograph.stat().st_size
+    photograph.unlink()
+    if content is not None:
+        photograph.write_bytes(content * size)
 
     done = run_main("preview", few, "--keys=00000000,00000001", "--to=to", "source.root=moved", "--stages")
 
