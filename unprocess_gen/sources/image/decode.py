@@ -98,7 +98,58 @@ def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Ph
     """
     header = probe(data)
     _refuse(header, max_pixels, icc)
-    return Photograph(upright(_pixels(data, header, name), header.orientation), header.orientation)
+    flags = _COLOUR_16 if header.bits == 16 else _COLOUR
+    if header.has_alpha or (header.format == "tiff" and header.bits == 16):
+        flags = cv2.IMREAD_UNCHANGED
+    content = np.frombuffer(tiff_without_orientation(data) if header.format == "tiff" else data, np.uint8)
+    decoded: Srgb | None = None
+    with captured() as written, suppress(cv2.error):
+        decoded = cast("Srgb | None", cv2.imdecode(content, flags))
+    if decoded is None:  # codecs report a lack of memory in many ways, or not at all: MemoryError if there is one
+        np.empty((header.height, header.width, DECODE_PEAK), f"uint{header.bits}")
+    messages = bytes(written)
+    text = " ".join(_LOG_PREFIX.sub("", messages.decode(errors="replace")).split())
+    damage = _DAMAGE.search(messages)
+    if decoded is None or damage:
+        # only the recognised words go into the manifest: the others differ between versions of the codecs
+        _LOGGER.debug("%s: %s", name, text)
+        words = damage[0].decode() if damage else "the codec fails"
+        raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {words}")
+    if text:
+        _LOGGER.warning("%s: %s", name, text)
+    _check(decoded, header)
+    if header.mode == "white_is_zero" and header.bits == 16:
+        np.subtract(65535, decoded, out=decoded)
+    if decoded.ndim == 2:
+        decoded = cast(Srgb, np.repeat(decoded[..., None], 3, axis=2))
+    elif flags == cv2.IMREAD_UNCHANGED:
+        decoded = decoded[..., 2::-1]
+    return Photograph(_upright(decoded, header.orientation), header.orientation)
+
+
+# Pixels ---------------------------------------------------------------------------------------------------------------
+
+
+def _check(decoded: Srgb, header: Header) -> None:
+    """Raise SourceError for another array than the header declares, and for pixels that are or may be transparent.
+
+    OpenCV drops the transparent value of gray.
+    """
+    expected = (header.height, header.width, f"uint{header.bits}")
+    actual = (*decoded.shape[:2], decoded.dtype.name)
+    if actual != expected:
+        raise SourceError("corrupt", f"the header declares {expected} (rows, columns, type), the data have {actual}")
+    if header.has_alpha and (
+        decoded.ndim == 2 or (decoded.shape[2] == 4 and decoded[..., 3].min() < 2**header.bits - 1)
+    ):
+        raise SourceError("alpha", "some pixels may be transparent; flatten the picture onto a background")
+
+
+def _upright(srgb: Srgb, orientation: int) -> Srgb:
+    """Rotate and mirror stored pixels by an EXIF orientation, 1 to 8 (tag 274)."""
+    turned = srgb.swapaxes(0, 1) if orientation > 4 else srgb
+    row_step, column_step = (-1 if orientation in mirrored else 1 for mirrored in ((3, 4, 7, 8), (2, 3, 6, 7)))
+    return cast(Srgb, np.ascontiguousarray(turned[::row_step, ::column_step]))
 
 
 # Policy ---------------------------------------------------------------------------------------------------------------
@@ -159,57 +210,3 @@ def _profile_objection(icc: bytes) -> str:
         return f"the embedded colour profile cannot be used ({type(error).__name__})"
     moved = int(np.abs(converted - np.asarray(colours.convert("RGB"))).max())
     return f"the embedded colour profile moves colours by up to {moved} codes" if moved > SRGB_TOLERANCE else ""
-
-
-# Pixels ---------------------------------------------------------------------------------------------------------------
-
-
-def _pixels(data: bytes, header: Header, name: str) -> Srgb:
-    """Decode the pixels as stored, ``[height, width, 3]``, R, G, B."""
-    flags = _COLOUR_16 if header.bits == 16 else _COLOUR
-    if header.has_alpha or (header.format == "tiff" and header.bits == 16):
-        flags = cv2.IMREAD_UNCHANGED
-    content = np.frombuffer(tiff_without_orientation(data) if header.format == "tiff" else data, np.uint8)
-    decoded: Srgb | None = None
-    with captured() as written, suppress(cv2.error):
-        decoded = cast("Srgb | None", cv2.imdecode(content, flags))
-    if decoded is None:  # codecs report a lack of memory in many ways, or not at all: MemoryError if there is one
-        np.empty((header.height, header.width, DECODE_PEAK), f"uint{header.bits}")
-    messages = bytes(written)
-    text = " ".join(_LOG_PREFIX.sub("", messages.decode(errors="replace")).split())
-    damage = _DAMAGE.search(messages)
-    if decoded is None or damage:
-        # only the recognised words go into the manifest: the others differ between versions of the codecs
-        _LOGGER.debug("%s: %s", name, text)
-        words = damage[0].decode() if damage else "the codec fails"
-        raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {words}")
-    if text:
-        _LOGGER.warning("%s: %s", name, text)
-    _check(decoded, header)
-    if header.mode == "white_is_zero" and header.bits == 16:
-        np.subtract(65535, decoded, out=decoded)
-    if decoded.ndim == 2:
-        return cast(Srgb, np.repeat(decoded[..., None], 3, axis=2))
-    return cast(Srgb, np.ascontiguousarray(decoded[..., 2::-1])) if flags == cv2.IMREAD_UNCHANGED else decoded
-
-
-def _check(decoded: Srgb, header: Header) -> None:
-    """Raise SourceError for another array than the header declares, and for pixels that are or may be transparent.
-
-    OpenCV drops the transparent value of gray.
-    """
-    expected = (header.height, header.width, f"uint{header.bits}")
-    actual = (*decoded.shape[:2], decoded.dtype.name)
-    if actual != expected:
-        raise SourceError("corrupt", f"the header declares {expected} (rows, columns, type), the data have {actual}")
-    if header.has_alpha and (
-        decoded.ndim == 2 or (decoded.shape[2] == 4 and decoded[..., 3].min() < 2**header.bits - 1)
-    ):
-        raise SourceError("alpha", "some pixels may be transparent; flatten the picture onto a background")
-
-
-def upright(srgb: Srgb, orientation: int) -> Srgb:
-    """Rotate and mirror stored pixels by an EXIF orientation, 1 to 8 (tag 274)."""
-    turned = srgb.swapaxes(0, 1) if orientation > 4 else srgb
-    row_step, column_step = (-1 if orientation in mirrored else 1 for mirrored in ((3, 4, 7, 8), (2, 3, 6, 7)))
-    return cast(Srgb, np.ascontiguousarray(turned[::row_step, ::column_step]))
