@@ -58,7 +58,7 @@ def _make_in_pools(
                     del waiting[report.shard]
                     yield report
             except TerminatedWorkerError:
-                in_progress = [shard for shard in waiting if read_deaths(folder, shard)] or [*waiting][:n_jobs]
+                in_progress = sorted(shards_with_deaths(folder) & waiting.keys()) or [*waiting][:n_jobs]
                 for shard in in_progress:
                     write_deaths(folder, shard, [])  # any of them may have ended the pool
                     alone.append(waiting.pop(shard))
