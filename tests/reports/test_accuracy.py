@@ -22,7 +22,7 @@ from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.accuracy import measure, report
 from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
-from unprocess_gen.simulation.kernels.render import uses_scene32
+from unprocess_gen.simulation.kernels.render import uses_float32
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE, TIERS
 from unprocess_gen.sources.listing import list_photographs
@@ -52,9 +52,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_plans_that_amplify_rounding_errors_use_float64(settings: Settings, steep: str) -> None:
     plan = plan_image(settings("accuracy=fast", "noise=imx385_iso3200", *steep.split()), "0" * 64)
 
-    assert uses_scene32(plan) == (not steep)
-    assert not uses_scene32(plan.replace(accuracy=EXACT))
-    assert not uses_scene32(plan.replace(clean_dtype="float32"))
+    assert uses_float32(plan) == (not steep)
+    assert not uses_float32(plan.replace(accuracy=EXACT))
+    assert not uses_float32(plan.replace(clean_dtype="float32"))
 
 
 def test_reference_tier_uses_the_exact_table_of_the_curve(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
