@@ -106,7 +106,7 @@ def _dark_current(results: Sequence[IsoResult]) -> Estimate | None:
 def _hot(results: Sequence[IsoResult], sensor: Sensor) -> tuple[Estimate | None, Estimate | None]:
     """Share and mean current of hot pixels, from the darks that show the most currents.
 
-    The currents are exponentially distributed (the profile's law), so those above a threshold have the mean of all plus
+    The currents are exponentially distributed (as in the profile), so those above a threshold have the mean of all plus
     the threshold. Full pixels are censored: they add to the sum of the currents, but not to their number.
     """
     from scipy.special import gammaincinv  # scipy.stats takes seconds to import

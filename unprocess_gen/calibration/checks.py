@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unprocess_gen.calibration.captures import Capture, Sensor
-from unprocess_gen.calibration.frame_sums import ROUNDING_DN2, Measured
+from unprocess_gen.calibration.frame_sums import ROUNDING_DN2, Measurement
 from unprocess_gen.calibration.scores import UNFORESEEN, Score, alarm_limit
 from unprocess_gen.core.errors import ConfigError
 
@@ -92,7 +92,7 @@ def _check(frames: Sequence[Capture], scores: dict[str, Score], notes: list[str]
             notes.append(text)
 
 
-def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes: list[str]) -> None:
+def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measurement, notes: list[str]) -> None:
     """Refuse darks that are clipped, contain light or differ; warn of doubtful ones."""
     std_dn = math.sqrt(max(float((dark.variance + dark.dsnu).mean()) - ROUNDING_DN2, 0.0))  # both are dither
     least = LEAST_DARK_STD_8_BITS_DN if sensor.bits <= 8 else LEAST_DARK_STD_DN
@@ -113,12 +113,12 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measured, notes:
     _check(frames, scores | _pixel_scores(dark), notes)
 
 
-def is_clipped(dark: Measured) -> bool:
+def is_clipped(dark: Measurement) -> bool:
     """True if black is clipped."""
     return _exceeds(clipped_black(dark), LIMITS["clipped black"].refused)
 
 
-def clipped_black(dark: Measured) -> Score:
+def clipped_black(dark: Measurement) -> Score:
     """Score the share of the lowest value, 0 if the histogram falls to both sides alike."""
     shares = []
     for codes in dark.codes:
@@ -128,7 +128,7 @@ def clipped_black(dark: Measured) -> Score:
     return Score(float(max(shares)), 1.0, float(max(shares)) / dark.sites / dark.count)
 
 
-def _pixel_scores(measured: Measured) -> dict[str, Score]:
+def _pixel_scores(measured: Measurement) -> dict[str, Score]:
     """Score missing values, and the correlation of neighbours, which subtracted means of lines change by 1/length."""
     correlation = measured.correlation
     moved = min(abs(correlation.total), 1 / min(measured.shape))
@@ -148,7 +148,9 @@ def _missing_codes(codes: np.ndarray) -> Score:
     return Score(float(np.mean(inner == 0)), 1.0, UNFORESEEN / len(inner), step=step)
 
 
-def check_flat(frames: Sequence[Capture], sensor: Sensor, flat: Measured, dark: Measured, notes: list[str]) -> None:
+def check_flat(
+    frames: Sequence[Capture], sensor: Sensor, flat: Measurement, dark: Measurement, notes: list[str]
+) -> None:
     """Refuse flats whose light changes in time or over the frame; warn of doubtful ones."""
     signal = max(float(flat.mean_dn.mean() - dark.mean_dn.mean()), 1.0)
     noise = float(flat.variance.mean()) / flat.sites / signal**2  # of the mean of a plane

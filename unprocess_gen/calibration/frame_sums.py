@@ -37,7 +37,7 @@ LARGEST_Z = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class Measurement:
     """Noise of the frames of one measurement; arrays are by plane of `TILE`, variances in DN².
 
     Attributes
@@ -125,7 +125,7 @@ class FrameSums:
         """Return the mean of all frames, [H, W] DN."""
         return np.asarray(self._first + self._sum / np.float64(len(self._rows)))
 
-    def measure(self) -> Measured:
+    def measure(self) -> Measurement:
         """Estimate the noise of the frames; two or more."""
         count, rows, columns = len(self._rows), np.array(self._rows), np.array(self._columns)
         height, width = rows.shape[2], columns.shape[2]
@@ -144,7 +144,7 @@ class FrameSums:
         temporal = (variance * SMOOTH + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
         offsets, fixed = own_columns.mean(axis=0), (patterns - temporal) / SMOOTH
         still = per_column / count + max(float(fixed.mean()), 0.0) / height
-        return Measured(
+        return Measurement(
             count=count,
             shape=(height, width),
             frame_means=means,

@@ -16,7 +16,7 @@ from unprocess_gen.calibration.frame_sums import (
     SMOOTH,
     WINDOW,
     FrameSums,
-    Measured,
+    Measurement,
     high_passed,
     robust_std,
 )
@@ -52,7 +52,7 @@ class Dark:
     """Darks of one exposure: frames, noise, and the values of their fixed pattern above a threshold, in DN."""
 
     frames: list[Capture]
-    measured: Measured
+    measured: Measurement
     hot_dn: Float
     hot_threshold_dn: float
 
@@ -70,7 +70,7 @@ class Flat:
     """
 
     frames: list[Capture]
-    measured: Measured
+    measured: Measurement
     dark: Dark
     is_full: bool
     signals_dn: Float
@@ -216,7 +216,7 @@ def _levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> list[Flat]:
 # --------------------------------------------------------------------------------------------------------------- noise
 
 
-def _variances(measured: Measured, shape: ReadShape) -> tuple[Float, Float]:
+def _variances(measured: Measurement, shape: ReadShape) -> tuple[Float, Float]:
     """Return the variance of a site without rounding, and its error.
 
     Where rounding distorts the variance, it follows from the fitted distribution and the fixed pattern.
@@ -236,7 +236,7 @@ def _curves(flats: Sequence[Flat], shape: ReadShape) -> list[Transfer]:
     return [Transfer(signal, variance, error, dark, darks) for signal, variance, error, dark in by_plane]
 
 
-def _dark_numbers(measured: Measured, sensor: Sensor, shape: ReadShape) -> dict[str, list[Estimate]]:
+def _dark_numbers(measured: Measurement, sensor: Sensor, shape: ReadShape) -> dict[str, list[Estimate]]:
     """Return the estimates that darks give."""
     columns, fixed_column = measured.column, measured.fixed_column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
@@ -266,7 +266,7 @@ def _with_mean(planes: Float) -> Float:
     return np.append(planes.mean(axis=-1, keepdims=True), planes, axis=-1)
 
 
-def _black_errors(measured: Measured, variances: Float) -> Float:
+def _black_errors(measured: Measurement, variances: Float) -> Float:
     """Standard errors of the black of all planes, and of each; two planes share the offset of a line."""
     height, width = np.outer(measured.shape, [2, 1, 1, 1, 1])
     sites = np.array([4, 1, 1, 1, 1]) * measured.sites

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.calibration.frame_sums import Measured
+from unprocess_gen.calibration.frame_sums import Measurement
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.planes import planes_of
 from unprocess_gen.calibration.scores import NORMAL_95
@@ -72,7 +72,7 @@ class ReadShape:
         return self.tukey_std_dn if self.is_tukey else self.normal_std_dn
 
 
-def fill_histogram(frames: Iterable[NDArray[np.uint16]], measured: Measured) -> Histogram:
+def fill_histogram(frames: Iterable[NDArray[np.uint16]], measured: Measurement) -> Histogram:
     """Return the histogram of the frames that were measured."""
     columns, is_seen = measured.column_offsets, measured.dsnu > 2 * measured.fixed_error
     pattern = float(np.where(is_seen, measured.dsnu, 0.0).mean())

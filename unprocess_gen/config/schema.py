@@ -5,7 +5,7 @@ meaning. OmegaConf checks keys and types against these dataclasses; `validation`
 A config is immutable and hashable: lists become tuples. `replaced` returns a copy with other values.
 
 A parameter that is drawn for every image is a number or a distribution, written as a list: ``[uniform, 1.9, 2.4]``. An
-override replaces a list completely. A mapping would be merged with the default's mapping, into a mixture of both.
+override replaces a list completely. A mapping would be merged with the default's mapping, into parts of both.
 """
 
 from __future__ import annotations

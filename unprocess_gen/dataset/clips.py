@@ -14,7 +14,7 @@ from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.reader import Place, RawPairs, dataset_folders
+from unprocess_gen.dataset.reader import DatasetPath, RawPairs, dataset_folders
 
 
 class _Frames(NamedTuple):
@@ -83,10 +83,10 @@ class RawClips:
     (2, 8, 7)
     """
 
-    def __init__(self, path: Place | Sequence[Place], *, split: str | None = None) -> None:
+    def __init__(self, path: DatasetPath | Sequence[DatasetPath], *, split: str | None = None) -> None:
         self._pairs = RawPairs(path, split=split)
         self.path = self._pairs.path
-        places = [path] if isinstance(path, Place) else path
+        places = [path] if isinstance(path, DatasetPath) else path
         folders = [folder for place in places for folder in dataset_folders(any_path(place))]
         rows = ((folder, row) for folder in folders for row in read_rows(folder / "manifest.csv"))
         pairs = ((folder, row) for folder, row in rows if row["status"] == "ok" and split in (None, row["split"]))

@@ -40,7 +40,7 @@ FINISHED = ("0", "3")
 """Exit codes of jobs that left a dataset: complete, and complete with failed sources."""
 
 
-Place = str | Path | ObjectPath
+DatasetPath = str | Path | ObjectPath
 """Folder of a dataset or sweep, or its URL."""
 
 
@@ -146,9 +146,11 @@ class RawPairs:
     (dtype('uint16'), '00000000')
     """
 
-    def __init__(self, path: Place | Sequence[Place], *, arrays_only: bool = False, split: str | None = None) -> None:
-        places = [path] if isinstance(path, Place) else path
-        roots, is_list = tuple(map(any_path, places)), not isinstance(path, Place)
+    def __init__(
+        self, path: DatasetPath | Sequence[DatasetPath], *, arrays_only: bool = False, split: str | None = None
+    ) -> None:
+        places = [path] if isinstance(path, DatasetPath) else path
+        roots, is_list = tuple(map(any_path, places)), not isinstance(path, DatasetPath)
         if not roots:
             raise ConfigError("RawPairs([]): no dataset; expected at least one folder")
         self.path = roots if is_list else roots[0]

@@ -25,7 +25,7 @@ from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.dataset.columns import Value
-from unprocess_gen.dataset.reader import Place, Sample, check_split, dataset_folders, name_apart
+from unprocess_gen.dataset.reader import DatasetPath, Sample, check_split, dataset_folders, name_apart
 from unprocess_gen.dataset.row import COLUMNS
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
@@ -89,7 +89,7 @@ class LivePairs:
     as_float : bool
         Frames are float32 with 0 at black and 1 at white.
     targets : sequence of str
-        More arrays: ``"variance"`` of the noise at each site, by the row's law on the clean frame; ``"noise_std"``, the
+        More arrays: ``"variance"`` of the noise at each site, by the row on the clean frame; ``"noise_std"``, the
         standard deviation that `noise_std` estimates from the noisy frame; ``"srgb"``, the pixels of the photograph;
         ``"linear_rgb"``, the scene before the mosaic, 0 at black and 1 at white, [H, W, 3]. The first two are float32,
         in DN² and DN, or in units of white with ``as_float``; the last is float32.
@@ -285,11 +285,11 @@ def _without_none(row: Mapping[str, Value]) -> dict[str, Value]:
 
 def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, split: str | None) -> list[LiveSource]:
     """Open datasets, or list the sources of a config or of overrides."""
-    places = [dataset] if isinstance(dataset, Place) else [] if isinstance(dataset, Config) else list(dataset)
-    if isinstance(dataset, Place) or any(_is_dataset(place) for place in places):
+    places = [dataset] if isinstance(dataset, DatasetPath) else [] if isinstance(dataset, Config) else list(dataset)
+    if isinstance(dataset, DatasetPath) or any(_is_dataset(place) for place in places):
         folders = [folder for place in places for folder in dataset_folders(any_path(place))]
         recorded = [RecordedPairs(folder, root, cache, split) for folder in folders]
-        if not isinstance(dataset, Place):
+        if not isinstance(dataset, DatasetPath):
             name_apart(recorded)
         if split is not None:
             check_split("LivePairs", split, recorded)

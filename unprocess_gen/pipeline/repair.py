@@ -49,10 +49,10 @@ class RepairStep(NamedTuple):
 def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> Iterator[RepairStep]:
     """Regenerate every damaged file of a dataset; yield a step for each.
 
-    ``root`` is the folder of the sources, None for built-in scenes or if no source is needed; ``dark_frames`` is that
-    of dark frames. Raises LockedError if a run holds the folder, DamageError if several files are damaged and nothing
-    proves what they were, ConfigError if sources are needed and ``root`` is None, SourceChangedError if the manifest is
-    damaged and a source was changed or deleted, MachineError if a file cannot be read or written.
+    ``root`` is the folder of the sources, None for synthetic pictures or if no source is needed; ``dark_frames`` is
+    that of dark frames. Raises LockedError if a run holds the folder, DamageError if several files are damaged and
+    nothing proves what they were, ConfigError if sources are needed and ``root`` is None, SourceChangedError if the
+    manifest is damaged and a source was changed or deleted, MachineError if a file cannot be read or written.
     """
     with OutFolder(folder) as place, machine_errors(folder):
         place.lock()

@@ -122,9 +122,9 @@ def _sum_of_squares(count: int, start: Decimal, step: Decimal, c0: Decimal, c1: 
     return a * a * n + 2 * a * b * first + (b * b + 2 * a * c) * second + 2 * b * c * third + c * c * fourth
 
 
-def quantile_table(law: str, shape: float) -> Float:
+def quantile_table(distribution: str, shape: float) -> Float:
     """Table of a distribution of the read noise, ``gaussian`` or ``tukey_lambda``, for standard deviation 1."""
-    return normal_table() if law == "gaussian" else unit_tukey_table(shape)
+    return normal_table() if distribution == "gaussian" else unit_tukey_table(shape)
 
 
 @functools.lru_cache(maxsize=1)

@@ -8,8 +8,8 @@ There are four tests:
 4. Small golden pairs, simulated by the kernels of the plan, have their published digests.
 
 A compiler, library or CPU that rounds differently fails here, before it writes a dataset. The golden pairs cover the
-8-bit kernels, every law of the noise, both branches of the highlights, every phase of the CFA pattern and both ends of
-the sensor's range. The 16-bit curves are checked when they are first read.
+8-bit kernels, every distribution of the noise, both branches of the highlights, every phase of the CFA pattern
+and both ends of the sensor's range. The 16-bit curves are checked when they are first read.
 """
 
 from __future__ import annotations

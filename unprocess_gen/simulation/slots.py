@@ -102,7 +102,7 @@ class SiteNoise(NamedTuple):
 
     stream: int
     std_dn: float
-    law: str = "gaussian"
+    distribution: str = "gaussian"
     shape: float = 0.0
 
 

@@ -17,7 +17,7 @@ from unprocess_gen.simulation.plan import DarkFramePlan, Plan
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 
-DITHER_LAW, DITHER_SHAPE = "tukey_lambda", 1.0
+DITHER_DISTRIBUTION, DITHER_SHAPE = "tukey_lambda", 1.0
 """Uniform distribution, as Tukey's lambda distribution of shape 1."""
 
 
@@ -83,7 +83,7 @@ class DarkFrameNoise(Effect):
 
     def noise_dn(self, crop: Crop) -> Float:
         """Draw the dither, uniform in ±½ DN of the dark frame."""
-        uniform = by_inverse_cdf(crop.frame_words(self.stream), quantile_table(DITHER_LAW, DITHER_SHAPE))
+        uniform = by_inverse_cdf(crop.frame_words(self.stream), quantile_table(DITHER_DISTRIBUTION, DITHER_SHAPE))
         return dither_std_dn(crop.plan) * uniform
 
     def site_offset_dn(self, crop: Crop) -> NDArray[np.float32]:
@@ -92,5 +92,5 @@ class DarkFrameNoise(Effect):
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site with the dither, and the offsets by site."""
-        dither = SiteNoise(self.stream, dither_std_dn(plan), DITHER_LAW, DITHER_SHAPE)
+        dither = SiteNoise(self.stream, dither_std_dn(plan), DITHER_DISTRIBUTION, DITHER_SHAPE)
         return {"noise": dither, "has_site_offsets": True}

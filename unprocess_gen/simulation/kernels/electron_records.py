@@ -126,7 +126,7 @@ def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
     gains, planes_dn = _by_site(slots.plane_gains, top), _by_site(slots.planes_dn, top)
     dn_per_e = slots.dn_per_e * gains
     noise, uniform = slots.noise or SiteNoise(0, 0.0), slots.uniform or UniformCounts(0, 0.0, 0.0)
-    quantiles = _quantiles(noise.law, noise.shape)
+    quantiles = _quantiles(noise.distribution, noise.shape)
     has_thresholds = uniform.rate_e <= MAX_THRESHOLD_RATE
     fewest, ranks = count_thresholds(uniform.rate_e) if has_thresholds else (0, np.zeros(0, dtype=np.uint32))
     rows, bright = slots.rows or LineOffsets(SlotWords(0, 0), 0.0), slots.patterns.bright
@@ -172,8 +172,8 @@ def _purpose(stream: int) -> np.uint64:
 
 
 @functools.lru_cache(maxsize=8)
-def _quantiles(law: str, shape: float) -> Quantiles:
-    return normal_quantiles() if law == "gaussian" else build_quantiles(quantile_table(law, shape))
+def _quantiles(distribution: str, shape: float) -> Quantiles:
+    return normal_quantiles() if distribution == "gaussian" else build_quantiles(quantile_table(distribution, shape))
 
 
 # ----------------------------------------------------------------------------------------------------- rows and columns

@@ -1,4 +1,4 @@
-"""Camera matrices with their sources, and the linear RGB → camera matrix of a mixture of cameras.
+"""Camera matrices with their sources, and the linear RGB → camera matrix of a mix of cameras.
 
 Matrices are tuples of nine Python floats, computed in a fixed order of operations, because the matrix products of
 libraries round differently between machines. Inverses are computed with exact fractions and rounded once.
