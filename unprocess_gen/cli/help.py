@@ -66,7 +66,7 @@ def global_help(verbs: Mapping[str, Verb]) -> str:
         _section("Verbs", ((verb.name, verb.summary) for verb in verbs.values()), 16),
         "\n".join([SETTINGS_HELP, *(_columns(*line, 16) for line in _group_lines())]) + "\n",
         "Keys at the top level:\n" + "".join(key_help("")),
-        _section("Flags, besides those of the verb", FLAGS),
+        _section("Flags, in addition to those of the verb", FLAGS),
         _section("Exit codes", EXIT_CODES.items(), 16),
     ]
     return "\n".join(blocks)
