@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
 from unprocess_gen.core.fields import ALWAYS, Condition, Kind, Limit, number_or_text
-from unprocess_gen.simulation.plan import PlanRecord, fields_of
+from unprocess_gen.simulation.plan import PlanRecord, fields_of, part_in
 
 Value = str | int | float | None
 Row = Mapping[str, Value]
 """Value by column; where a column does not apply, text is empty and a number is None."""
 
-RecordType = TypeVar("RecordType", bound=msgspec.Struct)
+RecordType = TypeVar("RecordType", bound=PlanRecord)
 
 TYPE_NAMES: Mapping[Any, str] = {int: "integer", float: "number", str: "text", number_or_text: "number or text"}
 
@@ -69,7 +69,7 @@ class FieldColumns(NamedTuple):
     columns: tuple[Column, ...]
     blank: bool = False
     default: Any = msgspec.NODEFAULT
-    record: type[msgspec.Struct] | None = None
+    record: type[PlanRecord] | None = None
     parts: tuple[FieldColumns, ...] = ()
 
     @property
@@ -81,16 +81,14 @@ class FieldColumns(NamedTuple):
 
 
 @functools.cache
-def places_of(record: type[msgspec.Struct], needs: Condition = ALWAYS) -> tuple[FieldColumns, ...]:
+def places_of(record: type[PlanRecord], needs: Condition = ALWAYS) -> tuple[FieldColumns, ...]:
     """Fields of a record that have columns."""
     given = record.__struct_defaults__  # of the last fields
     defaults: dict[str, Any] = dict.fromkeys(record.__struct_fields__, msgspec.NODEFAULT)
     defaults |= zip(record.__struct_fields__[len(defaults) - len(given) :], given, strict=True)
     places = []
     for name, (kind, declared) in fields_of(record).items():
-        part = next(
-            (one for one in (kind, *get_args(kind)) if isinstance(one, type) and issubclass(one, PlanRecord)), None
-        )
+        part = part_in(kind)
         if part is not None:
             parts = places_of(part, declared or needs)
             columns = tuple(column for place in parts for column in place.columns)
@@ -103,12 +101,12 @@ def places_of(record: type[msgspec.Struct], needs: Condition = ALWAYS) -> tuple[
     return tuple(places)
 
 
-def flatten(record: msgspec.Struct, unused: Collection[Condition] = ()) -> dict[str, Value]:
+def flatten(record: PlanRecord, unused: Collection[Condition] = ()) -> dict[str, Value]:
     """Cells of a record and of the records in it that are not empty; ``unused`` conditions have none."""
     return _cells(record, places_of(type(record)), unused)
 
 
-def _cells(record: msgspec.Struct, places: Sequence[FieldColumns], unused: Collection[Condition]) -> dict[str, Value]:
+def _cells(record: PlanRecord, places: Sequence[FieldColumns], unused: Collection[Condition]) -> dict[str, Value]:
     cells: dict[str, Value] = {}
     for place in places:
         value = getattr(record, place.name)

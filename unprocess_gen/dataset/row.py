@@ -10,8 +10,6 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any
 
-import msgspec
-
 from unprocess_gen.core.arrays import FLOAT32
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.fields import (
@@ -141,7 +139,7 @@ AFTER = {
 variances too."""
 
 
-def _in_order(records: Iterable[type[msgspec.Struct]]) -> tuple[Column, ...]:
+def _in_order(records: Iterable[type[PlanRecord]]) -> tuple[Column, ...]:
     """Columns of records, moved behind those of `AFTER`."""
     columns = {column.name: column for record in records for place in places_of(record) for column in place.columns}
     names = [name for name in columns if name not in AFTER]

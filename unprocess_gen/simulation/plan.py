@@ -112,22 +112,48 @@ class PlanRecord(msgspec.Struct, frozen=True):
         **values : Any
             New values by the names of the fields.
         """
-        own = {name: values.pop(name) for name in self.__struct_fields__ if name in values}
-        for name in self.__struct_fields__ if values else ():
-            part = getattr(self, name)
-            if name not in own and isinstance(part, PlanRecord) and (inner := _known(part, values)):
-                own[name] = part.replace(**inner)
-                values = {other: value for other, value in values.items() if other not in inner}
-        return msgspec.structs.replace(self, **own, **values)
+        part_of, changes = _parts_of_fields(type(self)), dict[str, Any]()
+        inner: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            place = changes if (part := part_of.get(name)) is None else inner.setdefault(part, {})
+            place[name] = value
+        for part, new in inner.items():
+            changes[part] = changes.get(part, getattr(self, part)).replace(**new)
+        return msgspec.structs.replace(self, **changes)
 
 
-def _known(record: PlanRecord, values: dict[str, Any]) -> dict[str, Any]:
-    """Values whose names are fields of a record or of the records in it."""
-    known = {name: values[name] for name in record.__struct_fields__ if name in values}
-    for name in record.__struct_fields__:
-        if isinstance(part := getattr(record, name), PlanRecord):
-            known |= _known(part, values)
-    return known
+@functools.cache
+def fields_of(record: type[PlanRecord]) -> dict[str, tuple[Any, Any]]:
+    """Type and declaration of each field of a record: a `Field`, a `Condition` of a part, or None."""
+    hints = get_type_hints(record, include_extras=True)
+    return {
+        name: (hints[name].__origin__, hints[name].__metadata__[0])
+        if hasattr(hints[name], "__metadata__")
+        else (hints[name], None)
+        for name in record.__struct_fields__
+    }
+
+
+def part_in(kind: Any) -> type[PlanRecord] | None:
+    """Record that a field of a type holds; None for a value."""
+    kinds = (part for part in (kind, *get_args(kind)) if isinstance(part, type) and issubclass(part, PlanRecord))
+    return next(kinds, None)
+
+
+def declared_fields(record: type[PlanRecord]) -> dict[str, Field]:
+    """Declared fields of a record and of the records in it, by name."""
+    fields: dict[str, Field] = {}
+    for name, (kind, declared) in fields_of(record).items():
+        part = part_in(kind)
+        fields |= {name: declared} if isinstance(declared, Field) else declared_fields(part) if part else {}
+    return fields
+
+
+@functools.cache
+def _parts_of_fields(record: type[PlanRecord]) -> dict[str, str]:
+    """Part of a record that has each field of the records in it."""
+    parts = {name: part for name, (kind, _) in fields_of(record).items() if (part := part_in(kind))}
+    return {field: name for name, part in parts.items() for field in (*part.__struct_fields__, *_parts_of_fields(part))}
 
 
 class Place(PlanRecord, frozen=True):
@@ -580,37 +606,13 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         return float(np.float32((value_dn - sensor.black_level_dn) / sensor.span_dn))
 
 
-@functools.cache
-def fields_of(record: type[msgspec.Struct]) -> dict[str, tuple[Any, Any]]:
-    """Type and declaration of each field of a record: a `Field`, a `Condition` of a part, or None."""
-    hints = get_type_hints(record, include_extras=True)
-    return {
-        name: (hints[name].__origin__, hints[name].__metadata__[0])
-        if hasattr(hints[name], "__metadata__")
-        else (hints[name], None)
-        for name in record.__struct_fields__
-    }
-
-
 NUMBERS: dict[str, Number] = {
     name: declared for name, (_, declared) in fields_of(Physics).items() if isinstance(declared, Number)
 }
 """Numbers of all effects by the names of their fields."""
 
 
-def _declared(record: type[msgspec.Struct]) -> dict[str, Field]:
-    """Declared fields of a record and of the records in it."""
-    fields: dict[str, Field] = {}
-    for name, (kind, declared) in fields_of(record).items():
-        parts = [part for part in (kind, *get_args(kind)) if isinstance(part, type) and issubclass(part, PlanRecord)]
-        for part in parts:
-            fields |= _declared(part)
-        if isinstance(declared, Field):
-            fields[name] = declared
-    return fields
-
-
-FIELDS = _declared(Plan)
+FIELDS = declared_fields(Plan)
 """All declared fields of a plan by their names; keys of the settings refer to them."""
 
 
