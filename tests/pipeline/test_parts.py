@@ -310,10 +310,10 @@ def test_wrong_calls_are_refused_with_2(
     assert files(begun) == before
 
 
-def test_another_version_is_refused(begun: Path, part: Part) -> None:
+def test_another_version_is_refused(begun: Path, part: Part, run_main: RunMain) -> None:
     edit_run(begun, version="9.9")
-    done = part("0/6")
-    assert (done.code, "was begun by unprocess_gen 9.9, this is" in done.err) == (2, True)
+    for done in (part("0/6"), run_main("merge", "ds")):
+        assert (done.code, "was begun by unprocess_gen 9.9, this is" in done.err) == (2, True)
 
 
 def test_edited_listing_is_refused(begun: Path, part: Part) -> None:

@@ -33,6 +33,7 @@ from unprocess_gen.pipeline.run import (
     begin,
     check_finished,
     check_settings,
+    check_version,
     read_run,
     resolve,
     resolve_part,
@@ -222,6 +223,7 @@ def merge(out: str) -> tuple[Summary, int]:
         known = read_run(folder)
         if known is None:
             raise ConfigError(f"merge: {out}: no run has begun there; expected one; run gen-dataset part K/N first")
+        check_version(folder, known)
         folder.lock()
         try:
             config, _ = parse_dataset_yaml(known.config)

@@ -208,13 +208,20 @@ def begin(folder: OutFolder, run: Run, parts: int | None = None) -> RunFile:
     return known
 
 
+def check_version(folder: OutFolder, known: RunFile) -> None:
+    """Raise ConfigError if another version of unprocess_gen began a run."""
+    own = version("unprocess_gen")
+    if known.version != own:
+        raise ConfigError(
+            f"out={folder}: was begun by unprocess_gen {known.version}, this is {own}; expected the same version; "
+            "install it, or choose another out"
+        )
+
+
 def _check_record(folder: OutFolder, run: Run, known: RunFile, own: RunFile) -> None:
     """Raise ConfigError if a run was begun with other sources or parts, or a part by another version."""
-    if own.parts and known.version != own.version:
-        raise ConfigError(
-            f"out={folder}: was begun by unprocess_gen {known.version}, this is {own.version}; expected the same "
-            "version; install it, or choose another out"
-        )
+    if own.parts:
+        check_version(folder, known)
     if own.parts and known.parts not in (None, own.parts):
         raise ConfigError(
             f"part K/{own.parts}: {folder} was begun with {known.parts} parts; expected K/{known.parts}; choose "
