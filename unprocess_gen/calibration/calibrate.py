@@ -44,10 +44,7 @@ class Calibration:
 
 
 def calibrate(folder: Path, watch: Watch = lambda frames: frames) -> Calibration:
-    """Measure the captures of a folder; ``watch`` shows progress.
-
-    Raises ConfigError or MachineError.
-    """
+    """Measure the captures of a folder; ``watch`` shows progress. ConfigError or MachineError."""
     return measure_all(read_captures(folder), watch)
 
 

@@ -69,10 +69,7 @@ class Capture:
         return -1.0 if self.exposure_s is None else self.exposure_s, self.level
 
     def pixels(self) -> NDArray[np.uint16]:
-        """Decode the mosaic, uint16 [H, W] with even sides.
-
-        Raises ConfigError or MachineError.
-        """
+        """Decode the mosaic, uint16 [H, W] with even sides; ConfigError or MachineError."""
         mosaic = read_mosaic(self.path, "calibrate", numbers=True).pixels
         if mosaic.dtype not in (np.uint16, np.uint8) or min(mosaic.shape) < LEAST_SIDE:
             actual = f"is {mosaic.dtype} {list(mosaic.shape)}"
@@ -123,10 +120,7 @@ class CaptureSet(NamedTuple):
 
 
 def read_captures(folder: Path, default: Sensor | None = None) -> CaptureSet:
-    """List the frames of a folder; ``default`` has the levels that no file states.
-
-    Raises ConfigError or MachineError.
-    """
+    """List the frames of a folder; ``default`` has the levels that no file states. ConfigError or MachineError."""
     if not folder.is_dir():
         raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of raw frames, darks and flats")
     with machine_errors(folder):
@@ -146,7 +140,7 @@ def read_captures(folder: Path, default: Sensor | None = None) -> CaptureSet:
 
 
 def joined_sha256(digests: Iterable[str]) -> str:
-    """Return the SHA-256 of the list of digests, one a line in ascending order."""
+    """The SHA-256 of the list of digests, one a line in ascending order."""
     return hashlib.sha256("\n".join(sorted(digests)).encode()).hexdigest()
 
 
@@ -190,7 +184,7 @@ def _from_names(folder: Path) -> Iterator[Capture]:
 
 
 def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
-    """Return the frame of a line of ``captures.csv``; empty cells follow from the metadata of a raw file."""
+    """The frame of a line of ``captures.csv``; empty cells follow from the metadata of a raw file."""
     file, kind = folder / row["file"], row["kind"].strip().lower()
     if not file.is_file() or file.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{place}: file={row['file']}: no such frame; expected a file as {', '.join(SUFFIXES)}")
@@ -214,7 +208,7 @@ def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
 
 
 def _metadata(file: Path) -> dict[str, Any]:
-    """Return the facts of a raw file by the names of `Capture`."""
+    """The facts of a raw file by the names of `Capture`."""
     facts = read_metadata(file, "calibrate")
     stated = {name: getattr(facts, name) for name in ("iso", "exposure_s", "pattern", "bits")}
     black = None if facts.black_dn is None else sum(facts.black_dn) / len(facts.black_dn)
@@ -223,10 +217,7 @@ def _metadata(file: Path) -> dict[str, Any]:
 
 
 def _from_emva(folder: Path) -> Iterator[Capture]:
-    """Yield the frames that an EMVA 1288 description lists; each line b (flats) or d (darks) has the exposure in ns.
-
-    The frames below a line are a measurement of their own, even if another line has its exposure and photons.
-    """
+    """Yield the frames of an EMVA 1288 description: those below each line b (flats) or d (darks) are a measurement."""
     path, bits = folder / EMVA, None
     kind, seconds, level = "", 0.0, ""
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
@@ -254,7 +245,7 @@ def _from_emva(folder: Path) -> Iterator[Capture]:
 
 
 def _sensor(captures: list[Capture], notes: list[str], default: Sensor | None) -> Sensor:
-    """Return the sensor of all frames; levels that no file states are measured, with a note."""
+    """The sensor of all frames; levels that no file states are measured, with a note."""
     files = {capture.path: capture for capture in captures}
     bits, black, white, pattern = (common(files, name) for name in SENSOR_FACTS)
     if default is not None:
@@ -284,7 +275,7 @@ def _sensor(captures: list[Capture], notes: list[str], default: Sensor | None) -
 
 
 def common(files: Mapping[Path, Any], name: str) -> Any:
-    """Return the fact that all files have; ConfigError names the first file that differs."""
+    """The fact that all files have; ConfigError names the first file that differs."""
     (first, facts), *others = files.items()
     expected = getattr(facts, name)
     for path, other in others:

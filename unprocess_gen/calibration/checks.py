@@ -71,7 +71,7 @@ LEAST_OF_CODE = 100
 
 
 def place(frames: Sequence[Capture]) -> str:
-    """Return the name of a measurement for messages: its first frame, ISO and number of frames."""
+    """The name of a measurement for messages: its first frame, ISO and number of frames."""
     first = frames[0]
     light = f", level {first.level}" if first.level else ""
     return f"calibrate: {first.path} ({first.kind}, ISO {first.iso:g}{light}, {len(frames)} frames)"

@@ -40,30 +40,14 @@ LARGEST_Z = 5.0
 class Measurement:
     """Noise of the frames of one measurement; arrays are by plane of `TILE`, variances in DN².
 
-    Attributes
-    ----------
-    count, shape
-        frames, and height and width of a plane
-    frame_means, frame_variances
-        mean of each plane of each frame, [frames, 4] DN; variance of a frame, from differences of sites, [frames] DN²
-    mean_dn
-        mean of the planes without defects
-    variance, error
-        temporal variance of a site without offsets of rows, and its standard error
-    row, column, fixed_column
-        variance of offsets of rows, of columns in one frame, of columns in all frames; each with its standard error
-    row_correlation
-        correlation of the offsets of neighbouring rows, and its standard error
-    fixed, fixed_error
-        variance of the fixed pattern of sites, without its part that is smooth over `WINDOW` sites
-    codes
-        histogram of the values, [4, 65536]
-    correlation
-        correlation of pairs of neighbours in a difference of two frames, the largest of all distances
-    shading
-        means of sixteenths of the mean frame, [4, 4] DN
-    column_offsets
-        means of the columns of all frames minus the means of the planes, [4, W] DN
+    ``shape`` is that of a plane. ``frame_means`` [frames, 4] are means of planes (DN), ``frame_variances`` [frames]
+    follow from differences of sites. ``mean_dn`` is without defects. ``variance`` is that of a site in time, without
+    offsets of rows. ``row``, ``column`` and ``fixed_column`` are variances of offsets of rows, of columns in one frame,
+    and of columns in all frames, each with its standard error; ``row_correlation`` is that of neighbouring rows.
+    ``fixed`` is the variance of the fixed pattern without what is smooth over `WINDOW` sites, ``codes`` [4, 65536] the
+    histogram of the values, ``correlation`` the largest of pairs of neighbours in a difference of two frames,
+    ``shading`` [4, 4] the means of sixteenths of the mean frame, ``column_offsets`` [4, W] the means of columns over
+    those of their planes (DN).
     """
 
     count: int
@@ -122,7 +106,7 @@ class FrameSums:
         self._squares += difference.astype(np.float32) ** 2
 
     def mean_frame(self) -> Float:
-        """Return the mean of all frames, [H, W] DN."""
+        """The mean of all frames, [H, W] DN."""
         return np.asarray(self._first + self._sum / np.float64(len(self._rows)))
 
     def measure(self) -> Measurement:
@@ -166,7 +150,7 @@ class FrameSums:
 
 
 def high_passed(plane: Float) -> Float:
-    """Return a plane without the mean of the square around each site; sites near the border are omitted."""
+    """A plane without the mean of the square around each site; sites near the border are omitted."""
     from scipy.ndimage import uniform_filter
 
     edge = WINDOW // 2
@@ -174,13 +158,13 @@ def high_passed(plane: Float) -> Float:
 
 
 def robust_std(values: Any) -> tuple[Any, float]:
-    """Return the distances of values from their median, and their standard deviation without outliers."""
+    """The distances of values from their median, and their standard deviation without outliers."""
     distances = np.abs(values - np.median(values))
     return distances, ROBUST * float(np.median(distances))
 
 
 def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, float, float, float]:
-    """Return mean, variance, its error, variance of the fixed pattern, and number, of sites that are no defects.
+    """Mean, variance, its error, variance of the fixed pattern, and number, of sites that are no defects.
 
     A defect is far from its neighbours in all frames. A site with one far value, as heavy tails have it, is none.
     """
@@ -198,16 +182,16 @@ def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, flo
 
 
 def _ripple(variance: Float, fixed: Float) -> Float:
-    """Return the largest error of the variance of a fixed pattern by the rounding of values, whose phase is unknown."""
+    """The largest error of the variance of a fixed pattern by the rounding of values, whose phase is unknown."""
     pattern = np.maximum(fixed, 0.0)
     return np.asarray(4 * pattern * np.exp(-2 * math.pi**2 * np.clip(variance + pattern - ROUNDING_DN2, 0, 9)))
 
 
 def _line_offsets(lines: Float, axis: int, noise: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return variance of offsets that are new in every frame, and the correlation of neighbours, each with its error.
+    """Variance of offsets that are new in every frame, and the correlation of neighbours, each with its error.
 
-    ``lines`` [frames, 4, N] are means of rows or columns of a plane. The planes of a row or column of the sensor share
-    its offset: ``axis`` 2 for rows, 1 for columns. ``noise`` is the variance of the mean of both.
+    ``lines`` [frames, 4, N] are means of rows (``axis`` 2) or columns (1) of a plane, whose planes share the offset of
+    a line of the sensor. ``noise`` is the variance of the mean of both.
     """
     full = lines.reshape(len(lines), 2, 2, -1).mean(axis=axis).transpose(0, 2, 1).reshape(len(lines), -1)
     offsets = full - full.mean(axis=0)
@@ -220,10 +204,7 @@ def _line_offsets(lines: Float, axis: int, noise: float) -> tuple[tuple[float, f
 
 
 def _fixed_offsets(columns: Float, noise: float, temporal: float) -> tuple[float, float]:
-    """Return the variance of offsets of columns in all frames, from differences of neighbours, and its error.
-
-    Differences are free of shading, which is smooth. ``noise`` is the variance of the mean of a column of a plane.
-    """
+    """Variance of offsets of columns in all frames, and its error, from differences of neighbours: free of shading."""
     full = columns.reshape(2, 2, -1).mean(axis=0)  # planes of both rows of the tile
     variance = float(np.mean(np.diff(full, axis=1) ** 2)) / 2
     return variance - noise / 2 - temporal, variance * math.sqrt(3 / full.size)
@@ -245,6 +226,6 @@ def _correlation(difference: NDArray[np.int32]) -> Score:
 
 
 def _block_means(frame: Float) -> Float:
-    """Return the means of the sixteenths of a frame of even sides."""
+    """The means of the sixteenths of a frame of even sides."""
     height, width = (length // 8 * 2 for length in frame.shape)
     return np.asarray(frame[: 4 * height, : 4 * width].reshape(4, height, 4, width).mean((1, 3)))

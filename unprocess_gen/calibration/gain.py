@@ -40,29 +40,29 @@ class Estimate:
         return (self.high - self.low) / 2 / NORMAL_95
 
     def scaled(self, factor: float) -> Estimate:
-        """Return the number in other units."""
+        """The number in other units."""
         return Estimate(self.value * factor, self.low * factor, self.high * factor)
 
 
 def estimate(value: float, error: float, least: float = -math.inf) -> Estimate:
-    """Return a number with a normal standard error; ``least`` limits the interval."""
+    """A number with a normal standard error; ``least`` limits the interval."""
     return Estimate(value, max(value - NORMAL_95 * error, least), value + NORMAL_95 * error)
 
 
 def root_estimate(variance: float, error: float) -> Estimate:
-    """Return the root of a variance with its standard error; 0 if it is less than 3 standard errors."""
+    """The root of a variance with its standard error; 0 if it is less than 3 standard errors."""
     value, positive = math.sqrt(variance) if variance > SIGNIFICANT * error else 0.0, max(variance, 0.0)
     return Estimate(value, math.sqrt(max(positive - NORMAL_95 * error, 0.0)), math.sqrt(positive + NORMAL_95 * error))
 
 
 def weighted_mean(values: Any, errors: Any) -> tuple[float, float]:
-    """Return the mean of independent values with standard errors, and its standard error."""
+    """The mean of independent values with standard errors, and its standard error."""
     weights = 1 / np.square(np.maximum(errors, 1e-300))
     return float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
 
 
 def combined(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the mean of independent estimates; the interval is wider if they differ by more than their errors."""
+    """The mean of independent estimates; the interval is wider if they differ by more than their errors."""
     values, errors = (np.array([getattr(one, name) for one in estimates]) for name in ("value", "error"))
     mean, error = weighted_mean(values, errors)
     excess = float(np.square((values - mean) / np.maximum(errors, 1e-300)).sum()) / max(len(values) - 1, 1)
@@ -70,7 +70,7 @@ def combined(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def weighted_slope(x: Float, y: Float, errors: Float) -> Estimate:
-    """Return the slope of a line through values with standard errors."""
+    """The slope of a line through values with standard errors."""
     slopes, _ = influence(np.stack([x, np.ones_like(x)]), 1 / errors**2)
     return estimate(float(slopes @ y), float(np.linalg.norm(slopes * errors)))
 
@@ -79,14 +79,8 @@ def weighted_slope(x: Float, y: Float, errors: Float) -> Estimate:
 class Transfer:
     """Points of a photon transfer curve of one plane: flats of one level each, and their darks.
 
-    Attributes
-    ----------
-    signal, variance, error
-        mean minus the mean of the darks (DN); variance minus the variance of the darks, and its standard error (DN²)
-    dark_error
-        standard errors of the variances of the darks (DN²)
-    dark
-        number of the darks of each point; points of the same darks share their error
+    ``signal`` is the mean above the darks (DN), ``variance`` that above the darks with its ``error``; ``dark_error`` is
+    that of the darks (DN²). ``dark`` numbers the darks of a point: points of the same darks share their error.
     """
 
     signal: Float
@@ -96,7 +90,7 @@ class Transfer:
     dark: Float
 
     def upto(self, limit_dn: float) -> Transfer:
-        """Return the points with a signal of at most ``limit_dn``."""
+        """The points with a signal of at most ``limit_dn``."""
         chosen = self.signal <= limit_dn
         return Transfer(*(getattr(self, name)[chosen] for name in Transfer.__slots__))
 

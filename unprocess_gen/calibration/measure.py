@@ -83,7 +83,7 @@ class Flat:
 
 @dataclass(frozen=True, slots=True)
 class IsoResult:
-    """Measured noise of one ISO.
+    """Measurement noise of one ISO.
 
     ``numbers`` are the estimates by name: of the sensor, then of each plane of `TILE` if planes may differ. ``dark``
     are the darks from which read noise and offsets are measured. ``prnu_square`` is the square of the PRNU, and its
@@ -102,15 +102,12 @@ class IsoResult:
     notes: list[str]
 
     def __getitem__(self, name: str) -> Estimate:
-        """Return an estimate of the sensor."""
+        """An estimate of the sensor."""
         return self.numbers[name][0]
 
 
 def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate | None = None) -> IsoResult:
-    """Measure the captures of one ISO; ConfigError if they are too few, or do not pass a check.
-
-    If the ``gain`` is given, darks alone are measured.
-    """
+    """Measure the captures of one ISO, or darks alone if the ``gain`` is given; ConfigError if a check fails."""
     sensor, notes = captures.sensor, list[str]()
     darks = _darks(captures, iso, notes, watch)
     dark = max(darks, key=lambda dark: dark.measured.count)
@@ -195,7 +192,7 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
 
 
 def _levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> list[Flat]:
-    """Return the levels below saturation: not at white, and no plane beyond its largest variance; refuse too few."""
+    """The levels below saturation: not at white, and no plane beyond its largest variance; refuse too few."""
     below = [flat for flat in flats if not flat.is_full]
     variances = np.array([flat.measured.variance for flat in below]).reshape(-1, 4)
     is_rising = variances > variances.max(axis=0, initial=0) * STILL_RISING
@@ -217,17 +214,14 @@ def _levels(iso: float, flats: Sequence[Flat], sensor: Sensor) -> list[Flat]:
 
 
 def _variances(measured: Measurement, shape: ReadShape) -> tuple[Float, Float]:
-    """Return the variance of a site without rounding, and its error.
-
-    Where rounding distorts the variance, it follows from the fitted distribution and the fixed pattern.
-    """
+    """Variance of a site without rounding, and its error; from the fitted distribution where rounding distorts it."""
     variances, errors = measured.variance - ROUNDING_DN2, np.hypot(measured.error, measured.fixed_error)
     is_weak = variances <= ROUNDED_STD_DN**2
     return np.where(is_weak, shape.std_dn**2, variances), np.where(is_weak, errors, measured.error)
 
 
 def _curves(flats: Sequence[Flat], shape: ReadShape) -> list[Transfer]:
-    """Return the photon transfer curve of each plane."""
+    """The photon transfer curve of each plane."""
     dark_variances, dark_errors = zip(*(_variances(flat.dark.measured, shape) for flat in flats), strict=True)
     variances = np.array([flat.measured.variance - ROUNDING_DN2 for flat in flats]) - dark_variances
     signals, errors = [flat.signals_dn for flat in flats], [flat.measured.error for flat in flats]
@@ -237,7 +231,7 @@ def _curves(flats: Sequence[Flat], shape: ReadShape) -> list[Transfer]:
 
 
 def _dark_numbers(measured: Measurement, sensor: Sensor, shape: ReadShape) -> dict[str, list[Estimate]]:
-    """Return the estimates that darks give."""
+    """The estimates that darks give."""
     columns, fixed_column = measured.column, measured.fixed_column
     temporal = columns[0] if columns[0] > 3 * columns[1] else 0.0
     variances, errors = _variances(measured, shape)
@@ -279,10 +273,10 @@ def _black_errors(measured: Measurement, variances: Float) -> Float:
 
 
 def _prnu_square(flats: Sequence[Flat], watch: Watch) -> tuple[float, float]:
-    """Return the square of the PRNU, and its standard error, from the mean of all frames of all levels.
+    """Square of the PRNU, and its standard error, from the mean of all frames of all levels.
 
     Frames have the weight signal/variance, which gives the mean of frame/signal the least noise. The variance of its
-    fixed pattern contains the variance of the darks' pattern, c² times, and the temporal noise.
+    fixed pattern contains that of the darks' pattern, c² times, and the temporal noise.
     """
     total, squares = np.zeros(1), list[tuple[float, float]]()
     weights = [flat.signal_dn / flat.measured.variance.mean() for flat in flats]

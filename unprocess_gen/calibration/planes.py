@@ -18,10 +18,7 @@ NEIGHBOURS = {
 
 
 def plane_names(pattern: str) -> list[str]:
-    """Names of the planes in the order of the tile: R, B, and Gr or Gb for green next to red or blue.
-
-    Without filters, row and column in the tile.
-    """
+    """Names of the planes in the order of the tile: R, B, and Gr or Gb; without filters, row and column in the tile."""
     if pattern == MONO:
         return ["00", "01", "10", "11"]
     rows = pattern[:2], pattern[2:]
@@ -29,12 +26,12 @@ def plane_names(pattern: str) -> list[str]:
 
 
 def planes_of(mosaic: Any) -> list[Any]:
-    """Return the planes of a mosaic of even sides, as views."""
+    """The planes of a mosaic of even sides, as views."""
     return [mosaic[y::2, x::2] for y, x in TILE]
 
 
 def neighbour_products(z: Any) -> dict[str, list[float]]:
-    """Return the sums of the products of z at pairs of sites, for each distance of `NEIGHBOURS`.
+    """Sums of the products of z at pairs of sites, by distance of `NEIGHBOURS`.
 
     The last two columns of z [H, W + 2] are zeros, which keep sites of other rows out.
     """

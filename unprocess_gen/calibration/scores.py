@@ -28,18 +28,9 @@ def alarm_limit(scores: int) -> float:
 class Score(NamedTuple):
     """Sum of a statistic over the rows, columns or clean values of a pair; or a statistic of captures.
 
-    Attributes
-    ----------
-    total : float
-        The sum.
-    information : float
-        ``total / information`` estimates the difference of a quantity from its expected value.
-    variance : float
-        Variance of the sum due to noise.
-    step : float
-        Largest contribution of one site or line.
-    low, high : float
-        Smallest and largest expectation of the sum, which depends on values that the row does not state.
+    ``total / information`` estimates the difference of a quantity from its expected value. ``variance`` is that of the
+    sum due to noise, ``step`` the largest contribution of one site or line. The expectation of the sum is from ``low``
+    to ``high``, because it depends on values that the row does not state.
     """
 
     total: float
@@ -78,7 +69,7 @@ class Score(NamedTuple):
 
 
 def influence(design: Float, precision: Any) -> Float:
-    """Return the matrix that turns N observations into the K parameters of the least variance, [K, N].
+    """The matrix that turns N observations into the K parameters of the least variance, [K, N].
 
     ``design`` is [K, N]; ``precision`` is the inverse of the covariance of the observations, or its diagonal.
     """

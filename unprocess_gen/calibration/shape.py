@@ -32,7 +32,7 @@ STEPS = np.array([2e-3, 1e-2])
 FLOOR = 1e-9
 """Probability of values that no distribution explains, such as defects."""
 ROW_FACTOR = 2.0
-"""λ is too near to `NORMAL_SHAPE` by this fraction over the sites of a row, whose mean is subtracted. Measured."""
+"""λ is too near to `NORMAL_SHAPE` by this fraction over the sites of a row, whose mean is subtracted. Measurement."""
 EVIDENCE = 8.0
 """Logarithm of the ratio of likelihoods from which Tukey's lambda is chosen."""
 
@@ -73,7 +73,7 @@ class ReadShape:
 
 
 def fill_histogram(frames: Iterable[NDArray[np.uint16]], measured: Measurement) -> Histogram:
-    """Return the histogram of the frames that were measured."""
+    """The histogram of the frames that were measured."""
     columns, is_seen = measured.column_offsets, measured.dsnu > 2 * measured.fixed_error
     pattern = float(np.where(is_seen, measured.dsnu, 0.0).mean())
     width, half = math.sqrt(float(measured.variance.mean()) + pattern) / PARTS, PARTS * REACH
@@ -91,7 +91,7 @@ def fill_histogram(frames: Iterable[NDArray[np.uint16]], measured: Measurement) 
 
 
 def cumulative(std: float, shape: float | None) -> Callable[[Float], Float]:
-    """Return F of Tukey's lambda, or without a shape of a normal distribution."""
+    """F of Tukey's lambda, or without a shape of a normal distribution."""
     from scipy.special import ndtr, tklmbda
 
     if shape is None:
@@ -101,7 +101,7 @@ def cumulative(std: float, shape: float | None) -> Callable[[Float], Float]:
 
 
 def probabilities(values: Float, std: float, shape: float | None) -> Float:
-    """Return P(r)."""
+    """P(r)."""
     below = cumulative(std, shape)
     return np.asarray(below(values + 0.5) - below(values - 0.5))
 
@@ -122,7 +122,7 @@ def fit_shape(histogram: Histogram) -> ReadShape:
         return np.maximum(np.where(np.abs(values) == end, below(-end), inner), FLOOR)
 
     def surprise(log_std: float, shape: float | None = None) -> float:
-        """Return the negative logarithm of the likelihood."""
+        """The negative logarithm of the likelihood."""
         if shape is not None and not LEAST_SHAPE < shape < LARGEST_SHAPE:
             return math.inf
         return -float(counts @ np.log(likelihoods(values, log_std, shape)))
@@ -150,7 +150,7 @@ def fit_shape(histogram: Histogram) -> ReadShape:
 
 
 def _error_of_shape(best: Float, likelihoods: Callable[[Float], Float], histogram: Histogram) -> float:
-    """Return the standard error of λ, from Fisher's information of both numbers."""
+    """The standard error of λ, from Fisher's information of both numbers."""
     expected, total = likelihoods(best), histogram.counts.sum()
     slopes = [(likelihoods(best + step) - likelihoods(best - step)) / 2 / step.sum() for step in np.diag(STEPS)]
     weights = np.full(len(expected), histogram.width)
@@ -160,7 +160,7 @@ def _error_of_shape(best: Float, likelihoods: Callable[[Float], Float], histogra
 
 
 def _rounding_error(std: float, shape: float) -> float:
-    """Return an error of λ because the mean of rounded values is not μ, which widens the histogram of weak noise."""
+    """An error of λ because the mean of rounded values is not μ, which widens the histogram of weak noise."""
     lattice = np.arange(-REACH, REACH, dtype=np.float64) + 0.25
     off = float(lattice @ probabilities(lattice, std, shape))
     return 2 * (off / std) ** 2

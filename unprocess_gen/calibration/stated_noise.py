@@ -64,10 +64,7 @@ class StatedNoise(NamedTuple):
 
 
 def read_stated_noise(folder: Path) -> StatedNoise:
-    """Read the NoiseProfile tags of the DNG files below a folder, or of one file.
-
-    Raises ConfigError or MachineError.
-    """
+    """Read the NoiseProfile tags of the DNG files below a folder, or of one file; ConfigError or MachineError."""
     with machine_errors(folder):
         is_raw = [path for path in folder.rglob("*") if path.suffix.lower() in RAW_FILES]
         files = [folder] if folder.is_file() else sorted(is_raw)
@@ -90,7 +87,7 @@ def read_stated_noise(folder: Path) -> StatedNoise:
 
 
 def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
-    """Return ISO, a and b of red, green and blue of a file; ConfigError if no sensor has them."""
+    """ISO, a and b of red, green and blue of a file; ConfigError if no sensor has them."""
     black, white, numbers = facts.black_dn, facts.white_dn, facts.noise_profile or ()
     if black is None or white is None or not sum(black) / 4 < white:
         raise ConfigError(f"calibrate: {path}: BlackLevel={black}, WhiteLevel={white}; expected both")
@@ -112,7 +109,7 @@ def _stated_iso(path: Path, facts: RawMetadata) -> StatedIso:
 
 
 def _modes(stated: Iterable[StatedIso]) -> list[list[StatedIso]]:
-    """Return a record of each ISO by gain mode, which begins where the variance without light falls or is no longer 0.
+    """Records of all ISOs by gain mode, which begins where the variance without light falls or is no longer 0.
 
     ConfigError for files of one ISO that differ, and for variances that no sensor has: all others rise with ISO.
     """
@@ -141,7 +138,7 @@ def _modes(stated: Iterable[StatedIso]) -> list[list[StatedIso]]:
 
 
 def stated_json(stated: StatedNoise) -> str:
-    """Return the list of estimates as JSON; the tags state no intervals."""
+    """The list of estimates as JSON; the tags state no intervals."""
     named = []
     for iso, a, b, _ in stated.isos:
         for site, plane in ((None, 1), ("R", 0), ("Gr", 1), ("Gb", 1), ("B", 2)):
@@ -152,7 +149,7 @@ def stated_json(stated: StatedNoise) -> str:
 
 
 def stated_yaml(stated: StatedNoise, name: str) -> str:
-    """Return the noise profile of NoiseProfile tags."""
+    """The noise profile of NoiseProfile tags."""
     isos, profile = [record.iso for record in stated.isos], profile_head(name, stated.sensor)
     profile["branches"] = []
     for mode in stated.modes:

@@ -85,10 +85,7 @@ class Comparisons(NamedTuple):
 
 
 def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: frames) -> Comparisons:
-    """Measure raw frames, and compare them with the profile of a dataset; levels they do not state are the dataset's.
-
-    Raises ConfigError or MachineError.
-    """
+    """Measure raw frames, and compare them with the profile of a dataset, which has the levels that no file states."""
     sensor = config.sensor
     default = Sensor(sensor.bits, sensor.black_level_dn, sensor.white_level_dn, sensor.pattern, (0, 0))
     captures = read_captures(frames, default)

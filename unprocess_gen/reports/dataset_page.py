@@ -45,9 +45,8 @@ def write_dataset_report(
 ) -> Path:
     """Write the page of a finished dataset to ``to``, ``report.html`` in a local dataset by default.
 
-    ``source`` is the folder of the photographs, for the contact sheet, by default the recorded one; ``dark_frames``
-    that of the dark frames. ConfigError if a library is missing or ``to`` may not be written; DamageError if the
-    dataset is not finished or was changed; MachineError if writing fails.
+    ``source`` is the folder of the photographs for the contact sheet, by default the recorded one. Raises ConfigError,
+    DamageError if the dataset is not finished or was changed, or MachineError.
     """
     file = page_file(folder, to)
     write_files(file.parent, {file.name: dataset_page(folder, source, dark_frames).encode()})

@@ -37,11 +37,10 @@ SAMPLE = 8
 
 @dataclass(frozen=True, slots=True)
 class SourceEstimate:
-    """The pairs of a source, or why it has none.
+    """The pairs of a source, or why it has none; ``levels`` and ``predictions`` have an item for each noise level.
 
-    ``bytes`` is the size of its pairs in a shard, ``seconds`` the time it took to make them. ``levels`` and
-    ``predictions`` have an item for each noise level. ``noise_ratio`` compares the noise of the source with the
-    simulated noise; None if it is not known.
+    ``bytes`` is their size in a shard, ``seconds`` the time it took to make them, ``noise_ratio`` the noise of the
+    source over the simulated noise, if it is known.
     """
 
     source: Source
@@ -59,8 +58,8 @@ class SourceEstimate:
 class RunEstimate:
     """The size and time of a run, and the sources that were read.
 
-    ``start_seconds`` is the time of imports and settings, also of the workers.
-    ``pair_seconds`` is the time to make the pairs with ``n_jobs`` workers.
+    ``start_seconds`` is for imports and settings, of the workers too; ``pair_seconds`` for pairs with ``n_jobs``
+    workers.
     """
 
     run: Run

@@ -1,8 +1,7 @@
 """Render the HTML pages of reports from the Jinja2 templates in ``templates/``.
 
-A page is one file without scripts that opens offline, on phones, in light and dark mode. Autoescaping is on for every
-template, so a file name cannot become markup. Characters that are invisible or reverse the text around them are shown
-as escapes.
+A page is one file without scripts that opens offline. Autoescaping is on, so a file name cannot become markup, and
+characters that are invisible or reverse the text around them are shown as escapes.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def data_uri(content: bytes, kind: str = "png") -> str:
 
 
 def visible(value: Any) -> Any:
-    r"""Write invisible characters of a text as escapes such as ``\x1b``; markup and other types are unchanged."""
+    """Write invisible characters of a text as escapes; markup and other types are unchanged."""
     if not isinstance(value, str) or hasattr(value, "__html__"):
         return value
     return INVISIBLE.sub(lambda match: match[0].encode("unicode_escape").decode(), value)

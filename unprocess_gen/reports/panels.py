@@ -39,10 +39,7 @@ Window = tuple[slice, slice]
 
 
 class SheetPanel(NamedTuple):
-    """A titled image, complete and as a detail at one pixel per site: grey or RGB values of which [0, 1] is shown.
-
-    The note says why a picture is None.
-    """
+    """A titled image, complete and as a detail at one pixel per site: values of which [0, 1] is shown, or None."""
 
     title: str
     note: str
@@ -72,10 +69,7 @@ def fit_image(values: NDArray[Any], panel_px: tuple[int, int]) -> Float:
 
 
 def average_planes(raw: MosaicArray, panel_px: tuple[int, int]) -> Float:
-    """Scale the four planes of a mosaic into a panel, ``[H, W]`` to ``[h, w, 4]``; a lone row or column is doubled.
-
-    Planes are averaged before anything is developed, which keeps sheets of large frames fast.
-    """
+    """Scale the four planes of a mosaic into a panel, ``[H, W]`` to ``[h, w, 4]``; a lone row or column is doubled."""
     even = np.pad(raw, [(0, length % 2) for length in raw.shape], mode="reflect")
     return np.stack([fit_image(plane.astype(np.float32), panel_px) for plane in planes_of(even)], axis=-1)
 
@@ -89,10 +83,7 @@ def common_stretch(dn: MosaicArray, plan: Plan) -> Float:
 
 
 def stretch(dn: MosaicArray, least: float = 1.0) -> Float:
-    """Stretch a frame to [0, 1] between its percentiles 0.1 and 99.9, which a few defective sites do not move.
-
-    A range of less than ``least`` is not stretched to [0, 1].
-    """
+    """Stretch a frame to [0, 1] between its percentiles 0.1 and 99.9, if they are ``least`` apart."""
     low, high = np.percentile(dn, (0.1, 99.9))
     return np.asarray(np.clip((dn - low) / max(high - low, least), 0, 1))
 
@@ -101,10 +92,7 @@ def stretch(dn: MosaicArray, least: float = 1.0) -> Float:
 
 
 def planes_to_rgb(planes: Float, pattern: str) -> Float:
-    """Average each channel over each tile, ``[h, w, 4]`` to ``[h, w, 3]``.
-
-    Nothing is interpolated: a demosaicking filter would add colour to every edge.
-    """
+    """Average each channel over each tile, ``[h, w, 4]`` to ``[h, w, 3]``; interpolation would colour every edge."""
     if pattern == MONO:
         return np.repeat(planes.mean(axis=-1, keepdims=True), 3, axis=-1)
     filters = np.ravel(tile(pattern))
@@ -117,10 +105,7 @@ def develop_planes(planes: Float, plan: Plan) -> Float:
 
 
 def develop_detail(raw: MosaicArray, plan: Plan, window: Window) -> Float | None:
-    """Develop the detail with a border as wide as the demosaicking filter, as if the complete frame were developed.
-
-    A frame of one row or column lacks a colour: it is not developed.
-    """
+    """Develop the detail with a border as wide as the demosaicking filter; None for a frame of one row or column."""
     if min(raw.shape) == 1:
         return None
     y, x = (max(0, part.start - DEMOSAIC_REACH_PX) for part in window)  # even, as the reach is

@@ -1,7 +1,4 @@
-"""Fit the noise of a pair by photon transfer, as cameras are measured (EMVA 1288), and draw the fits.
-
-A line is fitted to the variance of the noise against the signal. Alarms are raised by `noise_check`, not by the fits.
-"""
+"""Fit the noise of pairs by photon transfer, as cameras are measured (EMVA 1288), and draw the fits; no alarms."""
 
 from __future__ import annotations
 

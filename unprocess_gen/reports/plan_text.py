@@ -202,9 +202,7 @@ NOISY_SOURCE = 0.2
 def _rounding_warning(plans: Sequence[Plan]) -> str:
     """Warn if rounded clean frames have few levels.
 
-    The rounding error is uniform in ±½ DN, so its mean square is 1/12 DN². White of the darkened scene is
-    span / exposure ratio above black. A denoiser that returned the unrounded mean would have a PSNR of
-    20 log10(√12 · span / ratio).
+    The rounding error, uniform in ±½ DN, gives the unrounded mean a PSNR of 20 log10(√12 · span / exposure ratio).
     """
     span_dn = min(plan.sensor.span_dn / plan.scene.exposure_ratio for plan in plans)
     if plans[0].output.clean_normalised or span_dn >= FEW_LEVELS:
@@ -236,11 +234,7 @@ def _effect_lines(config: Config, estimates: Estimates) -> list[str]:
 
 
 def _effect_table(config: Config, estimates: Estimates) -> list[str]:
-    """A line per effect: what it adds where it is strongest, the noise there, and why it is simulated or not.
-
-    Hot and dead pixels are judged by the number of pixels that exceed the noise, other effects by their ratio to
-    the noise that hides them.
-    """
+    """A line per effect: what it adds where it is strongest, the noise there, and why it is simulated or not."""
     lines = [_TABLE_LINE.format("effect", "adds", "in", "noise there", "images", "why")]
     levels = [level for source in estimates for level in source.predictions]
     for by_image in zip(*levels, strict=True):

@@ -21,10 +21,7 @@ def require_libraries(verb: str) -> None:
 
 
 def check_report_folder(out: Path, verb: str) -> None:
-    """Check, before any work, that a verb can draw and write its report to a folder, which need not exist.
-
-    ConfigError if a library is missing, the folder cannot be written, or it contains or is inside a dataset.
-    """
+    """Check, before any work, that a report can be written to a folder, which need not exist, outside of datasets."""
     require_libraries(verb)
     if name := next((name for name in DATASET_ENTRIES if (out / name).exists()), None):
         raise ConfigError(f"out={out}: contains a dataset ({name}); expected a folder without one; choose another out")
@@ -32,10 +29,7 @@ def check_report_folder(out: Path, verb: str) -> None:
 
 
 def page_file(folder: AnyPath, to: Path | None = None) -> Path:
-    """The file for the page of a dataset or sweep: ``report.html`` in its folder, unless ``to`` names another.
-
-    ConfigError if a library is missing, or if the page cannot be written there.
-    """
+    """The file for a page: ``report.html`` in the folder, or ``to``; ConfigError if it cannot be written."""
     require_libraries("report")
     if to is not None:
         if not (isinstance(folder, Path) and to.resolve() == (folder / REPORT).resolve()):

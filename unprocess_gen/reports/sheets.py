@@ -1,12 +1,11 @@
 """Draw sheets of a dataset's pairs: PNG files of each pair, or an overview with one strip per pair.
 
-Sheets need only shards and manifest. The panel of the source is empty, with the reason, if the photograph is not
-available or differs from the row's. Each panel shows the complete frame, averaged, and a detail at one pixel per site.
-Raw frames are drawn from the black to the white level of the scene, square root. A sheet of stages shows the
-photograph after each step of unprocessing (Figure 1 of the article), computed with the reference functions.
+Each panel shows the complete frame, averaged, and a detail at one pixel per site; raw frames from the black to the
+white level of the scene, square root. The panel of a source is empty, with the reason, if the photograph is not
+available or has changed. A sheet of stages shows the photograph after each step of unprocessing (Figure 1 of the
+article).
 
-Each PNG file names the digest of the manifest that it shows. A folder with sheets of another dataset is refused,
-because their names are keys: sheets of two datasets would replace each other or be mixed.
+Each PNG file names the digest of its manifest: sheets of two datasets in a folder would replace each other.
 """
 
 from __future__ import annotations
@@ -73,11 +72,7 @@ class SheetFiles(NamedTuple):
 
 
 def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterator[SheetPair]:
-    """Yield pairs in the order of the manifest, by default `PAIRS_SHOWN` evenly spaced ones.
-
-    ``keys`` is the text of ``--keys``, ``source`` the folder of the photographs, by default the recorded one.
-    ConfigError for an unknown key or folder.
-    """
+    """Yield the pairs of ``--keys``, by default `PAIRS_SHOWN`, with sources from ``source`` or the recorded folder."""
     if source is not None and not source.is_dir():
         raise ConfigError(f"source.root={source}: is not a folder; expected the folder of the photographs")
     pairs, manifest = RawPairs(folder), folder / "manifest.csv"
@@ -111,11 +106,7 @@ def _load_part(row: Row, root: str | None, load: Load) -> tuple[Srgb | None, str
 def write_sheets(
     folder: AnyPath, to: Path, keys: str = "", source: AnyPath | None = None, with_stages: bool = False
 ) -> Iterator[SheetFiles]:
-    """Write ``KEY.png`` for each pair, and ``KEY.stages.png`` if asked for; yield the files once they are written.
-
-    ConfigError if ``to`` is inside a dataset, is not a folder or contains sheets of another dataset, and as for
-    `selected_pairs`.
-    """
+    """Write ``KEY.png`` for each pair, and ``KEY.stages.png`` if asked for; yield the files once they are written."""
     check_output_folder(to, f"--to {to}")
     mark = f"manifest_sha256={file_sha256(folder / 'manifest.csv')}"
     for path in sorted(to.glob("[0-9]" * 8 + "*.png")):

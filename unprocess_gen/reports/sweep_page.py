@@ -38,10 +38,7 @@ class SweepCell(NamedTuple):
 def write_sweep_page(
     folder: Path, jobs: Sequence[Mapping[str, str]], swept: Sequence[str], to: Path | None = None
 ) -> Path:
-    """Write the page of a sweep, whose ``sweep.csv`` has the rows ``jobs`` and a column for each key in ``swept``.
-
-    Values of the last key are side by side. ConfigError if a library is missing or the file may not be written.
-    """
+    """Write the page of a sweep from the rows of ``sweep.csv``; values of the last ``swept`` key are side by side."""
     file = page_file(folder, to)
     *down, across = swept or [""]
     rows: dict[tuple[str, ...], dict[str, SweepCell]] = {}

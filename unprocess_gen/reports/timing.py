@@ -18,10 +18,7 @@ def thread_ns(call: Callable[[], object], pixels: int) -> float:
 
 
 def measure_in_turns(measurements: Mapping[_Key, Callable[[int], _Time]], rounds: int) -> dict[_Key, list[_Time]]:
-    """Run every measurement once in each round, in reversed order in every second round; results by round.
-
-    A measurement gets the number of the round.
-    """
+    """Run every measurement once in each round, which it is given, in reversed order in every second one."""
     results: dict[_Key, list[_Time]] = {key: [] for key in measurements}
     for number in range(rounds):
         for key in list(measurements)[:: -1 if number % 2 else 1]:

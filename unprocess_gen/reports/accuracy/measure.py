@@ -1,12 +1,9 @@
 """Measure what each accuracy tier costs in complete runs, stage by stage, and its error against the reference.
 
-A run reads files and commits shards with `pipeline.generate`, in this process, with one worker, below a temporary
-folder. Runs of the tiers take turns, so that other programs disturb all alike. A run counts with all processor time of
-the process: the thread that hashes and writes is included, waiting for the disk is not. The reported time of a stage is
-its shortest in all rounds. The reference is so slow that it runs once.
-
-Errors are those of pairs on subsampled photographs: all tiers use the same random numbers, so frames are compared site
-by site.
+Runs have one worker, read files and commit shards below a temporary folder. The tiers take turns, so that other
+programs disturb all alike. A run counts with all processor time of the process, not with waiting for the disk. The time
+of a stage is its shortest in all rounds. Errors are those of pairs on subsampled photographs, which share their random
+numbers.
 """
 
 from __future__ import annotations
@@ -118,10 +115,7 @@ class Inputs:
 
 
 def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
-    """Measure every tier with the given settings; report progress on stderr.
-
-    ConfigError if no photograph can be read; MachineError if the temporary folder cannot be written.
-    """
+    """Measure every tier, with progress on stderr; ConfigError without a photograph, MachineError without a folder."""
     try:
         temporary = tempfile.TemporaryDirectory(prefix="unprocess-gen-accuracy-")
     except OSError as error:
@@ -154,10 +148,7 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
 
 
 def select_inputs(config: Config, folder: Path) -> Inputs:
-    """Select the first photographs; synthetic ones are written to ``folder`` as JPEG files, so that runs decode files.
-
-    ConfigError if none can be read.
-    """
+    """Select the first photographs; synthetic ones are written to ``folder`` as JPEG. ConfigError without one."""
     place, scenes = config.source.place, folder / "photographs"
     most_pixels = RUN_PIXELS // frames_per_photograph(config)
     samples, count, pixels, limit = list[tuple[Photograph, Source, str]](), 0, 0, 0

@@ -39,7 +39,7 @@ SETTINGS: dict[str, Setting] = {f"{group}.{name}".lstrip("."): setting for group
 
 
 def widget(name: str, folders: list[Any]) -> InputWidget:
-    """Return the control of a group or key, without a value."""
+    """The control of a group or key, without a value."""
     if name in SLIDERS:
         start, end = SLIDERS[name]
         return Slider(title=name, start=start, end=end, step=0.01, value=start)
@@ -55,7 +55,7 @@ def widget(name: str, folders: list[Any]) -> InputWidget:
 
 
 def shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], config: Config, plan: Plan) -> Any:
-    """Return the value of a control: an option, the number in the plan, or the text of a setting."""
+    """The value of a control: an option, the number in the plan, or the text of a setting."""
     if name in DRAWN:
         return float(getattr(plan.camera, DRAWN[name]))
     if name == "camera.weights":

@@ -54,9 +54,8 @@ SOURCES_LISTED = 1000
 class Shown(NamedTuple):
     """The pair of the settings, and what they follow from.
 
-    ``choices`` are the options by group, ``srgb`` the pixels of the patch, ``clean`` and ``noisy`` the frames as
-    mosaics in DN, ``saturated`` marks sites of the clean one. ``keys`` identify all pairs of the image, ``lines`` are
-    lines of ``plan`` about the noise.
+    ``choices`` are the options by group, ``srgb`` the pixels of the patch, ``clean`` and ``noisy`` mosaics in DN.
+    ``keys`` identify all pairs of the image, ``lines`` are those of ``plan`` about the noise.
     """
 
     config: Config
@@ -183,10 +182,7 @@ Choices = dict[str, Callable[[], Exploration]]
 def open_place(
     place: AnyPath | None, keys: str | None, overrides: Sequence[str], flags: Sequence[str], folders: OptionFolders
 ) -> Choices:
-    """List the explorations of a photograph, a folder, a dataset, or without a place of ``source.root``.
-
-    ConfigError if the place or a setting is wrong; DamageError if a manifest cannot be read.
-    """
+    """List the explorations of a photograph, a folder, a dataset, or without a place of ``source.root``."""
     start = Exploration(folders, flags=tuple(flags))
     start.add(overrides)
     if place is not None and is_dataset(place):

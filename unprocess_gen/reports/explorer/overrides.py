@@ -19,10 +19,7 @@ NAMED_GROUPS = ("camera", "noise", "scene")
 
 
 def overrides_of(config: Config) -> dict[str, str]:
-    """Return overrides by key from which a config of a dataset is composed again, without the place of its sources.
-
-    ConfigError if overrides cannot express it.
-    """
+    """Overrides by key that compose the config of a dataset again, without the place of its sources, or ConfigError."""
     names = {group: getattr(config, group).name for group in NAMED_GROUPS}
     given = {group: name for group, name in names.items() if (conf_dir() / group / f"{name}.yaml").is_file()}
     options = [f"{key}={text}" for key, text in given.items() if key in GROUPS]
@@ -36,7 +33,7 @@ def overrides_of(config: Config) -> dict[str, str]:
 
 
 def _differing_settings(config: Config, other: Config) -> list[tuple[str, Any]]:
-    """Return the keys that decide data and differ, with their values in a config."""
+    """The keys that decide data and differ, with their values in a config."""
     differences = []
     for group, name, setting in all_settings():
         owner, others = (operator.attrgetter(group)(side) if group else side for side in (config, other))
@@ -47,7 +44,7 @@ def _differing_settings(config: Config, other: Config) -> list[tuple[str, Any]]:
 
 
 def override_text(value: Any) -> str:
-    """Return a value in Hydra's grammar of overrides."""
+    """A value in Hydra's grammar of overrides."""
     if isinstance(value, bool) or value is None:
         return {None: "null", True: "true", False: "false"}[value]
     if is_number(value):

@@ -1,7 +1,4 @@
-"""Draw the page with Bokeh: controls, pictures with linked zoom, curves, and what ``plan`` says.
-
-The pair is computed again when a control changes. The page needs no network: scripts come from the installed Bokeh.
-"""
+"""Draw the page with Bokeh, without network: controls, pictures with linked zoom, curves, and what ``plan`` says."""
 
 from __future__ import annotations
 

@@ -18,7 +18,6 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
     """Serve a page to browsers of this machine until a signal arrives; ``started`` receives its address.
 
     The server has a thread of its own, because an event loop drops exceptions that a signal raises in its callbacks.
-    ConfigError if the port is taken. Port 0 is any free one.
     """
     try:
         with socket.create_server((HOST, port)) as probe:

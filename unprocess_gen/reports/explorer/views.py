@@ -34,8 +34,8 @@ VIEW_PX = (360, 480)
 def view(shown: Shown, window: panels.Window, common: bool) -> dict[str, Any]:
     """The pictures of a window as RGBA words ``[h, w]``, their place, and the values under the pointer.
 
-    With ``common``, raw frames are drawn from black to white (square root) and developed ones as photographs; else each
-    picture is stretched by itself.
+    ``common``: raw frames from black to white (square root), developed ones as photographs; else each stretched by
+    itself.
     """
     side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, VIEW_PX, strict=True))
     side += side % 2 if side > 1 else 0
@@ -124,10 +124,7 @@ def _source_histogram(shown: Shown) -> Iterator[Curve]:
 
 
 def _raw_histogram(shown: Shown) -> Iterator[Curve]:
-    """Yield shares of DN over all DN of the clean frame and all but 0.2 % of the noisy one.
-
-    DN that do not occur are NaN, because the axis is logarithmic.
-    """
+    """Yield shares of DN, NaN for 0, over those of the clean frame and all but 0.2 % of the noisy one."""
     low, high = np.percentile(shown.noisy, (0.1, 99.9)).round()
     low, high = min(low, float(shown.clean.min())), max(high, float(shown.clean.max()))
     edges = np.arange(low, high + 2, 1 + (high - low) // BINS) - 0.5

@@ -97,7 +97,7 @@ def _hot_sites(plan: Plan, patch: Patch, weight: Float) -> NDArray[np.bool_]:
 def _usable_std(clean_dn: Float, plan: Plan) -> Float:
     """Standard deviation of shot and read noise, [H, W] DN; 0 at sites that are not used.
 
-    At black and at clipped light, many sites can have exactly the same light before rounding, so these are not used.
+    These are at black and at clipped light, where many sites can have exactly the same light before rounding.
     """
     slope, intercept = plan.noise.variance_line
     black_dn, brightest_dn = plan.sensor.black_level_dn, plan.brightest_dn

@@ -79,10 +79,7 @@ def residual_of(noise: Noise) -> tuple[Residual, Scores]:
 
 
 def _score(differences: Float, information: float, bound: float = 0.0, together: float = 1.0) -> Score:
-    """Score of the sum of differences; correlated ones count as if groups of ``together`` were equal.
-
-    ``bound`` is the largest size of the part of the sum that the rounding of the clean frame explains.
-    """
+    """Score of a sum of differences, correlated in groups of ``together``; rounding explains up to ``bound``."""
     square = float(differences @ differences) * together
     return Score(float(differences.sum()), information, square, low=-bound, high=bound)
 
@@ -139,10 +136,7 @@ def _line_score(offsets: Float, information: Float, together: float) -> Score:
 class Bins:
     """Used sites of a part of a frame by clean value.
 
-    Attributes
-    ----------
-    signal, count, precision : ndarray of float64, [N]
-        DN above black, number of sites, and mean of 1 / std² (DN⁻²).
+    ``signal`` is in DN above black, ``count`` the number of sites, ``precision`` the mean of 1 / std² (DN⁻²), all [N].
     """
 
     def __init__(self, noise: Noise, part: Any) -> None:
