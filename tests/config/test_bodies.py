@@ -13,8 +13,7 @@ from helpers.datasets import Settings
 import unprocess_gen as ug
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.serialization import dataset_yaml, read_option
-from unprocess_gen.planning.bodies import body_sentence
-from unprocess_gen.planning.dark_scene import physical_profiles
+from unprocess_gen.planning.advice import body_sentence, physical_profiles
 
 BODIES = group_options("body")
 # LibRaw 0.22.2, colordata.cpp: XYZ to camera times 10,000

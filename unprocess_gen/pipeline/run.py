@@ -40,9 +40,7 @@ from unprocess_gen.pipeline.deaths import DEATHS
 from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.tasks import ShardTask
-from unprocess_gen.planning.bodies import body_sentence
-from unprocess_gen.planning.dark_scene import dark_scene_warning
-from unprocess_gen.planning.sensor_levels import sensor_warning
+from unprocess_gen.planning.advice import body_sentence, dark_scene_warning, sensor_warning
 from unprocess_gen.sources.listing import Listing, list_photographs
 from unprocess_gen.sources.names import decode_name
 

@@ -20,17 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from unprocess_gen.config import interpretation
 from unprocess_gen.config.distributions import lowest, parse_drawn
-from unprocess_gen.config.interpretation import (
-    UNCLIPPED,
-    assumed_numbers,
-    effect_switch,
-    is_normalised,
-    is_physical,
-    missing_number,
-    needed_numbers,
-    uses_dark_frames,
-)
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.arrays import Srgb
@@ -58,7 +49,7 @@ def facts_of(srgb: Srgb, frames: int = 1, raw: RawParts | None = None) -> Facts:
 
 def facts_for(config: Config, srgb: Srgb, frames: int = 1, raw: RawParts | None = None) -> Facts | None:
     """Return `facts_of` the pixels for a physical noise profile or a raw source; others need none."""
-    return facts_of(srgb, frames, raw) if is_physical(config.noise) or raw is not None else None
+    return facts_of(srgb, frames, raw) if interpretation.is_physical(config.noise) or raw is not None else None
 
 
 class Prediction(NamedTuple):
@@ -106,13 +97,14 @@ def _forced_decision(config: Config, name: str) -> ForcedDecision | None:
 
     The first rule that holds decides. Rows record the reasons of effects that are off, so bytes depend on them.
     """
-    effect, switch, sampled = BY_NAME[name], effect_switch(config.effects, name), uses_dark_frames(config.noise)
-    missing = missing_number(config.noise, name)
-    assumed = next((key for key in needed_numbers(name) if key in config.noise.assumed), None)
+    effect, switch = BY_NAME[name], interpretation.effect_switch(config.effects, name)
+    sampled = interpretation.uses_dark_frames(config.noise)
+    missing = interpretation.missing_number(config.noise, name)
+    assumed = next((key for key in interpretation.needed_numbers(name) if key in config.noise.assumed), None)
     rules: tuple[tuple[bool, bool, str], ...] = (
         (sampled and name == "read", True, "sampled from dark frames"),
         (sampled and effect.is_in_dark_frames, False, IN_DARK_FRAMES),
-        (name == "quantise" and is_normalised(config), False, NOT_ROUNDED),
+        (name == "quantise" and interpretation.is_normalised(config), False, NOT_ROUNDED),
         (name == "quantise", True, "integer output is always rounded and clipped"),
         (switch == "off", False, "switched off"),
         (missing is not None, False, f"noise={config.noise.name} gives no {missing}"),
@@ -139,15 +131,35 @@ class EffectRules:
         self.patterns = [effect for effect in free if effect in FIXED]
         self.temporal = [effect for effect in free if effect not in FIXED]
         self.tolerance, self.black_level_dn = config.effects.tolerance, float(sensor.black_level_dn)
-        self.assumed = {effect: assumed_numbers(noise, effect) for effect in effects}
-        self.dark_frames = uses_dark_frames(noise)  # `dark_frame` takes the place of `read`, whose variance it has
-        unclipped = sensor.clip == UNCLIPPED
+        self.assumed = {effect: interpretation.assumed_numbers(noise, effect) for effect in effects}
+        self.dark_frames = interpretation.uses_dark_frames(noise)  # in place of `read`, whose variance they have
+        unclipped = sensor.clip == interpretation.UNCLIPPED
         self.converter_dn = math.inf if unclipped else 2.0**sensor.bits - 1 - sensor.black_level_dn  # above black
         self.body_light_dn = min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn)  # most of the scene
 
     def frame(self, physics: Physics, facts: Facts, signals: SignalRange) -> FrameModel:
         """Model of a frame of the sensor."""
         return FrameModel(physics, facts, signals, self.black_level_dn, self.converter_dn)
+
+    def select_patterns(self, physics: Physics, is_clip: bool) -> BodySelection | None:
+        """Decide about the fixed patterns of a body for all of its images; None if the configuration has decided."""
+        if not self.patterns:
+            return None
+        height, width = BODY_FRAME
+        facts = Facts(width, height, codes=256, dark_code=0, bright_code=255, frames=BODY_CLIP if is_clip else 1)
+        frame = self.frame(physics, facts, SignalRange(0.0, self.body_light_dn))
+        on = omit_weakest(self.tolerance, frame, self.on, [*self.patterns, *self.temporal])
+        omitted = [effect for effect in self.patterns if effect not in on]
+        reasons = {effect: _prediction(effect, frame, on, None, self.tolerance).reason for effect in omitted}
+        return BodySelection(frame, on, reasons)
+
+    def select_effects(
+        self, physics: Physics, facts: Facts, signals: SignalRange, body: BodySelection | None
+    ) -> Selection:
+        """Decide about every effect for one image, after those of its ``body``."""
+        frame, omitted = self.frame(physics, facts, signals), [*body.reasons] if body else []
+        on = omit_weakest(self.tolerance, frame, self.on.difference(omitted), self.temporal, omitted)
+        return Selection(self, frame, on, body)
 
 
 class BodySelection(NamedTuple):
@@ -156,20 +168,6 @@ class BodySelection(NamedTuple):
     frame: FrameModel
     on: frozenset[str]
     reasons: dict[str, str]  # of the patterns that are omitted
-
-
-def select_patterns(rules: EffectRules, physics: Physics, is_clip: bool) -> BodySelection | None:
-    """Decide about the fixed patterns of a body, for all of its images; None if the configuration decides about all."""
-    if not rules.patterns:
-        return None
-    height, width = BODY_FRAME
-    facts = Facts(width, height, codes=256, dark_code=0, bright_code=255, frames=BODY_CLIP if is_clip else 1)
-    frame = rules.frame(physics, facts, SignalRange(0.0, rules.body_light_dn))
-    on = omit_weakest(rules.tolerance, frame, rules.on, [*rules.patterns, *rules.temporal])
-    omitted = [effect for effect in rules.patterns if effect not in on]
-    return BodySelection(
-        frame, on, {effect: _prediction(effect, frame, on, None, rules.tolerance).reason for effect in omitted}
-    )
 
 
 class Selection(NamedTuple):
@@ -218,15 +216,6 @@ class Selection(NamedTuple):
         return tuple(self.prediction(effect) for effect in PHYSICAL_EFFECTS)
 
 
-def select_effects(
-    rules: EffectRules, physics: Physics, facts: Facts, signals: SignalRange, body: BodySelection | None
-) -> Selection:
-    """Decide about every effect of a physical noise profile for one image, after those of its ``body``."""
-    frame, omitted = rules.frame(physics, facts, signals), [*body.reasons] if body else []
-    on = omit_weakest(rules.tolerance, frame, rules.on.difference(omitted), rules.temporal, omitted)
-    return Selection(rules, frame, on, body)
-
-
 def omit_weakest(
     tolerance: float, frame: FrameModel, on: frozenset[str], free: Sequence[str], before: Sequence[str] = ()
 ) -> frozenset[str]:
@@ -270,14 +259,5 @@ def _prediction(
     if simulated and ratios[index] <= tolerance and outliers < MIN_OUTLIERS:
         why += ", too much together with the omitted effects"
     why += f" (tolerance {tolerance:g})"
-    masking_dn = math.sqrt(masking / frame.counts[index])
-    return Prediction(
-        effect,
-        STATISTICS[index],
-        predicted_dn,
-        masking_dn,
-        outliers,
-        simulated,
-        forced is not None,
-        forced.reason if forced else why,
-    )
+    found = effect, STATISTICS[index], predicted_dn, math.sqrt(masking / frame.counts[index]), outliers, simulated
+    return Prediction(*found, forced is not None, forced.reason if forced else why)

@@ -11,8 +11,8 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
@@ -22,32 +22,13 @@ from unprocess_gen.core.arrays import FLOAT32
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, split_uniform, stream_key
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
-from unprocess_gen.planning.effect_selection import (
-    NOT_ROUNDED,
-    BodySelection,
-    EffectRules,
-    Prediction,
-    Selection,
-    select_effects,
-    select_patterns,
-)
+from unprocess_gen.planning.effect_selection import NOT_ROUNDED, BodySelection, EffectRules, Prediction, Selection
 from unprocess_gen.planning.frame_model import SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
+from unprocess_gen.simulation import plan as records
 from unprocess_gen.simulation.facts import DarkFrames, Facts
-from unprocess_gen.simulation.plan import (
-    CameraPlan,
-    DarkFramePlan,
-    IspPlan,
-    NoisePlan,
-    OutputPlan,
-    Physics,
-    Place,
-    Plan,
-    ScenePlan,
-    SensorPlan,
-    SourcePlan,
-)
+from unprocess_gen.simulation.plan import Physics, Place, Plan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
@@ -115,7 +96,7 @@ def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: i
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
-    return plan.replace(dark=DarkFramePlan(frame.sha256, shift, dark_frames.black_dn, dark_frames.scale))
+    return plan.replace(dark=records.DarkFramePlan(frame.sha256, shift, dark_frames.black_dn, dark_frames.scale))
 
 
 def _even_place(word: int, available: int, needed: int) -> int:
@@ -160,12 +141,8 @@ def _planner_without_seed(config: Config) -> Planner:
 class Planner:
     """Draw plans for the images of one configuration, which is interpreted once.
 
-    Parsing distributions and interpreting the noise profile take longer than all draws of an image.
-
-    Parameters
-    ----------
-    config : Config
-        A configuration that `validate_config` accepts, and that does not change. Its seed is not used.
+    Parsing distributions and interpreting the noise profile take longer than all draws of an image. The seed of the
+    config is not used.
     """
 
     def __init__(self, config: Config) -> None:
@@ -173,29 +150,19 @@ class Planner:
         self._red, self._blue, self._inverse_rgb = interpretation.gain_distributions(config.gains)
         self._lights = interpretation.lights(config)
         self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
-        levels = [replace(config, noise=noise) for noise in interpretation.noise_levels(config.noise)]
         self._is_physical = interpretation.is_physical(config.noise)
-        kind = PhysicalLevel if self._is_physical else TwoNumberLevel
-        self._levels = [kind(level) for level in levels]
-        self._accuracy = config.accuracy
-        self._scene_name = config.scene.name
-        self._source = SourcePlan(config.source.downscale, config.source.dequantize)
+        kind, levels = PhysicalLevel if self._is_physical else TwoNumberLevel, interpretation.noise_levels(config.noise)
+        self._levels = [kind(replace(config, noise=noise)) for noise in levels]
+        self._accuracy, self._scene_name = config.accuracy, config.scene.name
+        self._source = records.SourcePlan(config.source.downscale, config.source.dequantize)
         isp, gains, sensor = config.isp, config.gains, config.sensor
         gamma = "srgb" if isp.gamma == "srgb" else float(isp.gamma)
-        self._isp = IspPlan(isp.tone, gamma, gains.highlight, gains.threshold)
+        self._isp = records.IspPlan(isp.tone, gamma, gains.highlight, gains.threshold)
         self._splits: dict[str, float] = config.split or {}
-        self._sensor = SensorPlan(
-            sensor.pattern,
-            sensor.bits,
-            sensor.black_level_dn,
-            sensor.white_level_dn,
-            sensor.clip,
-            interpretation.saturated_as(config),
-        )
-        self._output = OutputPlan(
-            config.output.dtype, config.output.layout, FLOAT32 if interpretation.has_float_clean(config) else ""
-        )
-
+        levels_dn, saturated_as = (sensor.black_level_dn, sensor.white_level_dn), interpretation.saturated_as(config)
+        self._sensor = records.SensorPlan(sensor.pattern, sensor.bits, *levels_dn, sensor.clip, saturated_as)
+        clean_dtype = FLOAT32 if interpretation.has_float_clean(config) else ""
+        self._output = records.OutputPlan(config.output.dtype, config.output.layout, clean_dtype)
         distributions = {
             Draw.RED: self._red, Draw.BLUE: self._blue, Draw.INVERSE_RGB: self._inverse_rgb,
             Draw.EXPOSURE_RATIO: self._exposure_ratio, **self._levels[0].distributions,
@@ -230,7 +197,7 @@ class Planner:
             raise ValueError("a physical profile needs the facts of the pixels")
         uniforms = [math.nan] * DRAW_COUNT  # of parameters that are not drawn
         _draw(uniforms, self._drawn, key, 0, epoch)
-        scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
+        scene = records.ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
         source, isp = self._source, self._isp
         if raw is None:
@@ -239,31 +206,18 @@ class Planner:
             source, camera, isp = own_noise(raw, scene.exposure, span_dn), raw.camera, raw.isp
         signals = None
         if self._is_physical and facts is not None:
-            if raw is None:
-                signals = signal_range(facts, isp, camera, scene.exposure, span_dn)
-            else:
-                signals = raw_signal_range(facts, source, scene.exposure, span_dn)
+            light = scene.exposure, span_dn
+            signals = raw_signal_range(facts, source, *light) if raw else signal_range(facts, isp, camera, *light)
         image = Image(seed, key, facts, signals, dark_frames, source)
         for number, level in enumerate(self._levels):
             if number:
                 _draw(uniforms, NOISE_COUNTERS, key, number, epoch)
             noise, physics, selection = level.draw(image, uniforms)
-            plan = Plan(
-                seed=seed,
-                stream_key=key,
-                split=split,
-                place=Place(level=number),
-                camera=camera,
-                isp=isp,
-                source=source,
-                sensor=self._sensor,
-                scene=scene,
-                noise=noise,
-                accuracy=self._accuracy,
-                physics=physics,
-                output=self._output,
-            )
-            yield plan, selection
+            yield Plan(
+                seed=seed, stream_key=key, split=split, place=Place(level=number), camera=camera, isp=isp,
+                source=source, sensor=self._sensor, scene=scene, noise=noise, accuracy=self._accuracy,
+                physics=physics, output=self._output,
+            ), selection  # fmt: skip
 
     def _draw_split(self, seed: int, source_sha256: str) -> str:
         """Name the split of an image, empty without splits; the last one takes what the others leave."""
@@ -272,7 +226,7 @@ class Planner:
         names, ends = list(self._splits), list(itertools.accumulate(self._splits.values()))
         return names[bisect.bisect_right(ends[:-1], split_uniform(seed, source_sha256))]
 
-    def draw_camera(self, uniforms: Sequence[float]) -> CameraPlan:
+    def draw_camera(self, uniforms: Sequence[float]) -> records.CameraPlan:
         """Draw colours and gains."""
         name, weights, rgb2cam = plan_camera(self._camera, uniforms)
         red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
@@ -280,16 +234,10 @@ class Planner:
         if self._lights:
             light, cct_k, (red, blue) = draw_light(self._lights, xyz2cam(self._camera, weights), uniforms)
         inverse_rgb = draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB])
-        camera = CameraPlan(
-            camera=name,
-            weights=weights,
-            rgb2cam=rgb2cam,
-            light=light,
-            cct_k=cct_k,
-            red_gain=red,
-            blue_gain=blue,
+        camera = records.CameraPlan(
+            camera=name, weights=weights, rgb2cam=rgb2cam, light=light, cct_k=cct_k, red_gain=red, blue_gain=blue,
             inverse_rgb_gain=inverse_rgb,
-        )
+        )  # fmt: skip
         return without_filters(camera) if self._sensor.pattern == MONO else camera
 
 
@@ -299,7 +247,7 @@ def _draw(uniforms: list[float], counters: tuple[int, ...], key: int, level: int
         uniforms[counter] = uniform
 
 
-def without_filters(camera: CameraPlan) -> CameraPlan:
+def without_filters(camera: records.CameraPlan) -> records.CameraPlan:
     """Return a camera whose channels are equal: each is the mean of the three, gains included.
 
     Highlights are kept like highlights of the mean, whose gain is the mean of the three.
@@ -311,42 +259,23 @@ def without_filters(camera: CameraPlan) -> CameraPlan:
     return camera.replace(rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=sum(gains) / 3)
 
 
-DrawnNoise = tuple[NoisePlan, Physics | None, Selection | None]
+DrawnNoise = tuple[records.NoisePlan, Physics | None, Selection | None]
 """Noise of a plan, and of a physical profile its numbers and the selection of effects."""
 
 
-@dataclass(frozen=True, slots=True)
-class Image:
-    """Facts on which the noise levels of an image depend, in addition to its uniforms.
-
-    Attributes
-    ----------
-    seed, stream_key : int
-        Seed of the dataset, and key of the image's random streams.
-    facts, signals : Facts or None, SignalRange or None
-        Facts about the pixels, and the signal range; needed by physical profiles only.
-    dark_frames : DarkFrames or None
-        Frames from which noise is sampled.
-    source : SourcePlan
-        Preparation of the pixels, with the source's own noise.
-    """
+class Image(NamedTuple):
+    """Facts on which the noise levels of an image depend, in addition to its uniforms."""
 
     seed: int
     stream_key: int
     facts: Facts | None
-    signals: SignalRange | None
+    signals: SignalRange | None  # needed by physical profiles only, as the facts
     dark_frames: DarkFrames | None
-    source: SourcePlan
+    source: records.SourcePlan  # with the source's own noise
 
 
 class TwoNumberLevel:
-    """One noise level of a profile with two numbers.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration, with the profile of this level.
-    """
+    """One noise level of a profile with two numbers; the config has the profile of this level."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -361,31 +290,21 @@ class TwoNumberLevel:
             a_dn, b_dn2 = a_dn - image.source.own_a_dn, b_dn2 - image.source.own_b_dn2
         effects, skipped = plan_effects(self._config, a_dn, b_dn2, self._span_dn)
         noise = self._config.noise
-        return NoisePlan(noise.name, noise.law, a_dn, b_dn2, effects, skipped), None, None
+        return records.NoisePlan(noise.name, noise.law, a_dn, b_dn2, effects, skipped), None, None
 
     def two_numbers(self, uniforms: Sequence[float]) -> tuple[float, float]:
         """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
         noise, sensor = self._config.noise, self._config.sensor
         a = draw_parameter(self.distributions[Draw.A], uniforms[Draw.A])
         b = draw_parameter(self.distributions[Draw.B], uniforms[Draw.B], a)
-        return noise_in_dn(
-            a,
-            b,
-            units=noise.units or "",
-            black=noise.black or "",
-            profile_levels_dn=(noise.black_level_dn or 0, noise.white_level_dn or 0),
-            sensor_levels_dn=(sensor.black_level_dn, sensor.white_level_dn),
-        )
+        levels_dn = noise.black_level_dn or 0, noise.white_level_dn or 0
+        sensor_dn = sensor.black_level_dn, sensor.white_level_dn
+        meaning = {"units": noise.units or "", "black": noise.black or ""}
+        return noise_in_dn(a, b, **meaning, profile_levels_dn=levels_dn, sensor_levels_dn=sensor_dn)
 
 
 class PhysicalLevel:
-    """One noise level of a physical profile.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration, with the profile of this level.
-    """
+    """One noise level of a physical profile; the config has the profile of this level."""
 
     def __init__(self, config: Config) -> None:
         self._noise, self._rules = PhysicalNoise(config), EffectRules(config)
@@ -406,20 +325,12 @@ class PhysicalLevel:
                 physics = physics.replace(read_law="gaussian", read_shape=0.0, read_std_dn=read_std_dn)
             if lens:
                 physics = physics.replace(frame_size=(facts.height, facts.width))
-            known = self._sensors.keep(key, (physics, select_patterns(self._rules, physics, facts.frames > 1)))
+            known = self._sensors.keep(key, (physics, self._rules.select_patterns(physics, facts.frames > 1)))
         physics, patterns = known
-        selection = select_effects(self._rules, physics, facts, image.signals, patterns)
-        profile = self._noise.noise
-        plan = NoisePlan(
-            profile.name,
-            profile.law,
-            physics.dn_per_e,
-            physics.read_std_dn * physics.read_std_dn,
-            selection.effects,
-            selection.skipped,
-            selection.assumed,
-        )
-        return plan, physics, selection
+        selection = self._rules.select_effects(physics, facts, image.signals, patterns)
+        name, law, b_dn2 = self._noise.noise.name, self._noise.noise.law, physics.read_std_dn * physics.read_std_dn
+        chosen = selection.effects, selection.skipped, selection.assumed
+        return records.NoisePlan(name, law, physics.dn_per_e, b_dn2, *chosen), physics, selection
 
 
 # ---------------------------------------------------------------------------------------------------------- camera

@@ -1,16 +1,45 @@
-"""Warn about a camera's noise in the raw levels of the default sensor."""
+"""Warn about what is rarely meant: options that a body lacks, noise that ignores the scene, levels of another sensor."""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 from unprocess_gen.config.defaults import default_options, default_values
+from unprocess_gen.config.distributions import highest, lowest, parse_drawn
 from unprocess_gen.config.interpretation import is_physical
+from unprocess_gen.config.limits import EXPOSURE_RATIO, ISO
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.values import value_range
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 LEVEL_NAMES = ("bits", "black_level_dn", "white_level_dn")
+
+NOUNS = {"camera": "colour matrix", "sensor": "set of raw levels", "noise": "noise profile"}
+"""What the options of a body's groups contain."""
+
+
+def dark_scene_warning(config: Config) -> str:
+    """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text."""
+    if is_physical(config.noise):
+        return ""
+    ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
+    if highest(ratio) <= 1:
+        return ""
+    iso = parse_drawn("scene.iso", config.scene.iso, ISO)
+    ratios, isos = (value_range((lowest(drawn), highest(drawn))) for drawn in (ratio, iso))
+    return (
+        f"scene={config.scene.name}: light is divided by {ratios}, but noise={config.noise.name} ignores ISO {isos}; "
+        f"physical profiles follow the scene: {', '.join(physical_profiles())}"
+    )
+
+
+@cache
+def physical_profiles() -> tuple[str, ...]:
+    """Return the names of the built-in physical noise profiles, which takes 0.2 s to read."""
+    folder = conf_dir() / "noise"
+    return tuple(name for name in group_options("noise") if "branches" in read_yaml_mapping(folder / f"{name}.yaml"))
 
 
 def sensor_warning(config: Config) -> str:
@@ -48,3 +77,16 @@ def fitting_sensor(levels: dict[str, Any], camera: str = "") -> list[str]:
 
 def _levels_text(levels: dict[str, Any]) -> str:
     return f"{levels['bits']} bits, black {levels['black_level_dn']}, white {levels['white_level_dn']} DN"
+
+
+def body_sentence(config: Config) -> str:
+    """Return a sentence about the groups for which no numbers of the body are published; empty without any."""
+    body = config.body
+    missing = [group for group in body.missing if group != "camera" or config.source.kind != "raw"]
+    sentences = [f"no {NOUNS[group]} of it is published, so {_chosen(config, group)} applies" for group in missing]
+    return f"body={body.name}: {'; '.join(sentences)}" if body.name is not None and sentences else ""
+
+
+def _chosen(config: Config, group: str) -> str:
+    name = getattr(getattr(config, group), "name", None)
+    return f"the setting {group}" if name is None else f"{group}={name}"
