@@ -11,6 +11,7 @@ import hashlib
 import platform
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
@@ -164,12 +165,19 @@ def generate(config: Config, label: str = "") -> Summary:
     run = resolve(config)
     with OutFolder(config.out) as folder:
         folder.open()
-        facts = folder.finished()
+        facts, made = folder.finished(), Made()
         if facts is None:
             folder.lock()
+            facts = folder.finished()  # another run may have ended since
+        if facts is not None:
+            check_finished(folder, run.config, run.sources, facts)
+        else:
             known, made = _make(folder, run, None, label)
             facts = folder.finished()  # by a concurrent run, where there is no lock
-        if facts is None:
+        if facts is not None:
+            with suppress(OSError):  # may be read-only
+                folder.remove_work()
+        else:
             process = {
                 "seconds": round(time.monotonic() - started, 3),
                 **{stage: round(stage_s, 3) for stage, stage_s in asdict(made.times).items()},
@@ -179,9 +187,6 @@ def generate(config: Config, label: str = "") -> Summary:
                 "max_failed": config.source.max_failed,
             }
             facts = _finish(folder, known, columns_of(run.config), run.file(None).facts(), process)
-        else:
-            made = Made()
-            check_finished(folder, run.config, run.sources, facts)
     return Summary.of(folder.path, facts, started, made=made.rows, times=made.times, unmatched=run.listing.unmatched)
 
 
@@ -215,16 +220,17 @@ def merge(out: str) -> tuple[Summary, int]:
     """
     started = time.monotonic()
     with OutFolder(out) as folder:
+        known = read_run(folder)
+        if known is not None:
+            check_version(folder, known)
+            folder.lock()
         facts = folder.finished()
         if facts is not None:
             summary = Summary.of(folder.path, facts, started)
             max_failed = (facts["run"] or {}).get("max_failed")
             return summary, sum(summary.failed.values()) if max_failed is None else max_failed
-        known = read_run(folder)
         if known is None:
             raise ConfigError(f"merge: {out}: no run has begun there; expected one; run gen-dataset part K/N first")
-        check_version(folder, known)
-        folder.lock()
         try:
             config, _ = parse_dataset_yaml(known.config)
         except (ValueError, ConfigError) as error:
