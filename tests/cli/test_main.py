@@ -108,7 +108,7 @@ def test_useless_folders_are_refused_and_nothing_written(
 HELP = global_help(VERBS)
 
 
-@pytest.mark.parametrize("arguments", [("--help",), ("-h",), ("camera=nope", "--help"), ("nope", "-h")])
+@pytest.mark.parametrize("arguments", [("--help",), ("-h",), ("camera=nope", "--help")])
 def test_help_lists_verbs_whatever_else_is_given(arguments: tuple[str, ...], run_main: RunMain) -> None:
     assert run_main(*arguments) == (0, HELP, "")
     assert run_main("--version") == (0, f"unprocess_gen {__version__}\n", "")

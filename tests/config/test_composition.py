@@ -168,7 +168,7 @@ def test_interpolations_resolve_in_every_value(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("name", ["$HOME", "a$b", r"\${x}", "it's", "été", "a b", "[1]", "back\\slash", "=", "a,b"])
 def test_folder_names_are_taken_as_they_are(name: str) -> None:
-    assert load_config([f"out=~/{name}"]).out == os.path.expanduser("~/") + name.replace(r"\${", "${")
+    assert load_config([f"+out=~/{name}"]).out == os.path.expanduser("~/") + name.replace(r"\${", "${")
 
 
 BOMB = "".join(f"l{level}: &l{level} [{', '.join([f'*l{level - 1}' if level else '1'] * 9)}]\n" for level in range(12))

@@ -1,7 +1,6 @@
 """Describe the arguments of verbs as data, and parse a command line into a `Call`.
 
-argparse parses flags. Words are assigned here, because a dataset's folder may be called ``camera=sony_a7r``, and
-settings and flags may be mixed in any order.
+argparse parses flags; words are assigned here, because a dataset's folder may be called ``camera=sony_a7r``.
 """
 
 from __future__ import annotations
@@ -89,10 +88,9 @@ class Place(NamedTuple):
 
 
 class Verb(NamedTuple):
-    """A verb of the command line; ``run`` returns the exit code.
+    """A verb; ``run`` returns the exit code, ``keys`` are settings of its own, such as ``source.root=ROOT``, with help.
 
-    ``composes`` verbs take the settings of a run and Hydra's flags. ``keys`` are settings of the verb itself with their
-    help, such as ``source.root=ROOT``.
+    ``composes`` verbs take the settings of a run and Hydra's flags.
     """
 
     name: str
@@ -126,8 +124,7 @@ class Verb(NamedTuple):
 class Call(argparse.Namespace):
     """A parsed command line: flags are attributes, None or False if they are not given.
 
-    ``place`` is what the verb works on, ``settings`` are those of the verb itself by key, ``overrides`` those of a
-    config as the user wrote them, ``words`` the complete command line after the verb.
+    ``settings`` are those of the verb itself by key, ``overrides`` those of a config, ``words`` all behind the verb.
     """
 
     verb: Verb
@@ -146,10 +143,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parse(verb: Verb, arguments: Sequence[str]) -> Call:
-    """Parse what follows a verb; ConfigError for an argument that is unknown, given twice or cannot be read.
-
-    Everything after ``--`` is a word, even with a leading hyphen.
-    """
+    """Parse what follows a verb; everything after ``--`` is a word, even with a leading hyphen."""
     from unprocess_gen.core.paths import any_path  # --help needs no paths
 
     cut = arguments.index("--") if "--" in arguments else len(arguments)

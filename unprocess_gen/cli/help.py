@@ -37,10 +37,7 @@ FLAGS = (
 
 
 def asked_help(verbs: Mapping[str, Verb], verb: Verb | None, flags: Sequence[str]) -> str:
-    """Help of a verb; without one, of the verb, group or key that follows ``--help``, else of the program.
-
-    A group may be named by one of its settings, such as ``noise.iso``.
-    """
+    """Help of a verb, else of the verb, group or setting (``noise.iso``) behind ``--help``, else of the program."""
     word = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "-")
     if verb is not None:
         return verb_help(verb)
@@ -66,17 +63,14 @@ def global_help(verbs: Mapping[str, Verb]) -> str:
         _section("Verbs", ((verb.name, verb.summary) for verb in verbs.values()), 16),
         "\n".join([SETTINGS_HELP, *(_columns(*line, 16) for line in _group_lines())]) + "\n",
         "Keys at the top level:\n" + "".join(key_help("")),
-        _section("Flags, in addition to those of the verb", FLAGS),
+        _section("Flags (gen-dataset VERB --help lists more)", FLAGS),
         _section("Exit codes", EXIT_CODES.items(), 16),
     ]
     return "\n".join(blocks)
 
 
 def key_help(name: str) -> list[str]:
-    """Help of the key at the top level with this name, or of all without a name.
-
-    The comments of ``config.yaml`` explain them; `config.schema` imports NumPy, which is too slow for ``--help``.
-    """
+    """Help of the key at the top level with this name, or of all; comments explain them, to import no schema."""
     lines = re.findall(r"^(\w+): (\S+) +# (.*)", _primary_config(), re.MULTILINE)
     return [_columns(f"{key}={value}", summary, 20) + "\n" for key, value, summary in lines if name in ("", key)]
 

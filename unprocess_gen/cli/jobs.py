@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 class Job:
     """A config to run; inside the context, an error of a job of a sweep becomes its exit code.
 
-    ``row`` has the folder, the overrides and the swept values for ``sweep.csv``; it is empty without a sweep. ``label``
-    is shown with the progress, such as ``3/20 camera=sony_a7r``.
+    ``row`` has the first cells of ``sweep.csv``; ``label`` is shown with the progress: ``3/20 camera=sony_a7r``.
     """
 
     def __init__(self, config: Config, row: dict[str, str], sweep: Path | None = None) -> None:

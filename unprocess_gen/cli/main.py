@@ -62,16 +62,11 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:
-    """Find the verb of a command line, ``generate`` if the first word is none, and the arguments behind it.
-
-    A first word of small letters is always a verb, even if a folder has that name.
-    """
+    """Find the verb, which a first word of small letters always is, otherwise ``generate``, and what is behind it."""
     if not arguments or not re.fullmatch("[a-z]+", arguments[0]):
         return VERBS["generate"], list(arguments)
     name, *rest = arguments
     if name not in VERBS:
-        if {"-h", "--help"} & set(rest):
-            return VERBS["generate"], list(arguments)
         hint = path_hint(name) or did_you_mean(name, VERBS)
         raise ConfigError(f"{name}: no such verb; expected {', '.join(VERBS)} or settings key=value{hint}")
     return VERBS[name], rest

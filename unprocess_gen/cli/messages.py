@@ -1,8 +1,4 @@
-"""Write results to stdout, and messages to stderr.
-
-Messages go through the logger ``unprocess_gen``. A full stdout is a system
-error, while a full stderr is ignored: it must not end a run.
-"""
+"""Write results to stdout, and messages to stderr, also those of the logger ``unprocess_gen``."""
 
 from __future__ import annotations
 
@@ -62,10 +58,9 @@ def logging_to_stderr(quiet: bool = False) -> Iterator[None]:
 
 
 class _Stream:
-    """Pass text on to stdout or stderr, and handle their errors in one place.
+    """A stream whose errors are a MachineError (a broken pipe stays one) if it ``fails``, otherwise ignored.
 
-    A stream that fails becomes `os.devnull`, so that the interpreter's own flush at exit succeeds. An error of stdout
-    is a MachineError, or BrokenPipeError if its reader ended.
+    A failed stream becomes `os.devnull`, so that the interpreter's own flush at exit succeeds.
     """
 
     def __init__(self, stream: TextIO, fails: bool) -> None:
@@ -98,10 +93,9 @@ class _Stream:
 
 @contextmanager
 def checked_streams() -> Iterator[None]:
-    """Handle the errors of ``sys.stdout`` and ``sys.stderr`` until the end.
+    """Handle the errors of ``sys.stdout``, and ignore those of ``sys.stderr``, which must not end a run.
 
-    Streams that the caller closed become `os.devnull`: otherwise the next file to be opened would get the number of
-    stdout, and receive what C libraries print.
+    Closed streams become `os.devnull`: the next file would get the number of stdout, and what C libraries print.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:

@@ -31,10 +31,7 @@ LAST_COLUMNS = ("rows", "failed", "filtered", *(f"{name}_share" for name in SHAR
 
 
 def named_overrides(overrides: Iterable[str], swept: Container[str] = ()) -> list[str]:
-    """Choose the overrides that name a job's folder, sorted as in Hydra's ``override_dirname``.
-
-    Swept places of the sources are among them, because their datasets differ.
-    """
+    """Overrides that name a job's folder, sorted as in Hydra's ``override_dirname``; with swept places of sources."""
 
     def is_named(key: str) -> bool:
         differs = key in swept and key.startswith("source.")
@@ -48,10 +45,7 @@ def _key(override: str) -> str:
 
 
 def job_folder(overrides: Sequence[str], swept: Container[str] = ()) -> str:
-    """Name a job's folder by its overrides, with slashes encoded.
-
-    A name longer than `LONGEST_FOLDER_NAME` begins with the overrides of swept keys, is cut, and ends with a digest.
-    """
+    """Name of a job's folder; a long one begins with the overrides of swept keys, is cut, and ends with a digest."""
     import hashlib
 
     name = _encoded(overrides) or "default"
@@ -87,10 +81,9 @@ def result_cells(summary: Summary) -> dict[str, str]:
 
 
 def write_row(out: Path, row: Mapping[str, str]) -> None:
-    """Write the row of a job to ``sweep.csv`` in the sweep's folder, unless the folder is missing or in a dataset.
+    """Write the row of a job to ``sweep.csv``, in the place of an earlier one, whose time remains if there is no other.
 
-    A row of the same folder is replaced and keeps its place, so that the indices of `RawPairs` do not change. A job
-    that found its dataset complete has no time; the earlier one remains.
+    So the indices of `RawPairs` do not change.
     """
     import csv
 

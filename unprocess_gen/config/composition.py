@@ -297,8 +297,8 @@ def typed_config(node: DictConfig, overrides: Sequence[str]) -> Config:
 
 def normalised(override: str) -> str:
     """Quote a path for Hydra's grammar, expand its ``~``, and drop the plus of keys that need none."""
-    key, _, value = override.partition("=")
-    if key.lstrip("+") not in ADDED_GROUPS:
+    key, _, value = override.lstrip("+").partition("=")
+    if key not in ADDED_GROUPS:
         override = override.lstrip("+")
     if key in PATH_KEYS and value not in ("", "null") and value[0] not in "'\"":
         return f"{key}={quoted(os.path.expanduser(value))}"
