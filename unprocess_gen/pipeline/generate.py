@@ -135,31 +135,11 @@ class Summary:
 
 
 def generate(config: Config, label: str = "") -> Summary:
-    """Generate the dataset that a config describes, or resume it.
+    """Generate the dataset that a config describes, or resume it; ``label`` names the job of a sweep.
 
-    Parameters
-    ----------
-    config : Config
-        Config that `config.validation.validate_config` has accepted.
-    label : str
-        Name of the job and its place in a sweep, shown with the progress.
-
-    Returns
-    -------
-    Summary
-        Rows by status, shards, bytes and time.
-
-    Raises
-    ------
-    ConfigError
-        If ``out`` cannot be written, is not empty or inside a dataset, or was begun with other settings or sources.
-    LockedError
-        If another run holds ``out``.
-    DamageError
-        If ``out`` is a finished dataset and a file of it is missing or has another size.
-    MachineError
-        If the dataset will not fit the disk (unless ``check_disk=false``), the disk fails, ``out`` or a source was
-        deleted, or memory runs out.
+    ConfigError if ``out`` cannot be written, is not empty or inside a dataset, or was begun with other settings or
+    sources; LockedError if another run holds it; DamageError if it is finished and a file is missing or has another
+    size; MachineError if the disk is too small or fails, ``out`` or a source was deleted, or memory runs out.
     """
     started = time.monotonic()
     run = resolve(config)
