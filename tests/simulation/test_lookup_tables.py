@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from decimal import Decimal, localcontext
 from pathlib import Path
@@ -156,30 +154,6 @@ def test_damaged_package_data_are_refused(
 
     with pytest.raises(MachineError, match=r"curves\.npz: cannot be read .*; reinstall unprocess_gen"):
         tone_curves.linear_table("smoothstep", 2.2, 65536)
-
-
-IMPORT_WITHOUT = """
-import sys
-class Blocked:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {blocked!r}:
-            raise ImportError(name)
-sys.meta_path.insert(0, Blocked())
-import {module}
-"""
-
-
-@pytest.mark.parametrize(
-    ("module", "blocked"),
-    [
-        ("unprocess_gen", ["cv2", "fcntl", "hydra", "joblib", "numba", "omegaconf"]),
-        ("unprocess_gen.planning.effect_selection", ["cv2", "fcntl", "hydra", "joblib", "numba"]),
-    ],
-)
-def test_reader_and_planner_need_neither_numba_nor_posix(module: str, blocked: list[str]) -> None:
-    code = IMPORT_WITHOUT.format(module=module, blocked=blocked) + "unprocess_gen.RawPairs"
-
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 # Normals --------------------------------------------------------------------------------------------------------------
