@@ -149,6 +149,10 @@ def measured_yaml(calibration: Calibration, name: str) -> str:
     return profile_yaml(f"Measured {MARK} on {frames}", digest, calibration.notes, profile)
 
 
+AGAINST_ISO = {"dn_per_e": "DN per electron", "read_std_dn": "read noise (DN)", "row_std_dn": "row noise (DN)"}
+"""Numbers that are printed and drawn for each ISO, and their labels."""
+
+
 def dark_variance(result: IsoResult) -> Estimate:
     """Variance of a site without light, DN², all dark noise but rounding."""
     names = ("read_std_dn", "row_std_dn", "column_std_dn", "column_temporal_std_dn", "dsnu_std_dn")

@@ -45,7 +45,7 @@ def _state(folder: Path, to: Path) -> Sequence[float]:
 def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:
     """Write the profile of flats and darks, and a page about them; return its ISOs."""
     from unprocess_gen.calibration.calibrate import calibrate
-    from unprocess_gen.calibration.profile import estimates, estimates_json, measured_yaml, write_profile
+    from unprocess_gen.calibration.profile import AGAINST_ISO, estimates, estimates_json, measured_yaml, write_profile
     from unprocess_gen.pipeline.progress import with_bar
 
     if page is not None:
@@ -56,7 +56,7 @@ def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:
     _report_notes(calibration.notes)
     write_profile(to, measured_yaml(calibration, to.stem), estimates_json(estimates(calibration)))
     for result in calibration.isos:
-        gain, read, row = (result[name] for name in ("dn_per_e", "read_std_dn", "row_std_dn"))
+        gain, read, row = (result[name] for name in AGAINST_ISO)
         print_results(
             f"ISO {result.iso:g}: {short_number(gain.value, 4)} DN per electron "
             f"({short_number(gain.low, 4)} to {short_number(gain.high, 4)}), "

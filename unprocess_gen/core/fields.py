@@ -105,6 +105,7 @@ class Integers(Limit):
     def __init__(self, low: int, high: int, other: int | None = None, remark: str = "", **spelling: Any) -> None:
         allows: Test = lambda value: is_integer(value) and (low <= value <= high or value == other)  # noqa: E731
         super().__init__(f"{low} to {high}{remark}", allows, kind=int, **spelling)
+        self.low, self.high = low, high
         self.in_cells = f"a number from {low:.12g} to {high:.12g}"
 
 

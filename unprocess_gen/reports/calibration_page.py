@@ -9,7 +9,7 @@ import numpy as np
 
 from unprocess_gen.calibration.calibrate import Calibration
 from unprocess_gen.calibration.measure import IsoResult
-from unprocess_gen.calibration.profile import ENDS, estimates, site_names
+from unprocess_gen.calibration.profile import AGAINST_ISO, ENDS, estimates, site_names
 from unprocess_gen.calibration.scores import NORMAL_95
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
@@ -100,10 +100,6 @@ def _draw_histogram(axes: Axes, result: IsoResult) -> None:
         axes.semilogy(histogram.centres, np.maximum(likelihoods, 1e-9), linewidth=1, label=label)
     axes.set(title="read noise", xlabel="DN from the mean of the row", ylabel="share", ylim=(1e-8, 1))
     axes.legend()
-
-
-AGAINST_ISO = {"dn_per_e": "DN per electron", "read_std_dn": "read noise (DN)", "row_std_dn": "row noise (DN)"}
-"""Numbers that are drawn against ISO, and their labels."""
 
 
 def _against_iso(calibration: Calibration) -> bytes:
