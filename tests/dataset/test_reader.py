@@ -39,9 +39,16 @@ def test_pairs_equal_those_made_from_photographs_and_plans(
         assert np.array_equal(sample.noisy, expected.noisy)
 
 
-def test_a_sample_unpacks_as_clean_noisy_row(dataset: Path) -> None:
-    clean, noisy, row = RawPairs(dataset)[0]
+def test_a_sample_is_mapped_and_writing_to_it_touches_no_file(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    before = [path.read_bytes() for path in sorted((dataset / "shards").iterdir())]
+    clean, noisy, row = pairs[2]
+    assert isinstance(clean.base, mmap.mmap) and isinstance(noisy.base, mmap.mmap)
     assert (array_xxh3(clean), array_xxh3(noisy)) == (row["clean_xxh3"], row["noisy_xxh3"])
+    clean[:], row["source"] = 7, "mine"
+    assert (clean == 7).all()
+    assert [path.read_bytes() for path in sorted((dataset / "shards").iterdir())] == before
+    assert (array_xxh3(pairs[2].clean), pairs[2].row["source"]) != (array_xxh3(clean), "mine")
 
 
 @pytest.mark.parametrize("number", [13, -14, 10**9])
@@ -49,31 +56,6 @@ def test_a_number_out_of_range_is_an_index_error(number: int, dataset: Path) -> 
     assert RawPairs(dataset)[np.int64(-13)].row["key"] == "00000000"  # type: ignore[call-overload]
     with pytest.raises(IndexError):
         RawPairs(dataset)[number]
-
-
-# Mapped, not copied ---------------------------------------------------------------------------------------------------
-
-
-def test_arrays_are_mapped_from_the_file(dataset: Path) -> None:
-    sample = RawPairs(dataset)[3]
-    assert isinstance(sample.clean.base, mmap.mmap)
-    assert isinstance(sample.noisy.base, mmap.mmap)
-
-
-def test_writing_to_an_array_does_not_touch_the_file(dataset: Path) -> None:
-    pairs = RawPairs(dataset)
-    before = [path.read_bytes() for path in sorted((dataset / "shards").iterdir())]
-    sample = pairs[2]
-    sample.clean[:] = 7
-    assert (sample.clean == 7).all()
-    assert [path.read_bytes() for path in sorted((dataset / "shards").iterdir())] == before
-    assert array_xxh3(pairs[2].clean) == sample.row["clean_xxh3"]
-
-
-def test_writing_to_a_row_does_not_touch_the_next_one(dataset: Path) -> None:
-    pairs = RawPairs(dataset)
-    pairs[0].row["source"] = "mine"
-    assert pairs[0].row["source"] != "mine"
 
 
 @pytest.mark.linux_only("Windows deletes no file that is mapped")
@@ -118,53 +100,40 @@ def digest(pairs: RawPairs, number: int) -> str:
     return array_xxh3(pairs[number].noisy)
 
 
-def test_reader_can_be_pickled_before_and_after_use(dataset: Path) -> None:
+def test_a_reader_can_be_pickled_and_shared_between_threads(dataset: Path) -> None:
     pairs = RawPairs(dataset)
-    for _ in range(2):
+    for _ in range(2):  # before and after use
         copy = pickle.loads(pickle.dumps(pairs))
         assert [digest(copy, i) for i in range(13)] == digests(dataset)
-        assert digest(pairs, 0) == digests(dataset)[0]
-
-
-def test_several_threads_read_one_dataset(dataset: Path) -> None:
-    pairs = RawPairs(dataset)
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda i: digest(pairs, i % 13), range(52)))
-    assert found == digests(dataset) * 4
+        with ThreadPoolExecutor(4) as pool:
+            assert list(pool.map(lambda i: digest(pairs, i % 13), range(52))) == digests(dataset) * 4
 
 
 # Damage ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def copy(dataset: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(dataset, tmp_path / "ds"))
+def copy_first_shard(folder: Path) -> None:
+    shutil.copy(folder / "shards/shard-00000.tar", folder / "shards/shard-00001.tar")
 
 
-def test_a_folder_that_is_no_dataset_is_damage(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (lambda folder: (folder / "manifest.csv").unlink(), r"manifest.csv: no row at byte"),
+        (lambda folder: (folder / "shards/shard-00001.tar").unlink(), r"shard-00001.tar: not a complete shard"),
+        (copy_first_shard, r"shard-00001.tar: member 00000005.clean.npy is missing"),
+    ],
+    ids=["no manifest", "no shard", "shard of other images"],
+)
+def test_damage_is_reported_when_a_pair_is_read(
+    damage: Callable[[Path], None], sentence: str, dataset: Path, tmp_path: Path
+) -> None:
+    pairs = RawPairs(shutil.copytree(dataset, tmp_path / "ds"))
+    damage(tmp_path / "ds")
+    with pytest.raises(DamageError, match=sentence):
+        pairs[5]
     with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
         RawPairs(tmp_path)
-
-
-def test_deleted_manifest_is_damage(copy: Path) -> None:
-    pairs = RawPairs(copy)
-    (copy / "manifest.csv").unlink()
-    with pytest.raises(DamageError, match=r"manifest.csv: no row at byte"):
-        pairs[0]
-
-
-def test_a_missing_shard_is_damage(copy: Path) -> None:
-    (copy / "shards/shard-00001.tar").unlink()
-    pairs = RawPairs(copy)
-    assert pairs[0].clean.size
-    with pytest.raises(DamageError, match=r"shard-00001.tar: not a complete shard"):
-        pairs[5]
-
-
-def test_a_shard_of_other_images_is_damage(copy: Path) -> None:
-    shutil.copy(copy / "shards/shard-00000.tar", copy / "shards/shard-00001.tar")
-    with pytest.raises(DamageError, match=r"shard-00001.tar: member 00000005.clean.npy is missing"):
-        RawPairs(copy)[5]
 
 
 # Slices and sweeps ----------------------------------------------------------------------------------------------------
@@ -206,13 +175,8 @@ def test_sweep_is_read_in_the_order_of_its_table(sweep: Path) -> None:
     assert pairs.dataset == ("seed=2", "seed=2", "seed=1", "seed=1", "seed=1")
     assert pairs[3:].dataset == ("seed=1", "seed=1")
     assert digest(pickle.loads(pickle.dumps(pairs)), 4) == RawPairs(sweep / "seed=1")[2].row["noisy_xxh3"]
-
-
-def test_sample_keeps_its_dataset_when_pickled(sweep: Path) -> None:
-    sample = RawPairs(sweep)[0]
-    copy = pickle.loads(pickle.dumps(sample))
-    assert (copy.dataset, copy.row) == ("seed=2", sample.row)
-    assert len(sample) == 3
+    copy = pickle.loads(pickle.dumps(pairs[0]))
+    assert (copy.dataset, copy.row, len(copy)) == ("seed=2", pairs[0].row, 3)
 
 
 def test_sweep_whose_dataset_was_deleted_is_damage(sweep: Path, tmp_path: Path) -> None:

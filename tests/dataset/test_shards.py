@@ -80,18 +80,15 @@ def test_headers_contain_no_time_owner_or_other_mode(shard: Path) -> None:
             assert info.isreg()
 
 
-def test_arrays_of_any_layout_give_the_same_bytes(tmp_path: Path) -> None:
+def test_arrays_of_any_layout_give_the_same_bytes_and_digest(tmp_path: Path) -> None:
+    array = np.array([[1, 256], [65535, 0]], np.uint16)
+    expected = xxhash.xxh3_128_hexdigest(bytes([1, 0, 0, 1, 255, 255, 0, 0]))
+    assert array_xxh3(array) == array_xxh3(array.astype(">u2")) == array_xxh3(np.asfortranarray(array)) == expected
     one = pair(5, 7)
     other = Pair(np.asfortranarray(one.clean), one.noisy.astype(">u2"), COUNTS)
     written(tmp_path / "a.tar", one)
     written(tmp_path / "b.tar", other)
     assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
-
-
-def test_a_digest_is_xxh3_of_the_little_endian_bytes() -> None:
-    array = np.array([[1, 256], [65535, 0]], np.uint16)
-    expected = xxhash.xxh3_128_hexdigest(bytes([1, 0, 0, 1, 255, 255, 0, 0]))
-    assert array_xxh3(array) == array_xxh3(array.astype(">u2")) == array_xxh3(np.asfortranarray(array)) == expected
 
 
 # Writing --------------------------------------------------------------------------------------------------------------
@@ -135,14 +132,6 @@ def test_short_writes_are_continued(tmp_path: Path) -> None:
     assert writer.sha256 == complete.sha256 == hashlib.sha256(trickle.content).hexdigest()
 
 
-def test_write_of_zero_bytes_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="takes no more bytes") as error, ShardWriter(tmp_path / "b.tar") as writer:
-        writer._file.close()
-        writer._file = Trickle(100)  # type: ignore[assignment]
-        add(writer, "00000000", pair(5, 7), b"{}")
-    assert error.value.errno == errno.EIO
-
-
 class Slow(Trickle):
     """A file whose writes take a millisecond."""
 
@@ -168,12 +157,17 @@ def test_second_thread_writes_the_same_bytes(tmp_path: Path) -> None:
     assert writers[0].sha256 == writers[1].sha256 == hashlib.sha256(threaded.read_bytes()).hexdigest()
 
 
-def test_error_in_the_second_thread_is_raised_and_ends_it(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="takes no more bytes"), ShardWriter(tmp_path / "b.tar", threaded=True) as writer:
+@pytest.mark.parametrize("threaded", [False, True])
+def test_write_of_zero_bytes_is_an_error_that_ends_the_thread(threaded: bool, tmp_path: Path) -> None:
+    with (
+        pytest.raises(OSError, match="takes no more bytes") as error,
+        ShardWriter(tmp_path / "b.tar", threaded=threaded) as writer,
+    ):
         writer._file.close()
         writer._file = Slow(100)  # type: ignore[assignment]
         add(writer, "00000000", pair(5, 7), b"{}")
 
+    assert error.value.errno == errno.EIO
     assert not any(thread.name.startswith("shard writer") for thread in threading.enumerate())
 
 
@@ -208,9 +202,12 @@ def test_mapped_arrays_are_those_written(shard: Path) -> None:
 
 @pytest.mark.parametrize("kept", [0, 1, 511, 512, 700, 1024, 3000])
 def test_truncated_shard_is_damage(kept: int, shard: Path) -> None:
+    member = read_index(shard)["00000001.noisy.npy"]
     os.truncate(shard, kept)
     with pytest.raises(DamageError, match=r"a.tar: not a complete shard"):
         read_index(shard)
+    with pytest.raises(DamageError):
+        map_array(shard, member, uint16(8, 4))
 
 
 @pytest.mark.parametrize("at", [0, 6, 7, 20, 52, 60])
@@ -221,13 +218,6 @@ def test_member_that_is_not_the_expected_array_is_damage(at: int, shard: Path) -
     shard.write_bytes(content)
     with pytest.raises(DamageError, match=r"a.tar: the member at byte 512 is not an array"):
         map_array(shard, member, uint16(5, 7))
-
-
-def test_shard_truncated_after_its_index_was_read_is_damage(shard: Path) -> None:
-    member = read_index(shard)["00000001.noisy.npy"]
-    os.truncate(shard, 1024)
-    with pytest.raises(DamageError):
-        map_array(shard, member, uint16(8, 4))
 
 
 # WebDataset -----------------------------------------------------------------------------------------------------------
