@@ -11,7 +11,7 @@ from scene_page import SCENES, predictions_of
 from unprocess_gen.config.option_files import group_options
 from unprocess_gen.config.schema import BranchConfig, NoiseConfig
 from unprocess_gen.config.settings import settings_of
-from unprocess_gen.planning.dark_scene import physical_profiles
+from unprocess_gen.planning.advice import physical_profiles
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.simulation.effects import BY_NAME, EFFECTS, PHYSICAL_EFFECTS, profile_keys
 

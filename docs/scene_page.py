@@ -11,7 +11,7 @@ from unprocess_gen.config.interpretation import assumed_numbers, branch_of
 from unprocess_gen.config.option_files import group_options
 from unprocess_gen.config.schema import Config, NoiseConfig, SceneConfig
 from unprocess_gen.config.serialization import read_option
-from unprocess_gen.planning.dark_scene import physical_profiles
+from unprocess_gen.planning.advice import physical_profiles
 from unprocess_gen.planning.effect_selection import Prediction
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.formatting import short_number

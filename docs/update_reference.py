@@ -26,7 +26,6 @@ LAYERS = (
     ("pipeline", "calibration"),
     ("planning", "sources", "dataset"),
     ("config",),
-    ("statistics",),
     ("simulation",),
     ("core",),
 )

@@ -160,7 +160,7 @@ def steps(photo: Photograph) -> Figure:
             "gamma inverted": lambda light: unprocess.expand_gamma(light, plan.isp.gamma),
             "colour matrix inverted": lambda light: unprocess.apply_ccm(light, camera.rgb2cam),
             "gains inverted": lambda light: unprocess.invert_gains(
-                light, camera.inverse_gains, isp.highlight, isp.highlight_threshold
+                light, camera.inverse_gains, plan.isp.highlight, plan.isp.highlight_threshold
             ),
         }.items(),
         start=1,
