@@ -1,4 +1,4 @@
-"""Warn about what is rarely meant: options that a body lacks, noise that ignores the scene, levels of another sensor."""
+"""Warn about settings that are rarely meant: missing options of a body, noise that ignores the scene, other levels."""
 
 from __future__ import annotations
 
