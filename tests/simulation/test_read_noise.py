@@ -19,6 +19,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation import lookup_tables
 from unprocess_gen.simulation.lookup_tables import (
     OCTAVES,
     SEGMENTS,
@@ -158,3 +159,10 @@ def test_scatter_about_line_is_normal_in_logarithm(settings: Settings) -> None:
     assert bounds_off(normals, 0, 1, REACH) <= 1
     assert bounds_off(normals**2, 1, 2, REACH**2) <= 1
     assert 0.11 < float((normals > 0.5).mean()) < 0.5  # 0.309, five standard deviations
+
+
+@pytest.mark.parametrize("shape", [-0.3, 0.0026, 0.14])
+def test_tables_have_the_digits_of_decimal(shape: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = lookup_tables.tukey_table.__wrapped__(shape)
+    monkeypatch.setattr(lookup_tables, "ROUNDED_BITS", 0)  # fixed-point numbers decide nothing
+    np.testing.assert_array_equal(lookup_tables.tukey_table.__wrapped__(shape), table)

@@ -171,7 +171,7 @@ def _purpose(stream: int) -> np.uint64:
     return np.uint64(purpose(stream))
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=64)
 def _quantiles(distribution: str, shape: float) -> Quantiles:
     return normal_quantiles() if distribution == "gaussian" else build_quantiles(quantile_table(distribution, shape))
 
