@@ -153,7 +153,12 @@ def declared_fields(record: type[PlanRecord]) -> dict[str, Field]:
 def _parts_of_fields(record: type[PlanRecord]) -> dict[str, str]:
     """Part of a record that has each field of the records in it."""
     parts = {name: part for name, (kind, _) in fields_of(record).items() if (part := part_in(kind))}
-    return {field: name for name, part in parts.items() for field in (*part.__struct_fields__, *_parts_of_fields(part))}
+    return {
+        field: name
+        for name, part in parts.items()
+        for field in (*part.__struct_fields__, *_parts_of_fields(part))
+        if field not in parts  # ``camera`` is a part, and a field of it
+    }
 
 
 class Place(PlanRecord, frozen=True):
