@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 
 import unprocess_gen as ug
-from unprocess_gen.calibration.calibrate import calibrate, write_profile
+from unprocess_gen.calibration.calibrate import calibrate
 from unprocess_gen.calibration.captures import Capture, read_captures
+from unprocess_gen.calibration.profile import dark_variance, measured_yaml
 
 HERE = Path(__file__).parent
 SAMPLES = 2000
@@ -128,9 +129,13 @@ class Sensor:
                 lines.append(",".join((name, capture.kind, f"{capture.iso:g}", *known)))
         (places / "captures.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
         found = calibrate(places)
-        write_profile(found, self.folder / "noise" / "physical.yaml")
-        write_profile(found, self.folder / "noise" / "two_numbers.yaml", two_parameter=True)
-        sensor = found.captures.sensor
+        sensor, first = found.captures.sensor, found.isos[0]
+        (self.folder / "noise" / "physical.yaml").write_text(measured_yaml(found, "physical"), encoding="utf-8")
+        (self.folder / "noise" / "two_numbers.yaml").write_text(
+            "name: two_numbers\nunits: dn\nblack: subtracted\nnegative_variance: refuse\n"
+            f"bits: {sensor.bits}\nblack_level_dn: {sensor.black_dn:g}\nwhite_level_dn: {sensor.white_dn:g}\n"
+            f"a: {first['dn_per_e'].value!r}\nb: {dark_variance(first).value!r}\n"
+        )
         self.iso, self.black = found.isos[0].iso, round(sensor.black_dn)
         self.white, self.bits = round(sensor.white_dn), sensor.bits
         self.pattern = sensor.pattern if sensor.pattern in ("RGGB", "BGGR", "GRBG", "GBRG") else "RGGB"
