@@ -63,7 +63,7 @@ def weighted_mean(values: Any, errors: Any) -> tuple[float, float]:
 
 def combined(estimates: Sequence[Estimate]) -> Estimate:
     """The mean of independent estimates; the interval is wider if they differ by more than their errors."""
-    values, errors = (np.array([getattr(one, name) for one in estimates]) for name in ("value", "error"))
+    values, errors = (np.array([getattr(number, name) for number in estimates]) for name in ("value", "error"))
     mean, error = weighted_mean(values, errors)
     excess = float(np.square((values - mean) / np.maximum(errors, 1e-300)).sum()) / max(len(values) - 1, 1)
     return estimate(mean, error * math.sqrt(excess if excess > 4 else 1.0))
@@ -154,6 +154,6 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> list[Estimate]:
     if not is_systematic:
         return [estimate(base.gain, base.error), *base.planes]
     chosen, intervals = fits[largest, True], [fit.interval for fit in fits.values()]
-    sensor = Estimate(chosen.gain, min(one.low for one in intervals), max(one.high for one in intervals))
+    sensor = Estimate(chosen.gain, min(fit.low for fit in intervals), max(fit.high for fit in intervals))
     below, above = (abs(end - chosen.gain) for end in (sensor.low, sensor.high))  # planes share the systematic error
-    return [sensor, *(Estimate(one.value, one.low - below, one.high + above) for one in chosen.planes)]
+    return [sensor, *(Estimate(plane.value, plane.low - below, plane.high + above) for plane in chosen.planes)]

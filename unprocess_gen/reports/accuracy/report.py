@@ -138,7 +138,7 @@ def accuracy_figure(rows: Sequence[Measurement]) -> bytes:
             axes.barh(places, lengths, left=ends, color=colour, height=0.7, label=stage)
             ends += lengths
         for place, end, run in zip(places, ends, runs, strict=True):
-            cut = ", bar cut" if end == LONGEST_BAR else ""
+            cut = ", bar cut" if (run.ratio_to_exact or 0) > LONGEST_BAR else ""
             text = f"  {three_digits(run.ratio_to_exact)}{cut}; RMS {short_number(run.rms_std)} σ"
             axes.text(end, place, text, va="center", fontsize=8)
         axes.set_yticks(places, [run.tier for run in runs])
