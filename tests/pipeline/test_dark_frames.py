@@ -274,7 +274,7 @@ def test_noise_of_dark_frames_is_checked_with_their_folder(reported: Path, run_m
     (tmp_path / "darks").rename(tmp_path / "moved")
     done = run_main("verify", reported, "--noise")
     assert (done.code, done.err) == (0, "")
-    assert "dark frames that are not available; noise.dark_frames=FOLDER names their folder" in done.out
+    assert "a dark frame that is not available; noise.dark_frames=FOLDER names their folder" in done.out
     moved = f"noise.dark_frames={tmp_path / 'moved'}"
     done = run_main("verify", reported, "--noise", moved)
     assert f"noise of {count} pairs checked, 0 wrong\n" in done.out
