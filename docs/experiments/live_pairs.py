@@ -40,6 +40,11 @@ GOALS = {
 }
 """Settings, ``redraw``, and the least ratio of the time of plain NumPy to that of live pairs."""
 DECODE_GOAL = 1.2
+DRAWN_ISO = ("noise=canon_70d", "scene=night", "scene.iso=[log_uniform,200,6400]")
+REDRAWS: dict[str, tuple[tuple[str, ...], float | None]] = {
+    "two numbers": (TWO, 1.7), "physical, night": (NIGHT, 1.9), "physical, drawn ISO": (DRAWN_ISO, None)
+}  # fmt: skip
+"""Settings, and the largest ratio of the time with ``redraw="all"`` to that with ``"noise"``."""
 
 
 def median_ratio(times: Sequence[float], reference: Sequence[float]) -> float:
@@ -105,6 +110,21 @@ def measure_goals(out: Path, photos: Path, cache: Path, rounds: int) -> dict[str
             us_per_item(pairs, 0)  # compiles kernels and maps files
         calls = {side: lambda n, pairs=pairs: us_per_item(pairs, n + 1, REPEATS) for side, pairs in sides.items()}
         results[name] = summary(measure_in_turns(calls, rounds), "live", "numpy", goal)
+    return results
+
+
+def measure_redraws(out: Path, photos: Path, cache: Path, rounds: int) -> dict[str, Any]:
+    """Compare crops of which everything is drawn again with crops of new noise only."""
+    results = {}
+    for name, (settings, goal) in REDRAWS.items():
+        folder = dataset(out, photos, settings)
+        sides = {redraw: ug.LivePairs(folder, redraw=redraw, cache=cache, patch=SIDE) for redraw in ("all", "noise")}
+        for pairs in sides.values():
+            us_per_item(pairs, 0, REPEATS)
+        calls = {side: lambda n, pairs=pairs: us_per_item(pairs, n + 1, REPEATS) for side, pairs in sides.items()}
+        times = measure_in_turns(calls, rounds)
+        both = {side: round(statistics.median(values), 1) for side, values in times.items()}
+        results[name] = {**both, "ratio": round(median_ratio(times["all"], times["noise"]), 2), "goal": goal}
     return results
 
 
@@ -199,6 +219,8 @@ def tables(results: dict[str, Any]) -> str:
         for name, row in results["goals"].items()
     ]
     text = table(rows, ["128² from the cache", "live, µs", "NumPy, µs", "ratio", "goal, at least"])
+    rows = [[name, *row.values()] for name, row in results["redraws"].items()]
+    text += "\n" + table(rows, ["128² from the cache", "redraw=all, µs", "redraw=noise, µs", "ratio", "goal, at most"])
     if "decode" in results:
         row = results["decode"]
         cells = [row["live"], row["decode"], row["ratio"], row["goal"]]
@@ -222,6 +244,7 @@ def main() -> None:
     if options.photos is None:
         write_scenes(photos)
     results: dict[str, Any] = {"goals": measure_goals(options.out, photos, cache, options.rounds)}
+    results["redraws"] = measure_redraws(options.out, photos, cache, options.rounds)
     if options.only is None:
         results["decode"] = measure_decoding(options.out, photos, options.rounds)
         results["training"] = measure_training(options.out, photos, cache, max(options.rounds // 2, 2))
