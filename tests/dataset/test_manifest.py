@@ -234,6 +234,15 @@ def test_drawn_plans_survive_csv(settings: Settings, noise: str, tmp_path: Path)
     assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
 
 
+def test_a_field_of_any_part_and_a_part_are_replaced_by_their_names() -> None:
+    camera = PLAN.camera.replace(red_gain=3.0)
+    changed = PHYSICAL.replace(camera=camera, draw=9, row_std_dn=7.0, seed=5)
+    assert (changed.camera, changed.place.draw, changed.numbers.row_std_dn, changed.seed) == (camera, 9, 7.0, 5)
+    assert changed.replace(camera=PHYSICAL.camera, draw=2, row_std_dn=0.5, seed=0) == PHYSICAL
+    with pytest.raises(TypeError):
+        PLAN.replace(gain=1.0)
+
+
 def test_field_of_an_absent_column_keeps_its_default() -> None:
     row = {name: value for name, value in row_of(PHYSICAL, FRAME, KEY).items() if name not in ("draw", "dsnu_std_e")}
     assert plan_from_row(row) == PHYSICAL.replace(draw=0)
