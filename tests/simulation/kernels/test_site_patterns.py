@@ -81,7 +81,7 @@ def test_response_of_a_crop_equals_the_reference(
 
 
 def test_patterns_are_computed_once_for_all_frames_of_a_body() -> None:
-    pattern = NormalPattern(5, "prnu", 0.1, 1.0, 0.0)
+    pattern = NormalPattern(5, 2, 0.1, 1.0, 0.0)
     first = patterns_at(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values
     assert patterns_at(Patterns(electrons=pattern), (4, 70), (1, 1)).response.values is first
     other = patterns_at(Patterns(electrons=pattern._replace(body_key=2)), (4, 70), (1, 1)).response.values
