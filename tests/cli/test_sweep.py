@@ -105,13 +105,6 @@ def test_job_that_fails_while_it_runs_does_not_stop_the_others(run_main: RunMain
     assert [row["exit"] for row in sweep_rows(tmp_path / "sweep")] == ["3", "3"]
 
 
-@pytest.mark.parametrize("flags", [(), ("--cfg", "job", "--resolve"), ("-m",)], ids=" ".join)
-def test_out_that_cannot_be_resolved_is_refused(flags: tuple[str, ...], run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main(*flags, "out=${oc.env:UG_NOT_SET}/x")
-    assert (done.code, done.err.count("\n"), os.listdir(tmp_path)) == (2, 1, [])
-    assert "UG_NOT_SET" in done.err
-
-
 def test_repeated_sweep_and_its_plan_change_nothing(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     sweep = ("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
     done = run_main(*sweep)

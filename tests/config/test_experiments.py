@@ -17,7 +17,6 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.loader import downscaled
@@ -40,17 +39,6 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_experiment_runs_unmodified(recipe: str, clip: Path, run_main: RunMain, tmp_path: Path) -> None:
     assert run_main(f"+{RECIPE}={recipe}", f"source.root={clip}", "n_jobs=1", "out=ds").code == 0
     assert len(RawPairs(tmp_path / "ds")) == {"brooks2019_training": 16, "rvdd_like": 2}.get(recipe, 1)
-
-
-def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(
-    clip: Path, run_main: RunMain, tmp_path: Path
-) -> None:
-    """``config.yaml`` contains all values, whatever they came from."""
-    source = (f"source.root={clip}", "n_jobs=1")
-    assert run_main(f"+{RECIPE}=brooks2019_training", "source.patch=[random,64,2]", "out=ds", *source).code == 0
-    config, kind = read_dataset_yaml(tmp_path / "ds/config.yaml")
-    assert (config.output.dtype, config.gains.highlight, kind) == ("float32", "gray_mean", "folder")
-    assert "the same as ds" in run_main("again", "ds", "out=again", *source).out
 
 
 # Demo of the article --------------------------------------------------------------------------------------------------
