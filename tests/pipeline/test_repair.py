@@ -110,6 +110,21 @@ def test_lost_dataset_json_is_rewritten_and_reported(
     assert {name for name in old if old[name] != new[name]} == lost
 
 
+def test_manifest_needs_the_place_of_the_sources_if_none_is_recorded(
+    copy: Path, intact: Path, sources: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(sources)  # the folder of the command is no place of sources
+    for name in ("dataset.json", "manifest.csv"):
+        (copy / name).unlink()
+        if name == "dataset.json":
+            assert run_main("verify", copy, "--repair").code == 0
+    refused = run_main("verify", copy, "--repair")
+    assert refused.code == 2
+    assert "source.root is missing" in refused.err
+    assert run_main("verify", copy, "--repair", f"source.root={sources}").code == 0
+    assert (copy / "manifest.csv").read_bytes() == (intact / "manifest.csv").read_bytes()
+
+
 @pytest.mark.parametrize("lost", [True, False], ids=["missing", "damaged"])
 @pytest.mark.parametrize("other", ["config.yaml", "manifest.csv"])
 def test_damage_that_nothing_proves_is_refused_in_one_line(

@@ -65,6 +65,11 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
             yield RepairStep(f"{CONFIG}: restored from {DATASET}")
         config, kind = _read_config(folder, root)
         if facts and MANIFEST in damaged:
+            if root is None and kind != "synthetic":
+                raise ConfigError(
+                    f"source.root is missing: {folder} does not record the folder of its sources; expected that "
+                    "folder; give source.root=…"
+                )
             _restore_manifest(place, replaced(config, {"noise.dark_frames": dark_frames}), facts["manifest_sha256"])
             yield RepairStep(f"{MANIFEST}: regenerated from the settings and the sources")
             damaged = {damage.file for damage in verify(folder)}
