@@ -1,10 +1,11 @@
-"""Count the deaths of workers: a source at which four workers died, each alone, gets the row ``worker_died``.
+"""Count the deaths of workers: a source with four counted deaths gets the row ``worker_died``.
 
     .work/deaths/00012    sources of shard 12 at which workers died, as a list of indices
 
 A worker adds an entry when it begins a shard and removes it when it ends, so an entry that remains is a death, whatever
-ended the process: a signal, a lack of memory, the end of a batch job. The first entry of a shard is `UNKNOWN`, so that
-healthy shards cost two writes; later ones name the source in progress. A shard that is done has no file.
+ended the process: a signal, a lack of memory, the end of a batch job. A pool does not count a death at which several
+shards were in progress (`executors.local`). The first entry of a shard is `UNKNOWN`, so that a healthy shard costs one
+write and one deletion; later ones name the source in progress. A shard that is done has no file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from unprocess_gen.pipeline.tasks import ShardTask
 DEATHS = f"{WORK}/deaths"
 
 MAX_DEATHS = 4
-"""Deaths after which a source is not read any more in this run: as many as Dask allows a task by default."""
+"""Deaths, in all runs until the shard is done, after which its source is not read: as many as Dask allows a task."""
 
 UNKNOWN = -1
 """Entry of a death that may have been at any source of the shard."""

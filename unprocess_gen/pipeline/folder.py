@@ -4,8 +4,9 @@
     out/.work/run.json           what all processes of a run agree on (`run`), and the listing next to it
     out/.work/rows/00000.json    record of a shard that is done (`tasks`)
     out/.work/deaths/00000       deaths of workers at a shard (`deaths`)
-    out/.work/tmp/WRITER/        unfinished files of one writer, which it deletes when it ends
-    out/.work/lock               the process that coordinates a local run
+    out/.work/tmp/WRITER/        unfinished files of one writer, which it deletes when it ends; if killed, a later run
+    out/.work/*.part             small files that are being written
+    out/.work/lock               the process that runs (local or Dask; not a part), merges or repairs
     out/shards/                  complete shards
     out/manifest.csv             written once every shard has a record
     out/dataset.json             written last; then .work is deleted, unless a row is provisional
@@ -54,7 +55,7 @@ REPORT = "report.html"
 class OutFolder:
     """The place of a dataset; ``folder / name`` is the path of a file. Nothing is created before `open` or a write.
 
-    A file appears under its name complete or not at all. Errors of the system are OSError.
+    A file appears under its name complete or not at all, except deaths. Errors of the system are OSError.
     """
 
     def __init__(self, out: str | os.PathLike[str] | ObjectPath) -> None:

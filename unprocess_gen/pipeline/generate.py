@@ -2,7 +2,8 @@
 
 `generate` does this for all shards, `make_part` for those of a part, `merge` finishes a run in parts. Read on in `run`
 (what a run is, how it begins), `executors` (processes that make shards), `worker` (make one, commit it) and `tasks`
-(a shard is done when its record exists). Design: ``docs/design/pipeline.md``.
+(a shard is done when its record has no provisional row and its tar the recorded size).
+Design: ``docs/design/pipeline.md``.
 """
 
 from __future__ import annotations

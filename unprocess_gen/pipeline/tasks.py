@@ -260,7 +260,7 @@ def commit_shard(folder: OutFolder, result: ShardResult, columns: Sequence[str])
 
 
 def done_shards(folder: OutFolder, shards: range) -> set[int]:
-    """Find the shards that are done: their record has no provisional row."""
+    """Find the shards that are done: a record without a provisional row, whose tar has the recorded size."""
     records = zip(shards, read_records(folder, shards), strict=True)
     return {shard for shard, record in records if record is not None and not record.entry.get("provisional")}
 

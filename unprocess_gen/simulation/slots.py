@@ -6,7 +6,7 @@ that fits a slot touches no kernel. Light meets the slots in this order:
     light factor → electron factor → counts of light → counts of one rate → defects → limit of the well
     → gain by plane → noise of a site → offsets by row, column and plane → offsets by site → dead pixels
 
-An empty slot has its default. Fixed patterns belong to a camera body; all frames that are simulated in one pass share
+An empty slot has its default. Fixed patterns belong to a sensor unit; all frames that are simulated in one pass share
 them (`Patterns`).
 """
 
@@ -27,7 +27,7 @@ class RadialFactor(NamedTuple):
 
 
 class NormalPattern(NamedTuple):
-    """Fixed value of each pixel of a body: max(mean + std·n, least) for a normal deviate n, float32."""
+    """Fixed value of each pixel of a sensor unit: max(mean + std·n, least) for a normal deviate n, float32."""
 
     body_key: int
     stream: int
@@ -50,7 +50,7 @@ class BrightPixels(NamedTuple):
 
 
 class DeadSlot(NamedTuple):
-    """Share of the pixels of a body that read ``value_dn``, chosen by words of ``stream``."""
+    """Share of the pixels of a sensor unit that read ``value_dn``, chosen by words of ``stream``."""
 
     body_key: int
     stream: int
@@ -69,7 +69,7 @@ class Patterns(NamedTuple):
 
 
 class SlotWords(NamedTuple):
-    """Random words of a frame, or of a body: their key, stream, level, draw and frame."""
+    """Random words of a frame, or of a sensor unit: their key, stream, level, draw and frame."""
 
     key: int
     stream: int
@@ -81,7 +81,8 @@ class SlotWords(NamedTuple):
 class LineOffsets(NamedTuple):
     """Offsets of rows or of columns, DN: ``std_dn`` times normal deviates of these words.
 
-    Neighbouring rows have the correlation ``correlation`` (`reference.noise.autoregressive`).
+    Neighbouring rows have the correlation ``correlation`` (`reference.noise.autoregressive`). Of independent rows,
+    kernels use ``words.stream`` only, with the key and counters of the frame; else all words.
     """
 
     words: SlotWords

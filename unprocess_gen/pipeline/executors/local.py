@@ -4,8 +4,8 @@ When a worker dies, usually because the system is out of memory, loky stops all 
 and raises TerminatedWorkerError. The other shards continue in a new pool. Those that were in progress are made at the
 end, each with no other one: a source that kills four workers there gets the row ``worker_died`` (`deaths`).
 
-If the coordinator dies, its workers exit by themselves (`worker._exit_with_parent`). With ``n_jobs=1`` the coordinator
-does the work, so killing it ends the run; a rerun resumes.
+If the coordinator dies, its workers exit by themselves (`worker._exit_with_parent`). With ``n_jobs=1`` or one
+shard the coordinator does the work, so killing it ends the run; a rerun resumes.
 """
 
 from __future__ import annotations

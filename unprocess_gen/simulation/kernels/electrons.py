@@ -104,7 +104,7 @@ class FrameNumbers(NamedTuple):
     fewest_dark: np.float32  # smallest count by thresholds
     dark_steps: np.int64  # number of thresholds
     site_std_dn: float  # noise of a site
-    row_std_dn: float
+    row_std_dn: float  # 0 if rows are correlated: `Electrons.rows_dn` has their offsets
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
 
 
