@@ -16,7 +16,7 @@ from unprocess_gen.config.distributions import DISTRIBUTIONS, ISO_FORMS
 from unprocess_gen.config.distributions import spelled as spelled_form
 from unprocess_gen.config.interpretation import needed_numbers
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings, group_settings
+from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, ProvenanceConfig, all_settings, group_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.core.fields import value_text
@@ -132,6 +132,9 @@ def _options(group: str, options: Iterable[str], default: str) -> str:
 def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
     """Return the table of a group's keys; ``None`` stands for the branches, which have no defaults."""
     values = {} if group is None else default_values(group)
+    for nested in NESTED:
+        outer, _, inner = nested.partition(".")
+        values |= {f"{inner}.{key}": value for key, value in default_values(nested).items() if outer == group}
     head = ["key", "default", "unit", "allowed", "meaning"]
     rows = [
         [
