@@ -233,6 +233,15 @@ def test_single_picture_is_accepted_as_source_root(settings: Settings, tmp_path:
     validate_config(settings(f"source.root={tmp_path}/file"))
 
 
+@pytest.mark.parametrize(("key", "good", "bad"), [("source.patch", 2, 2.0), ("source.limit", 1, True)])
+def test_value_is_refused_after_an_equal_one_was_accepted(
+    key: str, good: object, bad: object, settings: Settings
+) -> None:
+    validate_config(replaced(settings(), {key: good}))
+    with pytest.raises(ConfigError, match=f"{key}={str(bad).lower()}"):
+        validate_config(replaced(settings(), {key: bad}))
+
+
 # config.yaml ----------------------------------------------------------------------------------------------------------
 
 

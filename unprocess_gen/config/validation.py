@@ -6,11 +6,10 @@ profiles: `noise_validation`.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 import operator
-from dataclasses import replace
+import pickle
 from pathlib import Path
 
 from unprocess_gen.config.distributions import parse_drawn
@@ -44,6 +43,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import any_path, local_path
+from unprocess_gen.core.sequences import Recent
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
@@ -71,12 +71,19 @@ def validate_config(config: Config) -> None:
 def check_values(config: Config) -> None:
     """Check the values of a configuration, composed or recorded, independent of files and installed packages."""
     SEED.check("seed", config.seed)
-    _check_values(replace(config, seed=0))
+    values = pickle.dumps([value for name, value in vars(config).items() if name != "seed"])
+    if values not in _allowed:
+        _check_values(config)
+        _allowed.keep(values, True)
 
 
-@functools.lru_cache(maxsize=64)
+_allowed: Recent[bytes, bool] = Recent(64)
+"""Configs without their seeds that were checked, because `unprocess_gen.make_pair` checks in every call. As bytes, 2,
+2.0 and true differ."""
+
+
 def _check_values(config: Config) -> None:
-    """Check all values but the seed, once for each config: `unprocess_gen.make_pair` checks it in every call."""
+    """Check all values but the seed."""
     _check_settings(config)
     _check_source(config.source)
     check_raw_source(config)
