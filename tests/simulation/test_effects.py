@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,11 +27,15 @@ from helpers.flats import (
 )
 from helpers.moments import REACH, bernstein
 
-from unprocess_gen.simulation.effects import EFFECTS, order
+from unprocess_gen.simulation.effects import EFFECTS, PHYSICAL_EFFECTS, order
+from unprocess_gen.simulation.effects.dsnu import Dsnu
 from unprocess_gen.simulation.effects.effect import Effect
+from unprocess_gen.simulation.effects.prnu import Prnu
 from unprocess_gen.simulation.lookup_tables import exponential_levels
-from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.pair import crop_maker, make_pair
 from unprocess_gen.simulation.plan import DarkFramePlan
+from unprocess_gen.simulation.plan_slots import slots_of
+from unprocess_gen.simulation.self_test import GOLDEN_PHYSICS, GOLDEN_PLAN, golden_image
 from unprocess_gen.simulation.slots import Patterns, Slots
 
 # Slots ----------------------------------------------------------------------------------------------------------------
@@ -45,6 +50,34 @@ def test_every_physical_effect_fills_a_slot_of_the_kernels(effect: Effect) -> No
     filled = effect.slots(plan_with(effect.name).replace(dark=DarkFramePlan("0" * 64, (0, 0), 0.0, 1.0)))
     assert filled.keys() <= {*Slots._fields, *Patterns._fields}
     assert bool(filled) != (effect.name in IN_EVERY_PAIR)
+
+
+def test_two_effects_in_one_slot_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Dsnu, "slots", Prnu.slots)
+    with pytest.raises(AssertionError, match="the effects prnu and dsnu both fill the slot electrons"):
+        slots_of(plan_with("prnu", "dsnu", prnu_std=0.125))
+
+
+ALONE = [(name,) for name in PHYSICAL_EFFECTS]
+EVERY = GOLDEN_PHYSICS.replace(
+    column_temporal_std_dn=1.5, dsnu_std_e=0.5, gain_by_colour=(0.9, 1.0, 1.1),
+    lens_shading=(-0.3, 0.0, 0.0), frame_size=(19, 83),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("changes", [{"row_correlation": 0.5}, {"fixed_pattern_in_clean": True}], ids=str)
+@pytest.mark.parametrize("effects", [*ALONE, PHYSICAL_EFFECTS], ids=lambda on: on[0] if len(on) == 1 else "all")
+def test_crops_in_each_epoch_are_those_of_the_pair(effects: tuple[str, ...], changes: dict[str, Any]) -> None:
+    """Crops keep slots between epochs if these have no words of the frame."""
+    physics, srgb = EVERY.replace(**changes), golden_image()
+    plan = GOLDEN_PLAN.replace(physics=physics, effects=effects, exposure_ratio=1.5, frame=3)
+    make = crop_maker(plan, (8, 64), srgb.shape[:2], (6, 10), 256)
+    for epoch in (0, 1, 2):
+        pair = make_pair(srgb, plan.replace(epoch=epoch))
+        clean, noisy, _ = make(np.ascontiguousarray(srgb[6:14, 10:74]), (6, 10), epoch)
+        np.testing.assert_array_equal(clean, pair.clean[6:14, 10:74])
+        np.testing.assert_array_equal(noisy, pair.noisy[6:14, 10:74])
+    assert slots_of(plan).depends_on_epoch == (slots_of(plan) != slots_of(plan.replace(epoch=1)))
 
 
 # Shot noise -----------------------------------------------------------------------------------------------------------

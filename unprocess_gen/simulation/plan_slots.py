@@ -18,9 +18,11 @@ def slots_of(plan: Plan) -> Slots:
     black_dn, physics = float(plan.sensor.black_level_dn), plan.physics
     if physics is None:
         return _two_numbers(plan, black_dn)
-    filled: dict[str, Any] = {}
+    filled, names = dict[str, Any](), dict[str, str]()
     for effect in effects_of(plan):
-        filled |= effect.slots(plan)
+        for slot, value in effect.slots(plan).items():
+            assert slot not in filled, f"the effects {names[slot]} and {effect.name} both fill the slot {slot}"
+            filled[slot], names[slot] = value, effect.name
     patterns = Patterns(**{name: filled.pop(name) for name in Patterns._fields if name in filled})
     return Slots(black_dn, physics.dn_per_e, patterns, **filled)
 

@@ -68,26 +68,41 @@ class Patterns(NamedTuple):
     dead: DeadSlot | None = None
 
 
-class SlotWords(NamedTuple):
-    """Random words of a frame, or of a sensor unit: their key, stream, level, draw and frame."""
+class UnitWords(NamedTuple):
+    """Random words of a sensor unit: their key and stream."""
 
     key: int
     stream: int
-    level: int = 0
-    draw: int = 0
-    frame: int = 0
 
 
-class LineOffsets(NamedTuple):
-    """Offsets of rows or of columns, DN: ``std_dn`` times normal deviates of these words.
+class FrameWords(NamedTuple):
+    """Random words of a frame in one epoch: their key, stream, level, draw and frame."""
 
-    Neighbouring rows have the correlation ``correlation`` (`reference.noise.autoregressive`). Of independent rows,
-    kernels use ``words.stream`` only, with the key and counters of the frame; else all words.
+    key: int
+    stream: int
+    level: int
+    draw: int
+    frame: int
+
+
+class ColumnOffsets(NamedTuple):
+    """Offsets of columns, DN: ``std_dn`` times normal deviates of these words."""
+
+    words: UnitWords | FrameWords
+    std_dn: float
+
+
+class RowOffsets(NamedTuple):
+    """Offsets of rows, DN: ``std_dn`` times normal deviates.
+
+    Neighbouring rows have the correlation ``correlation`` (`reference.noise.autoregressive`), and deviates of
+    ``words``. For independent rows, kernels use ``stream`` with the key and counters of the frame.
     """
 
-    words: SlotWords
+    stream: int
     std_dn: float
     correlation: float = 0.0
+    words: FrameWords | None = None
 
 
 class UniformCounts(NamedTuple):
@@ -118,8 +133,13 @@ class Slots(NamedTuple):
     full_well_e: float = math.inf  # of a plane whose relative gain is 1
     plane_gains: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  # relative to dn_per_e
     noise: SiteNoise | None = None
-    rows: LineOffsets | None = None
-    fixed_columns: LineOffsets | None = None
-    columns: LineOffsets | None = None
+    rows: RowOffsets | None = None
+    fixed_columns: ColumnOffsets | None = None
+    columns: ColumnOffsets | None = None
     planes_dn: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     has_site_offsets: bool = False  # of its own (`dark_frame.dark_frame_offsets`)
+
+    @property
+    def depends_on_epoch(self) -> bool:
+        """True if a slot has words of the frame, so that each epoch has other slots."""
+        return any(type(member) is FrameWords for slot in self if isinstance(slot, tuple) for member in slot)

@@ -10,7 +10,7 @@ from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.slots import LineOffsets, SlotWords
+from unprocess_gen.simulation.slots import ColumnOffsets, UnitWords
 
 
 class ColumnNoise(Effect):
@@ -34,4 +34,4 @@ class ColumnNoise(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the body."""
         physics = plan.numbers
-        return {"fixed_columns": LineOffsets(SlotWords(physics.body_key, self.stream), physics.column_std_dn)}
+        return {"fixed_columns": ColumnOffsets(UnitWords(physics.body_key, self.stream), physics.column_std_dn)}

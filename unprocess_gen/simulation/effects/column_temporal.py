@@ -10,7 +10,7 @@ from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, sl
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.slots import LineOffsets
+from unprocess_gen.simulation.slots import ColumnOffsets
 
 
 class ColumnTemporal(Effect):
@@ -34,4 +34,4 @@ class ColumnTemporal(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of columns of the frame."""
         std_dn = plan.numbers.column_temporal_std_dn
-        return {"columns": LineOffsets(slot_words(plan, self.stream), std_dn)}
+        return {"columns": ColumnOffsets(slot_words(plan, self.stream), std_dn)}

@@ -15,7 +15,7 @@ from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.numbers import Number
 from unprocess_gen.simulation.plan import NUMBERS, Physics, Plan
-from unprocess_gen.simulation.slots import SlotWords
+from unprocess_gen.simulation.slots import FrameWords
 
 Shape = tuple[int, int]
 SlotValues = dict[str, Any]
@@ -70,9 +70,9 @@ class Crop:
         return np.asarray(tile[y[:, None], x[None, :]])
 
 
-def slot_words(plan: Plan, stream: int) -> SlotWords:
+def slot_words(plan: Plan, stream: int) -> FrameWords:
     """Return the random words of a plan's frame, level and draw for a slot."""
-    return SlotWords(plan.stream_key, stream, plan.place.level, plan.place.draw, plan.place.frame_word)
+    return FrameWords(plan.stream_key, stream, plan.place.level, plan.place.draw, plan.place.frame_word)
 
 
 class Effect:

@@ -10,7 +10,7 @@ from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, sl
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
-from unprocess_gen.simulation.slots import LineOffsets
+from unprocess_gen.simulation.slots import RowOffsets
 
 
 class RowNoise(Effect):
@@ -48,4 +48,5 @@ class RowNoise(Effect):
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the offsets of rows."""
         physics = plan.numbers
-        return {"rows": LineOffsets(slot_words(plan, self.stream), physics.row_std_dn, physics.row_correlation)}
+        words = slot_words(plan, self.stream) if physics.row_correlation else None
+        return {"rows": RowOffsets(self.stream, physics.row_std_dn, physics.row_correlation, words)}

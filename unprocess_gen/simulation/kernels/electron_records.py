@@ -26,7 +26,15 @@ from unprocess_gen.simulation.kernels.strips import SiteMap, padded_width
 from unprocess_gen.simulation.lookup_tables import quantile_table
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
-from unprocess_gen.simulation.slots import LineOffsets, SiteNoise, Slots, SlotWords, UniformCounts
+from unprocess_gen.simulation.slots import (
+    ColumnOffsets,
+    FrameWords,
+    RowOffsets,
+    SiteNoise,
+    Slots,
+    UniformCounts,
+    UnitWords,
+)
 
 FARTHEST_NORMAL = 6.4
 """Bound of the absolute value of a normal deviate of 32 bits."""
@@ -129,7 +137,7 @@ def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
     quantiles = _quantiles(noise.distribution, noise.shape)
     has_thresholds = uniform.rate_e <= MAX_THRESHOLD_RATE
     fewest, ranks = count_thresholds(uniform.rate_e) if has_thresholds else (0, np.zeros(0, dtype=np.uint32))
-    rows, bright = slots.rows or LineOffsets(SlotWords(0, 0), 0.0), slots.patterns.bright
+    rows, bright = slots.rows or RowOffsets(0, 0.0), slots.patterns.bright
     offset_dn = FARTHEST_NORMAL * rows.std_dn
     offset_dn += slots.black_dn + float(np.abs(planes_dn).max())
     most_dark_e = uniform.rate_e + 8 * math.sqrt(uniform.rate_e) + 40 if uniform.rate_e else 0.0
@@ -142,7 +150,7 @@ def _members(slots: Slots, top: int) -> dict[str, NDArray[Any]]:
         dark_stream=_purpose(uniform.stream),
         defect_stream=_purpose(bright.stream if bright else 0),
         site_stream=_purpose(noise.stream),
-        row_stream=_purpose(rows.words.stream),
+        row_stream=_purpose(rows.stream),
         dark_e=uniform.rate_e,
         removed_e=uniform.removed_e,
         fewest_dark=np.float32(fewest),
@@ -183,7 +191,7 @@ def _correlated_rows(frames: Sequence[Slots], top: int, height: int) -> Float:
     """Return the offsets of correlated rows, [N, H] DN; 0 in frames without them."""
     rows_dn = np.zeros((len(frames), height))
     for frame_dn, slots in zip(rows_dn, frames, strict=True):
-        if slots.rows and slots.rows.correlation:
+        if slots.rows and slots.rows.words:
             independent = _normals(slots.rows.words, top + height, 1)
             frame_dn[:] = slots.rows.std_dn * autoregressive(independent, slots.rows.correlation)[top:]
     return rows_dn
@@ -193,18 +201,18 @@ _COLUMNS = 1024
 """Columns whose normals are computed at once: for a crop alone they would take longer than its pixels."""
 
 
-def _fixed_columns(offsets: LineOffsets | None, columns: int) -> Float:
+def _fixed_columns(offsets: ColumnOffsets | None, columns: int) -> Float:
     """Return the offsets of the first columns of a sensor unit."""
     return np.zeros(columns) if offsets is None else np.asarray(offsets.std_dn * _first_normals(offsets.words, columns))
 
 
 @functools.lru_cache(maxsize=512)
-def _first_normals(stream: SlotWords, columns: int) -> Float:
+def _first_normals(stream: UnitWords | FrameWords, columns: int) -> Float:
     """Return the normals of the first columns of a sensor unit."""
     return _normals(stream, 1, columns)
 
 
-def _normals(stream: SlotWords, rows: int, columns: int) -> Float:
+def _normals(stream: UnitWords | FrameWords, rows: int, columns: int) -> Float:
     """Return the normals of the first columns of one row, or of the first column of some rows."""
     numbers = stream._asdict()
     key, name = numbers.pop("key"), numbers.pop("stream")

@@ -185,8 +185,8 @@ def _records(
     if form.noise is not None:
         return inverse, form.noise
     frames = form.frames
-    if epoch and any(slots.columns or (slots.rows and slots.rows.correlation) for slots in frames):
-        frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in plans)  # offsets of lines have words of an epoch
+    if epoch and any(slots.depends_on_epoch for slots in frames):
+        frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in plans)
     patterns = patterns_at(frames[0].patterns, shape, origin, frame)
     factor = light_factor(frames[0].patterns, patterns, shape, origin, first.averaged)
     if factor is not None:
