@@ -118,12 +118,11 @@ def test_run_that_dask_began_is_finished_locally(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def interrupted(reports: Iterator[object], *_: object) -> None:
-        next(iter(reports))
+    def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "_follow", interrupted)
+        patch.setattr(runner, "_count", interrupted)
         done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
     assert (done.code, len(committed(tmp_path / "ds")) > 0) == (130, True)
     assert run_main(ROOT, ONE, "n_jobs=1", "out=ds").code == 0

@@ -117,7 +117,7 @@ def again(call: Call) -> int:
     """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
     from unprocess_gen.config.composition import load_config
     from unprocess_gen.core.paths import any_path
-    from unprocess_gen.pipeline.again import check_sources, compare, recorded_config
+    from unprocess_gen.pipeline.again import compare, recorded_config
     from unprocess_gen.pipeline.generate import generate
 
     folder = dataset_folder(call)
@@ -130,7 +130,6 @@ def again(call: Call) -> int:
     changes = {key: attrgetter(key)(given) for key in {"executor", *call.settings} - places}
     changes["noise.dark_frames"] = dark_frames_of(folder / "manifest.csv", call)
     config = recorded_config(folder, given_root(call), changes)
-    check_sources(folder, config)
     code, lines = outcome(config, generate(config))
     print_results(*lines)
     print_results(compare(folder, any_path(config.out)))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -242,27 +242,25 @@ def _make(folder: OutFolder, run: Run, part: tuple[int, int] | None, label: str)
     with machine_errors(folder.path, RESUME), Progress(total, total - images, label) as progress:
         for warning in run.warnings():
             progress.warn(warning)
-        if todo:
-            _follow(make_shards(folder, run.settings, todo, progress, made), progress, made)
+        for report in make_shards(folder, run.settings, todo, progress, made) if todo else ():
+            _count(report, made, progress)
     return known, made
 
 
-def _follow(reports: Iterable[ShardReport], progress: Progress, made: Made) -> None:
-    """Show the progress and warnings of committed shards, whose reports come in any order."""
-    shown, self_test = 0, ""
-    for report in reports:
-        for killer in report.killers:
-            progress.warn(f"{killer}: its worker died four times; run the same command again to retry it")
-        if report.self_test and not self_test:
-            self_test = report.self_test
-            progress.warn(f"the self-test failed: {self_test}; continuing because of self_test=go_on")
-        for text in report.warnings[: FAILURES_SHOWN - shown]:
-            progress.warn(text)
-        shown = min(FAILURES_SHOWN, shown + len(report.warnings))
-        made.rows += report.rows
-        made.shards += 1
-        made.times.add(report.times)
-        progress.advance(report.images, report.failed)
+def _count(report: ShardReport, made: Made, progress: Progress) -> None:
+    """Add a committed shard to what was made; show its progress, and its warnings unless enough were shown."""
+    for killer in report.killers:
+        progress.warn(f"{killer}: its worker died four times; run the same command again to retry it")
+    if report.self_test and not made.self_test:
+        progress.warn(f"the self-test failed: {report.self_test}; continuing because of self_test=go_on")
+    for text in report.warnings[: FAILURES_SHOWN - made.failures_shown]:
+        progress.warn(text)
+    made.self_test = made.self_test or report.self_test
+    made.failures_shown = min(FAILURES_SHOWN, made.failures_shown + len(report.warnings))
+    made.rows += report.rows
+    made.shards += 1
+    made.times.add(report.times)
+    progress.advance(report.images, report.failed)
 
 
 def _finish(
@@ -282,19 +280,21 @@ def _finish(
                 stream.write(text)
 
             add(header_text(columns).encode())
-            for shard, record in enumerate(read_records(folder, range(run.shards))):
-                if record is None:
+            for shard, read in enumerate(read_records(folder, range(run.shards))):
+                if read is None:
                     missing.append(shard)
                     continue
+                record, csv = read
                 entries.append(record.entry)
                 tally.add(record.tally)
-                add(record.csv)
+                add(csv)
         if missing:
             raise _missing_error(folder, run, missing)
         (folder / "manifest.csv").commit(manifest)
         decoders = decoder_versions() if run.source.kind == "raw" else {}
         versions = {package: version(package) for package in PACKAGES} | decoders
-        facts = tally.facts() | sources | {"run": process | _machine(), "versions": versions}
+        machine = {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
+        facts = tally.facts() | sources | {"run": process | machine, "versions": versions}
         dataset = dataset_facts(run.config, digest.hexdigest(), entries, facts)
         folder.write("dataset.json", dataset_text(dataset).encode())
         if not any(entry.get("provisional") for entry in entries):
@@ -322,8 +322,3 @@ def _ranges(numbers: Sequence[int]) -> str:
             runs.append([number, number])
     texts = [str(first) if first == last else f"{first}-{last}" for first, last in runs[:RANGES_SHOWN]]
     return ",".join(texts) + ", …" * (len(runs) > RANGES_SHOWN)
-
-
-def _machine() -> dict[str, Any]:
-    """Names of host, platform and Python version, for ``dataset.json`` only."""
-    return {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}

@@ -148,8 +148,8 @@ class LivePairs:
         if patches < 1 or (patches > 1 and patch is None):
             expected = "1 or more, and patch with more than 1"
             raise ConfigError(f"LivePairs: patches={patches}: out of range; expected {expected}")
-        pixels = None if cache is None else PixelCache(cache, cache_bytes)
-        self._sources = _live_sources(dataset, None if root is None else os.fspath(root), pixels, split)
+        self._cache = None if cache is None else PixelCache(cache, cache_bytes)
+        self._sources = _live_sources(dataset, None if root is None else os.fspath(root), split)
         self._ends = [*itertools.accumulate(map(len, self._sources))]
         self._redraw, self._patch, self._patches, self._as_float = redraw, patch, patches, as_float
         self._targets, self._arrays_only = tuple(targets), arrays_only
@@ -173,20 +173,24 @@ class LivePairs:
         source = self._sources[place]
         image = source.image(number - (self._ends[place - 1] if place else 0))
         epoch = epoch if self._redraw != "none" else 0
-        srgb = source.pixels(image)
+        decode = partial(source.decode, image)
+        srgb = decode() if self._cache is None else self._cache.get(image.cache_name, decode)
         plan, patch, make = self._prepared(place, image, srgb, epoch, number)
         if self._patch is not None:
             patch = _crop(plan, epoch, patch, self._patch, crop)
         clean, noisy, counts = make(crop_patch(srgb, patch), patch.origin, epoch)
         targets, frames = {}, (clean, noisy)
+
+        def pair() -> Pair:
+            return Pair(clean, noisy, counts())
+
         if self._targets:
-            pair = Pair(clean, noisy, counts())
-            targets = targets_of(self._targets, srgb, plan, patch, pair, as_float=self._as_float)
+            targets = targets_of(self._targets, srgb, plan, patch, pair(), as_float=self._as_float)
         if self._as_float:
             frames = self._frame(clean, plan), self._frame(noisy, plan)
         if self._arrays_only:
             return (*frames, *targets.values())
-        row: Any = LiveRow(partial(_build_row, source, image, plan, epoch, patch, clean, noisy, counts))
+        row: Any = LiveRow(partial(image.row, plan, epoch, patch, pair))
         return LiveSample(*frames, row, source.name, targets)
 
     def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
@@ -216,7 +220,7 @@ class LivePairs:
         prepared = kept.get(key)
         if prepared is None:
             plan = self._redrawn(settings, image, srgb, plan_epoch, number) if plan_epoch else image.plan
-            for kernels in kernels_for(self._targets, plan):
+            for kernels in kernels_for(self._targets, [plan]):
                 self_test.check(kernels)
             make = crop_maker(plan, shape, frame, patch.origin, 256**srgb.itemsize, settings.dark_folder)
             prepared = kept.keep(key, (plan, make))
@@ -269,13 +273,6 @@ class LiveRow(Mapping[str, Value]):
         return dict, (self._row,)
 
 
-def _build_row(
-    source: LiveSource, image: LiveImage, plan: Plan, epoch: int, patch: Patch, clean: Frame, noisy: Frame, counts: Any
-) -> dict[str, Value]:
-    """Build the row of a pair in an epoch."""
-    return source.row(image, plan.replace(epoch=epoch), patch, Pair(clean, noisy, counts()))
-
-
 def _without_none(row: Mapping[str, Value]) -> dict[str, Value]:
     """Give the columns of a row one type in every pair: NaN instead of None, text where some pairs have text."""
     texts = {column.name for column in COLUMNS if column.type is number_or_text}
@@ -283,12 +280,12 @@ def _without_none(row: Mapping[str, Value]) -> dict[str, Value]:
     return {name: str(value) if name in texts else value for name, value in cells.items()}
 
 
-def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, split: str | None) -> list[LiveSource]:
+def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[LiveSource]:
     """Open datasets, or list the sources of a config or of overrides."""
     places = [dataset] if isinstance(dataset, DatasetPath) else [] if isinstance(dataset, Config) else list(dataset)
     if isinstance(dataset, DatasetPath) or any(_is_dataset(place) for place in places):
         folders = [folder for place in places for folder in dataset_folders(any_path(place))]
-        recorded = [RecordedPairs(folder, root, cache, split) for folder in folders]
+        recorded = [RecordedPairs(folder, root, split) for folder in folders]
         if not isinstance(dataset, DatasetPath):
             name_apart(recorded)
         if split is not None:
@@ -303,7 +300,7 @@ def _live_sources(dataset: Any, root: str | None, cache: PixelCache | None, spli
         from unprocess_gen.config.composition import load_config
 
         dataset = load_config(dataset)
-    return [PlannedPairs(dataset, root, cache)]
+    return [PlannedPairs(dataset, root)]
 
 
 def _is_dataset(place: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -31,7 +31,6 @@ from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.pixel_cache import PixelCache
 
 KEPT = 4096
 """Plans that a process keeps, 8 kB each: reading or drawing one again takes longer than a patch of 128 x 128."""
@@ -41,7 +40,7 @@ KEPT = 4096
 class LiveImage:
     """All that decides a pair in epoch 0, as `dataset.row.pair_row` takes it.
 
-    ``offset`` is the place of the pair's row in the manifest of a dataset, if the row has digests.
+    ``recorded`` reads the row of the pair from the manifest of a dataset, if the row has digests.
     """
 
     source: Source
@@ -52,14 +51,26 @@ class LiveImage:
     plan: Plan
     patch: Patch
     source_noise_dn: float | None = None
-    offset: int | None = None
+    recorded: Callable[[], dict[str, Value]] | None = None
 
-    def row(self, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
-        """Build the row of a pair of this image."""
-        digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
-        identity = self.source, self.sha256, self.orientation, self.shard
-        row = pair_row(self.key, *identity, plan, pair, digests, patch, self.source_noise_dn)
-        return {**row, "epoch": plan.place.epoch} if plan.place.epoch else dict(row)
+    @property
+    def cache_name(self) -> str:
+        """Name of the decoded image in a `PixelCache`."""
+        prepared = self.plan.source
+        if not prepared.is_raw:
+            return f"{self.sha256}-{prepared.downscale}"
+        means = prepared.raw_pattern, *prepared.raw_black_dn, *prepared.raw_white_dn
+        return "-".join(map(str, (prepared.mosaic_xxh3, prepared.shrink, *(means if prepared.shrink > 1 else ()))))
+
+    def row(self, plan: Plan, epoch: int, patch: Patch, pair: Callable[[], Pair]) -> dict[str, Value]:
+        """Build the row of a pair in an epoch, or read the recorded one."""
+        if self.recorded is not None and not epoch and patch == self.patch:
+            return self.recorded()
+        made = pair()
+        digests = array_xxh3(made.clean), array_xxh3(made.noisy)
+        identity = self.key, self.source, self.sha256, self.orientation, self.shard
+        row = pair_row(*identity, plan.replace(epoch=epoch), made, digests, patch, self.source_noise_dn)
+        return {**row, "epoch": epoch} if epoch else dict(row)
 
 
 class LiveSource(abc.ABC):
@@ -67,9 +78,6 @@ class LiveSource(abc.ABC):
 
     name = ""
     settings: PairSettings
-
-    def __init__(self, cache: PixelCache | None) -> None:
-        self._cache = cache
 
     @abc.abstractmethod
     def __len__(self) -> int: ...
@@ -79,24 +87,14 @@ class LiveSource(abc.ABC):
         """Find all that decides a pair."""
 
     @abc.abstractmethod
-    def _decode(self, image: LiveImage) -> Srgb:
+    def decode(self, image: LiveImage) -> Srgb:
         """Decode the image of a pair."""
-
-    def pixels(self, image: LiveImage) -> Srgb:
-        """Take the decoded image of a pair from the cache, or decode it."""
-        decode = partial(self._decode, image)
-        return decode() if self._cache is None else self._cache.get(_cache_name(image), decode)
-
-    def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
-        """Build the row of a pair."""
-        return image.row(plan, patch, pair)
 
 
 class RecordedPairs(LiveSource):
     """Pairs of a dataset, or of those in a split; reads its manifest and its sources, and no shard."""
 
-    def __init__(self, folder: AnyPath, root: str | None, cache: PixelCache | None, split: str | None = None) -> None:
-        super().__init__(cache)
+    def __init__(self, folder: AnyPath, root: str | None, split: str | None = None) -> None:
         self.path, self.name = folder, folder_name(folder)
         self._manifest = folder / "manifest.csv"
         check_format(folder)
@@ -131,26 +129,20 @@ class RecordedPairs(LiveSource):
             numbers, noise_dn = (int(row["orientation"] or 1), int(row["shard"] or 0)), row["source_noise_dn"]
             identity = source_of(row), str(row["source_sha256"]), *numbers, str(row["key"])
             assert not isinstance(noise_dn, str)
-            parts = plan_from_row(row), patch_from_row(row), noise_dn, offset if row["clean_xxh3"] else None
-            image = self._kept.keep(number, LiveImage(*identity, *parts))
+            parts = plan_from_row(row), patch_from_row(row), noise_dn
+            recorded = partial(self._read, offset) if row["clean_xxh3"] else None
+            image = self._kept.keep(number, LiveImage(*identity, *parts, recorded))
         return image
 
-    def _decode(self, image: LiveImage) -> Srgb:
+    def decode(self, image: LiveImage) -> Srgb:
         """Decode the image of a pair; raise as `PairRegenerator.photograph`."""
         return self._sources.photograph(image.source, image.sha256, image.plan.source).srgb
-
-    def row(self, image: LiveImage, plan: Plan, patch: Patch, pair: Pair) -> dict[str, Value]:
-        """Build the row of a pair, or read the recorded one in epoch 0."""
-        if image.offset is None or plan.place.epoch or patch != image.patch:
-            return image.row(plan, patch, pair)
-        return self._read(image.offset)
 
 
 class PlannedPairs(LiveSource):
     """Pairs of listed photographs, planned when they are read, as a run would make them."""
 
-    def __init__(self, config: Config, root: str | None, cache: PixelCache | None) -> None:
-        super().__init__(cache)
+    def __init__(self, config: Config, root: str | None) -> None:
         config = config if root is None else replaced(config, {"source.root": root})
         validate_config(config)
         rule = patch_rule(config.source)
@@ -186,7 +178,7 @@ class PlannedPairs(LiveSource):
         shard = source.index // self.settings.config.output.pairs_per_shard
         return LiveImage(source, sha256, orientation, shard, key, plan, patch)
 
-    def _decode(self, image: LiveImage) -> Srgb:
+    def decode(self, image: LiveImage) -> Srgb:
         """Decode the image of a pair; raise as `load_source`."""
         return self._load(image.source)[1].srgb
 
@@ -196,11 +188,3 @@ class PlannedPairs(LiveSource):
         if decoded is None or decoded[0] != source:
             decoded = self._decoded = source, *load_source(config.source, source, config.output.layout)
         return decoded[1:]
-
-
-def _cache_name(image: LiveImage) -> str:
-    prepared = image.plan.source
-    if prepared.is_raw:
-        means = prepared.raw_pattern, *prepared.raw_black_dn, *prepared.raw_white_dn
-        return "-".join(map(str, (prepared.mosaic_xxh3, prepared.shrink, *(means if prepared.shrink > 1 else ()))))
-    return f"{image.sha256}-{prepared.downscale}"

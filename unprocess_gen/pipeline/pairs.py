@@ -108,14 +108,12 @@ def levels_of(plan: Plan) -> dict[str, Value]:
     return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
 
 
-def kernels_for(names: Sequence[str], plan: Plan) -> list[str]:
-    """Sets of kernels that simulate a plan and its targets (`self_test.kernels`)."""
-    own = self_test.kernels(plan)
-    if LINEAR_RGB not in names:
-        return [own]
-    rounded = plan.replace(accuracy=EXACT)
-    plans = rounded, rounded.replace(clean_dtype=FLOAT32)
-    return list(dict.fromkeys([own, *map(self_test.kernels, plans)]))
+def kernels_for(names: Sequence[str], plans: Sequence[Plan]) -> list[str]:
+    """Sets of kernels that simulate plans and their targets, each once (`self_test.kernels`)."""
+    if LINEAR_RGB in names:
+        exact = [plan.replace(accuracy=EXACT) for plan in plans]
+        plans = [*plans, *exact, *(plan.replace(clean_dtype=FLOAT32) for plan in exact)]
+    return list(dict.fromkeys(map(self_test.kernels, plans)))
 
 
 def _noise(name: str, frame: Frame, plan: Plan, as_float: bool) -> NDArray[np.float32]:

@@ -108,21 +108,22 @@ def _restore_manifest(place: OutFolder, config: Config, sha256: str) -> None:
     """Regenerate every row, and write them as the manifest if they have its digest."""
     run, part = resolve(config), place.scratch / MANIFEST
     context = RunContext(run.settings, str(place.scratch), os.getpid())
+
+    def rows() -> Iterator[Row]:
+        for shard in range(run.shards):
+            made = make_shard(context, run.task(shard))
+            if made.path is not None:
+                Path(made.path).unlink()
+            yield from made.rows
+
     with part.open("w", encoding="utf-8", newline="") as stream:
-        made = (make_shard(context, run.task(shard)) for shard in range(run.shards))
-        write_rows(stream, (row for result in made for row in _without_file(result).rows), columns_of(run.config))
+        write_rows(stream, rows(), columns_of(run.config))
     if file_sha256(part) != sha256:
         raise SourceChangedError(
             f"{place}/{MANIFEST}: the regenerated one has another SHA-256: a source was changed, added or "
             f"deleted; {ADVICE}"
         )
     (place / MANIFEST).commit(part)
-
-
-def _without_file(made: ShardResult) -> ShardResult:
-    if made.path is not None:
-        Path(made.path).unlink()
-    return made
 
 
 def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regenerator: PairRegenerator) -> RepairStep:

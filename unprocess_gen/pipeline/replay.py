@@ -17,9 +17,8 @@ import numpy as np
 from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_errors
-from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.output_paths import check_output_folder
-from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
@@ -28,7 +27,7 @@ from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
-from unprocess_gen.dataset.manifest import read_row, read_rows, rows_with_offsets
+from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
 from unprocess_gen.dataset.row import has_frames, patch_from_row, plan_from_row
 from unprocess_gen.dataset.shards import arrays_of
 from unprocess_gen.pipeline.pairs import PlannedImage, Targets, kernels_for, targets_of
@@ -38,7 +37,6 @@ from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
-from unprocess_gen.sources.reading import source_file
 
 NO_LIMIT = 2**40
 """Pixels that a replay accepts; ``source.max_pixels`` applied when the row was made."""
@@ -101,47 +99,6 @@ def dark_frames_root(manifest: AnyPath, given: str | None = None) -> str | None:
     return given or (_recorded_places(manifest).dark_frames or DarkFrameFacts()).root
 
 
-def check_source_sizes(manifest: AnyPath, root: str) -> None:
-    """Compare the sizes of the source files with those that a manifest records; opens no source.
-
-    Raises SourceChangedError if a file is missing or has another size; names the first one; DamageError if the manifest
-    cannot be read.
-    """
-    last = ""
-    place = any_path(root)
-    # one listing instead of a request for each object
-    sizes = {entry.path: entry.size for entry in place.walk_entries()} if isinstance(place, ObjectPath) else None
-    for row in read_rows(manifest):
-        name, recorded = str(row["source"]), row["source_bytes"]
-        if name == last or not recorded:  # synthetic pictures and unreadable files have no size
-            continue
-        last = name
-        path = decode_name(name)
-        try:
-            size = sizes[path] if sizes else source_file(root, path).stat().st_size
-        except (OSError, ValueError, KeyError, SourceError):
-            raise SourceChangedError(f"source {name}: is missing from {root}; {ADVICE}") from None
-        if size != recorded:
-            raise SourceChangedError(
-                f"source {name}: has {size} bytes in {root}; expected {recorded}, as recorded; {ADVICE}"
-            )
-
-
-def check_source_digests(old: AnyPath, new: AnyPath) -> None:
-    """Compare the digests of sources that two manifests record.
-
-    Raises SourceChangedError if a source that is in both has another SHA-256; names the first one; DamageError if a
-    manifest cannot be read.
-    """
-    recorded = {row["source"]: row["source_sha256"] for row in read_rows(old)}
-    for row in read_rows(new):
-        name, sha256 = row["source"], row["source_sha256"]
-        if sha256 and recorded.get(name) and sha256 != recorded[name]:
-            raise SourceChangedError(
-                f"source {name}: has the SHA-256 {sha256}; expected {recorded[name]}, as recorded; {ADVICE}"
-            )
-
-
 def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
     """Yield rows of pairs, evenly spaced over a manifest."""
     pairs = (offset for offset, row in rows_with_offsets(manifest) if row["status"] == "ok")
@@ -168,21 +125,18 @@ def replay(
                 f"row {row['key']}: has no digests to compare, because its dataset has no frames "
                 "(output.frames=false); expected a manifest with digests; add --to FOLDER to write the arrays"
             )
-        yield _replay(row, regenerator, to)
-
-
-def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayResult:
-    key, source = str(row["key"]), str(row["source"])
-    try:
-        arrays = regenerator.regenerate(row)
-    except SourceChangedError as error:
-        return ReplayResult(key, source, str(error), source_changed=True)
-    except DamageError as error:
-        return ReplayResult(key, source, str(error))
-    if to is not None:
-        _save(arrays, to, key)
-    compared = has_frames(row)
-    return ReplayResult(key, source, _difference(arrays, row) if compared else "", False, to is not None, compared)
+        key, source, compared = str(row["key"]), str(row["source"]), has_frames(row)
+        try:
+            arrays = regenerator.regenerate(row)
+        except (SourceChangedError, DamageError) as error:
+            yield ReplayResult(key, source, str(error), isinstance(error, SourceChangedError))
+            continue
+        if to is not None:
+            with machine_errors(to):
+                to.mkdir(parents=True, exist_ok=True)
+                for name, array in arrays.items():
+                    np.save(to / f"{key}.{name}.npy", array)
+        yield ReplayResult(key, source, _difference(arrays, row) if compared else "", False, to is not None, compared)
 
 
 class PairRegenerator:
@@ -203,7 +157,7 @@ class PairRegenerator:
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
         """
         plan, names = plan_from_row(row), [LINEAR_RGB] if row["targets"] else []
-        for kernels in kernels_for(names, plan):
+        for kernels in kernels_for(names, [plan]):
             self_test.check(kernels)
         photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source)
         patch = patch_from_row(row)
@@ -219,13 +173,28 @@ class PairRegenerator:
         return {"clean": pair.clean, "noisy": pair.noisy, **targets}
 
     def photograph(self, source: Source, recorded: str, prepared: SourcePlan) -> Photograph:
-        """Decode the source of a row with this SHA-256; raise as `regenerate`."""
+        """Decode the source of a row with this SHA-256; raise as `regenerate`.
+
+        SourceChangedError unless the file can be read and used as when it was listed.
+        """
         if self._root is None and source.size_bytes != 0:
             raise ConfigError(
                 f"source.root is missing: row {source.index:08d} was generated from the file {source.name}; "
                 "expected its folder; give source.root=…"
             )
-        sha256, photograph = self._load_unchanged(source, recorded, prepared)
+        config = recorded_source(self._root, source, prepared)
+        try:
+            if self._kept is None or self._kept[:2] != (config, source):
+                self._kept = None  # frees the last photograph first: two at a time would take twice the memory
+                self._kept = config, source, *load_source(config, source)
+        except SourceError as error:
+            if error.sha256 not in (None, recorded):
+                raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
+            text = f"its source cannot be used ({error})"
+            raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {ADVICE}")) from error
+        except MachineError as error:
+            raise SourceChangedError(f"{str(error).partition(';')[0]}; {ADVICE}") from error
+        _, _, sha256, photograph = self._kept
         if sha256 != recorded:
             raise SourceChangedError(_changed(sha256, recorded))
         if photograph.raw is not None and photograph.raw.source.mosaic_xxh3 != prepared.mosaic_xxh3:
@@ -257,25 +226,6 @@ class PairRegenerator:
             raise DamageError(difference)
         return arrays
 
-    def _load_unchanged(self, source: Source, recorded: str, prepared: SourcePlan) -> tuple[str, Photograph]:
-        """Load a source; raise SourceChangedError unless the file can be read and used as when it was listed."""
-        try:
-            return self._load(source, prepared)
-        except SourceError as error:
-            if error.sha256 not in (None, recorded):
-                raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
-            text = f"its source cannot be used ({error})"
-            raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {ADVICE}")) from error
-        except MachineError as error:
-            raise SourceChangedError(f"{str(error).partition(';')[0]}; {ADVICE}") from error
-
-    def _load(self, source: Source, prepared: SourcePlan) -> tuple[str, Photograph]:
-        config = recorded_source(self._root, source, prepared)
-        if self._kept is None or self._kept[:2] != (config, source):
-            self._kept = None  # frees the last photograph first: two at a time would take twice the memory
-            self._kept = config, source, *load_source(config, source)
-        return self._kept[2:]
-
 
 def recorded_source(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
     """Settings with which the source of a row is decoded."""
@@ -299,13 +249,6 @@ def _difference(arrays: Targets, row: Row) -> str:
 
 def _changed(sha256: str, recorded: str) -> str:
     return f"its source has changed: SHA-256 is {sha256}, the row records {recorded}; {ADVICE}"
-
-
-def _save(arrays: Targets, to: Path, key: str) -> None:
-    with machine_errors(to):
-        to.mkdir(parents=True, exist_ok=True)
-        for name, array in arrays.items():
-            np.save(to / f"{key}.{name}.npy", array)
 
 
 def source_of(row: Row) -> Source:

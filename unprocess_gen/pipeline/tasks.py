@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import msgspec
 
@@ -29,8 +29,6 @@ from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.simulation.frames import Counts
 
-Item = TypeVar("Item")
-
 FAILURES_SHOWN = 3
 """Failed sources that a run names; the manifest lists all."""
 
@@ -42,11 +40,12 @@ class StageTimes:
     decode_s: float = 0.0
     simulate_s: float = 0.0
 
-    def timed(self, stage: str, function: Callable[..., Item], *given: Any) -> Item:
-        """Call a function, and add its time to a stage, ``decode_s`` or ``simulate_s``, even if it fails."""
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time of the body to a stage, ``decode_s`` or ``simulate_s``, even if it fails."""
         started = time.thread_time()
         try:
-            return function(*given)
+            yield
         finally:
             setattr(self, stage, getattr(self, stage) + time.thread_time() - started)
 
@@ -171,13 +170,18 @@ class ShardReport:
 
 @dataclass(slots=True)
 class Made:
-    """Rows and shards that one call made, shards that it found done, processor time of the stages, and workers."""
+    """What one call made and found done, and what it has told the user about failures.
+
+    Rows and shards that it made, shards that it found done, processor time of the stages, and number of workers.
+    """
 
     rows: int = 0
     shards: int = 0
     done: int = 0
     times: StageTimes = field(default_factory=StageTimes)
     n_jobs: int = 1
+    failures_shown: int = 0
+    self_test: str = ""
 
 
 COUNTS = Counts.__struct_fields__
@@ -201,21 +205,17 @@ class Tally:
         """Count rows."""
         tally = cls()
         for row in rows:
-            tally._add_row(row)
+            if row["status"] == "filtered":
+                tally.filtered += 1
+            elif row["status"] == "failed":
+                tally.failed[str(row["reason"])] = tally.failed.get(str(row["reason"]), 0) + 1
+            else:
+                tally.pairs += 1
+                if has_frames(row):
+                    tally.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
+                    for name in COUNTS:
+                        tally.sites[name] += int(row[name] or 0)
         return tally
-
-    def _add_row(self, row: Row) -> None:
-        if row["status"] == "filtered":
-            self.filtered += 1
-            return
-        if row["status"] == "failed":
-            self.failed[str(row["reason"])] = self.failed.get(str(row["reason"]), 0) + 1
-            return
-        self.pairs += 1
-        if has_frames(row):
-            self.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
-            for name in COUNTS:
-                self.sites[name] += int(row[name] or 0)
 
     def add(self, other: Tally) -> None:
         """Add the counts of other rows."""
@@ -235,18 +235,16 @@ class Tally:
 ROWS = f"{WORK}/rows"
 
 
-class _RecordFacts(msgspec.Struct, frozen=True):
+class ShardRecord(msgspec.Struct, frozen=True):
+    """First line of a shard's record: its entry in ``dataset.json``, counts of its rows, size of the lines below."""
+
     entry: dict[str, Any]
     tally: Tally
     csv_bytes: Count
 
 
-class ShardRecord(NamedTuple):
-    """Record of a shard: its entry in ``dataset.json``, counts of its rows, and its lines of the manifest."""
-
-    entry: dict[str, Any]
-    tally: Tally
-    csv: bytes
+RecordAndLines = tuple[ShardRecord, bytes]
+"""Record of a shard, and its lines of the manifest."""
 
 
 def commit_shard(folder: OutFolder, result: ShardResult, columns: Sequence[str]) -> ShardReport:
@@ -262,10 +260,10 @@ def commit_shard(folder: OutFolder, result: ShardResult, columns: Sequence[str])
 def done_shards(folder: OutFolder, shards: range) -> set[int]:
     """Find the shards that are done: a record without a provisional row, whose tar has the recorded size."""
     records = zip(shards, read_records(folder, shards), strict=True)
-    return {shard for shard, record in records if record is not None and not record.entry.get("provisional")}
+    return {shard for shard, read in records if read is not None and not read[0].entry.get("provisional")}
 
 
-def read_records(folder: OutFolder, shards: range) -> Iterator[ShardRecord | None]:
+def read_records(folder: OutFolder, shards: range) -> Iterator[RecordAndLines | None]:
     """Read the records of shards in order; None if there is none, it cannot be read, or the tar has another size.
 
     Consecutive shards are looked up in listings, those of a part one by one.
@@ -274,7 +272,7 @@ def read_records(folder: OutFolder, shards: range) -> Iterator[ShardRecord | Non
         return folder.path.map(lambda shard: _read(folder, shard, (folder / tar_name(shard)).size), shards)
     recorded, sizes = (folder / ROWS).entries(), (folder / "shards").entries()
 
-    def read(shard: int) -> ShardRecord | None:
+    def read(shard: int) -> RecordAndLines | None:
         is_recorded = Path(_file(shard)).name in recorded
         return _read(folder, shard, lambda: sizes.get(shard_name(shard))) if is_recorded else None
 
@@ -286,15 +284,15 @@ def tar_name(shard: int) -> str:
     return f"shards/{shard_name(shard)}"
 
 
-def _read(folder: OutFolder, shard: int, tar_bytes: Callable[[], int | None]) -> ShardRecord | None:
+def _read(folder: OutFolder, shard: int, tar_bytes: Callable[[], int | None]) -> RecordAndLines | None:
     try:
         line, _, csv = folder.read(_file(shard)).partition(b"\n")
-        facts = parse_record(line, _RecordFacts)
-        check_shard(shard, check_record(facts.entry, ShardFacts))
+        record = parse_record(line, ShardRecord)
+        check_shard(shard, check_record(record.entry, ShardFacts))
     except (OSError, ValueError):
         return None
-    fits = facts.entry["file"] is None or facts.entry["bytes"] == tar_bytes()
-    return ShardRecord(facts.entry, facts.tally, csv) if fits and len(csv) == facts.csv_bytes else None
+    fits = record.entry["file"] is None or record.entry["bytes"] == tar_bytes()
+    return (record, csv) if fits and len(csv) == record.csv_bytes else None
 
 
 def _file(shard: int) -> str:

@@ -14,19 +14,18 @@ import heapq
 import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.dataset.columns import Row, Value
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import check_format, read_dataset
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
-from unprocess_gen.dataset.row import has_frames, row_json, without_empty
+from unprocess_gen.dataset.row import has_frames, row_json
 from unprocess_gen.dataset.shards import (
     ExpectedFrame,
     ExpectedSample,
@@ -117,19 +116,6 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
         if name not in jobs and not (folder / name / DATASET).exists():
             what = "is missing: the sweep ended before this job; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage(DATASET, what),))
-
-
-def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
-    """Check whether a new manifest has the rows of an older one, in every cell that is not empty there.
-
-    Raises DamageError if a manifest cannot be read.
-    """
-    with suppress(OSError):  # reported below
-        if file_sha256(old) == file_sha256(new):
-            return True
-    no_row = dict[str, Value]()
-    rows = itertools.zip_longest(read_rows(old), read_rows(new), fillvalue=no_row)
-    return all(row and without_empty(row).items() <= other.items() for row, other in rows)
 
 
 def _without_path(error: DamageError) -> str:

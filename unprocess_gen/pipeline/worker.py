@@ -8,7 +8,6 @@ its memory, for minutes.
 from __future__ import annotations
 
 import ctypes
-import itertools
 import os
 import signal
 import sys
@@ -32,7 +31,6 @@ from unprocess_gen.pipeline.pairs import kernels_for, plan_pixels, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, commit_shard
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.reading import ReadFile, read_bytes, reading_ahead, source_file
 
@@ -101,23 +99,32 @@ def make_image(
     """Append the samples of one image to a shard, and return its rows; notes and times go to ``made``."""
     config, shard, timed = context.config, made.shard, made.times.timed
     try:
-        sha256, photograph = timed("decode_s", load_source, config.source, source, config.output.layout, read)
+        with timed("decode_s"):
+            sha256, photograph = load_source(config.source, source, config.output.layout, read)
     except SourceError as error:
         _check_not_deleted(config, source, error)
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
     if photograph.note:
         made.notes.append(f"{source.name} {photograph.note}")
-    image = timed("simulate_s", plan_pixels, context.settings, photograph, source, sha256)
-    noise_dn = None
-    if config.source.place is not None:
-        noise_dn = timed("simulate_s", source_noise_dn, photograph.srgb, image.plans[0])
-    if config.output.frames:
-        made.self_test.update(dict.fromkeys(_self_test(context, image.plans)))
+    with timed("simulate_s"):
+        image = plan_pixels(context.settings, photograph, source, sha256)
+        noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
+    # only the kernels in use are tested, because each set takes seconds to compile
+    for kernels in kernels_for(config.output.targets, image.plans) if config.output.frames else ():
+        if not self_test.are_compiled(kernels):
+            context.compiling_path.touch()
+        if config.self_test == "stop":
+            self_test.check(kernels, ", or set self_test=go_on")
+        made.self_test.update(dict.fromkeys(self_test.failures(kernels)))
     identity = source, sha256, photograph.orientation, shard
     rows: list[Row] = []
     sample: list[Row] = []
     pairs = image.pairs() if config.output.frames else image.without_frames()
-    while (made_pair := timed("simulate_s", next, pairs, None)) is not None:
+    while True:
+        with timed("simulate_s"):
+            made_pair = next(pairs, None)
+        if made_pair is None:
+            return rows
         patch, plan, pair = made_pair
         key = patch_key(source.index, patch, several=config.source.patch is not None)
         row_key = pair_key(key, plan, several=len(image.plans) > 1)
@@ -126,7 +133,8 @@ def make_image(
             continue
         if plan is image.plans[0]:
             sample, clean_xxh3 = [], array_xxh3(pair.clean)
-            targets = timed("simulate_s", targets_of, config.output.targets, photograph.srgb, plan, patch, pair)
+            with timed("simulate_s"):
+                targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
             stored_targets = targets_cell(targets)
         row = pair_row(row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn)
         row = {**row, "targets": stored_targets}
@@ -138,7 +146,6 @@ def make_image(
         if plan is image.plans[-1]:
             writer.add_rows(key, row_json(sample))
             rows += sample
-    return rows
 
 
 def _check_not_deleted(config: Config, source: Source, error: SourceError) -> None:
@@ -150,22 +157,6 @@ def _check_not_deleted(config: Config, source: Source, error: SourceError) -> No
             f"source.root={config.source.place}: {source.name} was deleted or moved after listing; expected "
             "the listed files; restore it and run the same command again"
         ) from error
-
-
-def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
-    """Test the kernels that an image's plans need; return the failures, or raise MachineError if ``self_test=stop``.
-
-    Tests only the kernels in use, because each takes seconds to compile.
-    """
-    failures: list[str] = []
-    needed = (kernels_for(context.config.output.targets, plan) for plan in plans)
-    for kernels in dict.fromkeys(itertools.chain.from_iterable(needed)):
-        if not self_test.are_compiled(kernels):
-            context.compiling_path.touch()
-        if context.config.self_test == "stop":
-            self_test.check(kernels, ", or set self_test=go_on")
-        failures += self_test.failures(kernels)
-    return failures
 
 
 def _prepare_process(coordinator_pid: int | None) -> None:
