@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import msgspec
 import numpy as np
 import pytest
 from helpers.cases import slow_except
@@ -22,6 +23,7 @@ from helpers.promise_report import Figure
 
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16, Srgb
 from unprocess_gen.core.random_streams import STREAMS, words
+from unprocess_gen.simulation.effects import EFFECTS as ALL_EFFECTS
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.facts import DarkPixels
@@ -169,7 +171,7 @@ def with_dark_frame(one: Case, dice: Dice) -> Case:
 
 
 def with_special_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:
-    """Add lens shading, gains by colour, temporal column noise and correlated rows to a plan of a physical profile."""
+    """Add the numbers that few profiles have, and their effects, to a plan of a physical profile."""
     assert plan.physics is not None
     few_rows = origin[0] < 2**14  # correlated offsets are computed from row 0
     physics = plan.physics.replace(
@@ -178,6 +180,7 @@ def with_special_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, 
         gain_by_colour=dice.pick(((1.0, 1.0, 1.0), (0.97, 1.0, 1.04), (0.1, 3.0, 10.0))),
         lens_shading=dice.pick(((-0.3, 0.05, -0.1), (-0.9, 0.0, 0.0), (-0.001, -0.002, 0.0))),
         dsnu_std_e=dice.at_most(40),
+        dead_pixel_level=dice.pick((0.0, 0.3, 1.0)),
         frame_size=tuple(start + side + int(dice.power(0, 8)) for start, side in zip(origin, shape, strict=True)),
     )
     on = {*plan.noise.effects, *(one for one in SPECIAL if not dice.chance(0.3))}
@@ -328,6 +331,15 @@ def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count:
             failed[f"case({kind!r}, {number}, {dtype!r})"] = text
     assert failed == {}
     figure("kernels", f"{count} random plans, {kind}, {dtype}: 0 pairs differ from the reference")
+
+
+def test_random_plans_have_every_number_of_an_effect() -> None:
+    """A number that is never drawn would be compared with the reference at its default only."""
+    plans = [case(kind, number).plan for kind in WITH_SPECIAL_EFFECTS for number in range(QUICK)]
+    defaults = {field.name: field.default for field in msgspec.structs.fields(Physics)}
+    for effect, name in ((one, name) for one in ALL_EFFECTS for name in one.numbers):
+        drawn = [getattr(plan.numbers, name) for plan in plans if effect.name in plan.noise.effects]
+        assert any(value != defaults[name] for value in drawn), name
 
 
 @pytest.mark.parametrize("kind", KINDS)
