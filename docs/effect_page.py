@@ -106,7 +106,8 @@ def _section(effect: str) -> list[str]:
     also = f", {' and '.join(f'`{name}`' for name in picture.also_on)} on" if picture.also_on else ""
     light = f", `scene.exposure_ratio={picture.ratio:g}`" if picture.ratio else ""
     where = " Middle and right: all noise of the scene, with and without it." if picture.in_scene else ""
-    assert calls(effect, picture.scene) or not picture.in_scene
+    called = calls(effect, picture.scene) or not picture.in_scene
+    assert called, f"effects.all=auto omits {effect} in scene={picture.scene}: leave `in_scene` out of its picture"
     text = f"`{shown}`{light}{changed}{also}: ±{picture.limit_dn:g} DN, {factor} times.{where}"
     return [*blocks, f"![{effect} by itself](effects/{effect}.jpg)", text]
 
@@ -115,7 +116,9 @@ def effects_page(table: Callable[[Iterable[str], Iterable[Iterable[str]]], str],
     """Return the page; ``table`` and ``page`` format Markdown (`reference_pages`)."""
     assert set(SCENES) == set(group_options("scene"))
     names = [effect.name for effect in EFFECTS]
-    assert set(names) == {*PICTURES, "dark_frame"}
+    lacking = " ".join(sorted({*names} - {*PICTURES, "dark_frame"}))
+    assert not lacking, f"no picture of {lacking}: add to PICTURES, then run `python docs/draw_effects.py {lacking}`"
+    assert {*PICTURES} <= {*names}, f"PICTURES names no effects: {sorted({*PICTURES} - {*names})}; remove them"
     rows = [[f"[`{name}`](#{name})", *(_count(name, scene) for scene in SCENES)] for name in PHYSICAL_EFFECTS]
     head = ["effect", *(f"[`{scene}`](scenes.md#{scene})" for scene in SCENES)]
     return page(INTRODUCTION, table(head, rows), *(block for name in names for block in _section(name)))
