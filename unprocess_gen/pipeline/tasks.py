@@ -170,7 +170,7 @@ class ShardReport:
 
 @dataclass(slots=True)
 class Made:
-    """What one call made and found done, and what it has told the user about failures.
+    """Result of one call: what it made and found done, and how many failures the user has seen.
 
     Rows and shards that it made, shards that it found done, processor time of the stages, and number of workers.
     """
