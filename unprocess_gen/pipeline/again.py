@@ -30,7 +30,7 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
     """
     check_format(folder)
     config, kind = read_dataset_yaml(folder / "config.yaml")
-    out = any_path(changes["out"])
+    manifest, out = folder / "manifest.csv", any_path(changes["out"])
     if out.resolve() == any_path(folder).resolve() and (out / "dataset.json").exists():
         raise ConfigError(f"again: out={out}: is the dataset itself; expected another folder")
     frames = changes["noise.dark_frames"]
@@ -38,30 +38,23 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
         raise ConfigError(
             f"again: noise.dark_frames={frames}: {folder} was generated without dark frames; leave it out"
         )
-    config = replaced(config, {**changes, **source_changes(_root(folder, kind, root), folder)})
-    validate_config(config)
-    manifest, place = folder / "manifest.csv", config.source.place
-    if place is not None and any_path(place).exists() and manifest.exists():
-        _check_sizes(manifest, place)
-    return config
-
-
-def _root(folder: AnyPath, kind: str, root: str | None) -> str | None:
-    """Root of the sources, given or recorded; None for the synthetic pictures."""
-    if kind == "synthetic":
-        if root is not None:
-            raise ConfigError(
-                f"again: source.root={root}: {folder} was generated from a source of kind {kind}; expected no root; "
-                "leave source.root out"
-            )
-        return None
-    known_root = source_root(folder / "manifest.csv", root)
-    if known_root is None:
+    if kind == "synthetic" and root is not None:
+        raise ConfigError(
+            f"again: source.root={root}: {folder} was generated from a source of kind {kind}; expected no root; "
+            "leave source.root out"
+        )
+    root = None if kind == "synthetic" else source_root(manifest, root)
+    if kind != "synthetic" and root is None:
         raise ConfigError(
             f"again: source.root is missing: {folder} does not record the folder of its sources; expected "
             "that folder; give source.root=…"
         )
-    return known_root
+    config = replaced(config, {**changes, **source_changes(root, folder)})
+    validate_config(config)
+    place = config.source.place
+    if place is not None and any_path(place).exists() and manifest.exists():
+        _check_sizes(manifest, place)
+    return config
 
 
 def compare(folder: AnyPath, new_folder: AnyPath) -> str:

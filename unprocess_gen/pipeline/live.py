@@ -16,7 +16,7 @@ import numpy as np
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.arrays import Frame, Srgb
+from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.object_store import ObjectPath
@@ -179,19 +179,21 @@ class LivePairs:
         if self._patch is not None:
             patch = _crop(plan, epoch, patch, self._patch, crop)
         clean, noisy, counts = make(crop_patch(srgb, patch), patch.origin, epoch)
-        targets, frames = {}, (clean, noisy)
 
         def pair() -> Pair:
             return Pair(clean, noisy, counts())
 
+        targets = {}
         if self._targets:
             targets = targets_of(self._targets, srgb, plan, patch, pair(), as_float=self._as_float)
-        if self._as_float:
-            frames = self._frame(clean, plan), self._frame(noisy, plan)
+        first, second = (
+            to_light(frame, levels_of(plan)) if self._as_float and frame.dtype == np.uint16 else frame
+            for frame in (clean, noisy)
+        )
         if self._arrays_only:
-            return (*frames, *targets.values())
+            return first, second, *targets.values()
         row: Any = LiveRow(partial(image.row, plan, epoch, patch, pair))
-        return LiveSample(*frames, row, source.name, targets)
+        return LiveSample(first, second, row, source.name, targets)
 
     def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
         """Make a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
@@ -242,20 +244,16 @@ class LivePairs:
             plan = next_dark_frame(plan, settings.dark_frames, epoch)
         return plan
 
-    def _frame(self, frame: Frame, plan: Plan) -> Frame:
-        """Convert a frame to light."""
-        return frame if frame.dtype != np.uint16 else to_light(frame, levels_of(plan))
-
 
 class LiveRow(Mapping[str, Value]):
     """Row of a live pair, built on first access: its digests take longer than a small pair. Pickled as a dict."""
 
-    def __init__(self, row: Callable[[], dict[str, Value]] | dict[str, Value]) -> None:
-        self._given = row
+    def __init__(self, build: Callable[[], dict[str, Value]]) -> None:
+        self._build = build
 
     @cached_property
     def _row(self) -> dict[str, Value]:
-        return self._given if isinstance(self._given, dict) else self._given()
+        return self._build()
 
     def __getitem__(self, name: str) -> Value:
         return self._row[name]

@@ -18,7 +18,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from typing import Any
 
@@ -329,7 +329,7 @@ def _check_sources(
     Both are in the order of the listing, so equal ones are compared without holding the known ones: a million take
     0.4 GB.
     """
-    change = _change_of_listed if listed else _change
+    change = partial(_change, listed=listed)
     pairs = itertools.zip_longest(known(), sources)
     if all(old and new and old.name == new.name and not change(old, new) for old, new in pairs):
         return
@@ -346,21 +346,19 @@ def _check_sources(
         )
 
 
-def _change(old: Source, new: Source) -> str:
-    """Describe how a source differs from its row in a manifest; digests are compared if the listing hashed it."""
-    if new.size_bytes != old.size_bytes:
-        return f"has {new.size_bytes} bytes, had {old.size_bytes}"
-    return "has other bytes than it had" if old.sha256 and new.sha256 not in (None, old.sha256) else ""
-
-
-def _change_of_listed(old: Source, new: Source) -> str:
-    """Describe how a source differs from an earlier listing.
+def _change(old: Source, new: Source, listed: bool) -> str:
+    """Describe how a source differs from its row in a manifest, or from an earlier listing.
 
     A listing hashes the files that could be identical. If one of them has changed, another one can have another number
-    among identical files, and so other noise.
+    among identical files, and so other noise. A row is compared only with a digest that the listing has.
     """
-    same_etag = not old.etag or new.etag in (None, old.etag)
-    return _change(old, new) or ("" if same_etag and new.sha256 == old.sha256 else "has other bytes than it had")
+    if new.size_bytes != old.size_bytes:
+        return f"has {new.size_bytes} bytes, had {old.size_bytes}"
+    if listed:
+        is_same = new.sha256 == old.sha256 and (not old.etag or new.etag in (None, old.etag))
+    else:
+        is_same = not old.sha256 or new.sha256 in (None, old.sha256)
+    return "" if is_same else "has other bytes than it had"
 
 
 def _first(differing: Sequence[str]) -> str:

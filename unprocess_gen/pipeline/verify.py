@@ -65,33 +65,29 @@ def verify(folder: AnyPath) -> list[Damage]:
     Raises DamageError if the folder contains no finished dataset; MachineError if a file exists but cannot be read.
     """
     with machine_errors(folder):
-        return _verify(folder)
-
-
-def _verify(folder: AnyPath) -> list[Damage]:
-    if not (folder / DATASET).exists() and not (folder / MANIFEST).exists():
-        raise DamageError(
-            f"{folder}: contains neither dataset.json nor manifest.csv; expected a finished dataset; "
-            "check the folder, or run the command that began it again"
-        )
-    damages: list[Damage] = []
-    facts: dict[str, Any] = {}
-    check_format(folder)
-    try:
-        if (folder / DATASET).exists():
-            facts = read_dataset(folder / DATASET)
-        else:
-            damages.append(Damage(DATASET, "is missing"))
-    except DamageError as error:
-        damages.append(Damage(DATASET, _without_path(error)))
-    damages += _check_files(folder, facts)
-    listed = {number: entry for number, entry in enumerate(facts.get("shards", [])) if entry["file"] is not None}
-    try:
-        if (folder / MANIFEST).exists():
-            return damages + _check_shards(folder, listed, shard_rows(folder / MANIFEST))
-    except DamageError as error:
-        damages.append(Damage(MANIFEST, _without_path(error)))
-    return damages + _check_shards(folder, listed, iter(()))
+        if not (folder / DATASET).exists() and not (folder / MANIFEST).exists():
+            raise DamageError(
+                f"{folder}: contains neither dataset.json nor manifest.csv; expected a finished dataset; "
+                "check the folder, or run the command that began it again"
+            )
+        damages: list[Damage] = []
+        facts: dict[str, Any] = {}
+        check_format(folder)
+        try:
+            if (folder / DATASET).exists():
+                facts = read_dataset(folder / DATASET)
+            else:
+                damages.append(Damage(DATASET, "is missing"))
+        except DamageError as error:
+            damages.append(Damage(DATASET, _without_path(error)))
+        damages += _check_files(folder, facts)
+        listed = {number: entry for number, entry in enumerate(facts.get("shards", [])) if entry["file"] is not None}
+        try:
+            if (folder / MANIFEST).exists():
+                return damages + _check_shards(folder, listed, shard_rows(folder / MANIFEST))
+        except DamageError as error:
+            damages.append(Damage(MANIFEST, _without_path(error)))
+        return damages + _check_shards(folder, listed, iter(()))
 
 
 def is_sweep(folder: AnyPath) -> bool:
