@@ -112,23 +112,20 @@ class Progress:
         LOGGER.warning("%s%s", self._prefix, message)
         self._bar.refresh()
 
-    def report_compiling(self) -> None:
-        """Report that kernels are being compiled, which takes seconds in which no item is finished."""
-        self._bar.set_postfix_str(COMPILING)
-        if self._lines:
-            LOGGER.info("%s%d/%d %ss, %s", self._prefix, self._done, self._total, self._unit, COMPILING)
-
     def watch(self, context: RunContext) -> None:
         """Report what worker processes do: compiling kernels, and images of shards that are not committed yet."""
-        threading.Thread(target=self._watch, args=(context,), daemon=True).start()
 
-    def _watch(self, context: RunContext) -> None:
-        is_compiling = False
-        while not self._over.wait(POLL_S):
-            if not is_compiling and context.compiling_path.exists():
-                is_compiling = True
-                self.report_compiling()
-            self._show(min(self._done + context.images_in_progress(), self._total - 1))
+        def look() -> None:
+            is_compiling = False
+            while not self._over.wait(POLL_S):
+                if not is_compiling and context.compiling_path.exists():
+                    is_compiling = True  # takes seconds in which no item is finished
+                    self._bar.set_postfix_str(COMPILING)
+                    if self._lines:
+                        LOGGER.info("%s%d/%d %ss, %s", self._prefix, self._done, self._total, self._unit, COMPILING)
+                self._show(min(self._done + context.images_in_progress(), self._total - 1))
+
+        threading.Thread(target=look, daemon=True).start()
 
 
 def with_bar(items: Iterable[Item], unit: str, total: int | None = None) -> Iterable[Item]:
