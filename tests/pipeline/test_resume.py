@@ -293,6 +293,15 @@ def test_changed_settings_or_sources_are_refused_and_change_nothing(
 # Finished -------------------------------------------------------------------------------------------------------------
 
 
+def test_rerun_removes_what_a_run_killed_at_its_end_left(finished: Path, run_main: RunMain) -> None:
+    work = finished / "ds" / ".work"
+    (work / "rows").mkdir(parents=True)
+    for name in ("lock", "rows/00000.json"):
+        (work / name).touch()
+    assert run_main("source.root=p", TWO).code == 0
+    assert not work.exists()
+
+
 def test_rerun_of_a_finished_dataset_reports_nothing_to_do(finished: Path, run_main: RunMain) -> None:
     before = snapshot(finished)
     done = run_main("source.root=p", TWO)

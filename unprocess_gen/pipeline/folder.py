@@ -198,5 +198,8 @@ class OutFolder:
         self._delete_scratch()
         self.delete_unfinished()
         for name in (self / WORK).entries():
-            if name not in (Path(TMP).name, LOCK):
+            if name == LOCK and self._lock is not None:
+                with contextlib.suppress(OSError):  # held; a lock that was left is deleted when this one is released
+                    self._lock.acquire(wait=False)
+            elif name != Path(TMP).name:
                 (self / f"{WORK}/{name}").delete_all()

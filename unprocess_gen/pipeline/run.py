@@ -203,6 +203,10 @@ def begin(folder: OutFolder, run: Run, parts: int | None = None) -> RunFile:
         _ = folder.scratch
     except OSError as error:
         raise folder.cannot_write(error) from error
+    except ConfigError:
+        if folder.finished() is not None:  # by another run since this one began
+            folder.remove_work()
+        raise
     return known
 
 
