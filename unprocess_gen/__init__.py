@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from unprocess_gen.pipeline.live import LivePairs, LiveSample
     from unprocess_gen.simulation.plan import Plan
 
-__version__ = "0.3.0"
+__version__ = "0.9.0"
 
 __all__ = [
     "CameraNoise",
