@@ -27,7 +27,7 @@ from unprocess_gen.dataset.row import columns_of, failed_row, has_frames, pair_r
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.deaths import counted_attempt
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.pairs import kernels_for, plan_pixels, targets_of
+from unprocess_gen.pipeline.pairs import PlannedImage, kernels_for, plan_pixels, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, commit_shard
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
@@ -109,13 +109,8 @@ def make_image(
     with timed("simulate_s"):
         image = plan_pixels(context.settings, photograph, source, sha256)
         noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
-    # only the kernels in use are tested, because each set takes seconds to compile
-    for kernels in kernels_for(config.output.targets, image.plans) if config.output.frames else ():
-        if not self_test.are_compiled(kernels):
-            context.compiling_path.touch()
-        if config.self_test == "stop":
-            self_test.check(kernels, ", or set self_test=go_on")
-        made.self_test.update(dict.fromkeys(self_test.failures(kernels)))
+    if config.output.frames:
+        _test_kernels(context, image, made)
     identity = source, sha256, photograph.orientation, shard
     rows: list[Row] = []
     sample: list[Row] = []
@@ -146,6 +141,20 @@ def make_image(
         if plan is image.plans[-1]:
             writer.add_rows(key, row_json(sample))
             rows += sample
+
+
+def _test_kernels(context: RunContext, image: PlannedImage, made: ShardResult) -> None:
+    """Test the kernels that an image needs, no others, because each set takes seconds to compile.
+
+    MachineError if they fail and ``self_test=stop``; else the failures go to ``made``.
+    """
+    config = context.config
+    for kernels in kernels_for(config.output.targets, image.plans):
+        if not self_test.are_compiled(kernels):
+            context.compiling_path.touch()
+        if config.self_test == "stop":
+            self_test.check(kernels, ", or set self_test=go_on")
+        made.self_test.update(dict.fromkeys(self_test.failures(kernels)))
 
 
 def _check_not_deleted(config: Config, source: Source, error: SourceError) -> None:
