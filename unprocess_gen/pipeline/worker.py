@@ -104,16 +104,14 @@ def make_image(
     except SourceError as error:
         _check_not_deleted(config, source, error)
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
-    if photograph.note:
-        made.notes.append(f"{source.name} {photograph.note}")
+    made.notes += [f"{source.name} {photograph.note}"] if photograph.note else []
     with timed("simulate_s"):
         image = plan_pixels(context.settings, photograph, source, sha256)
         noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
     if config.output.frames:
         _test_kernels(context, image, made)
     identity = source, sha256, photograph.orientation, shard
-    rows: list[Row] = []
-    sample: list[Row] = []
+    rows, sample = list[Row](), list[Row]()
     pairs = image.pairs() if config.output.frames else image.without_frames()
     while True:
         with timed("simulate_s"):
