@@ -169,8 +169,8 @@ def curve_dn() -> Figures:
 
 
 @cache
-def mixtures() -> list[colour.Matrix]:
-    """Return XYZ → camera matrices of 500 random mixtures of the four cameras."""
+def mixes() -> list[colour.Matrix]:
+    """Return XYZ → camera matrices of 500 random mixes of the four cameras."""
     weights = random(1).random((500, 4))
     return [colour.mix(list(colour.CAMERAS.values()), (one / one.sum()).tolist()) for one in weights]
 
@@ -179,7 +179,7 @@ def mixtures() -> list[colour.Matrix]:
 def white_through_matrix() -> Figures:
     """Return the share of channels in which white is not exactly 1, in percent; additions from left to right."""
     wrong = [0, 0]
-    for xyz2cam in mixtures():
+    for xyz2cam in mixes():
         product = colour.multiply(xyz2cam, colour.RGB2XYZ)
         rows = [product[at : at + 3] for at in (0, 3, 6)]
         divided = [[entry / (row[0] + row[1] + row[2]) for entry in row] for row in rows]

@@ -18,7 +18,7 @@ from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.row import without_empty
-from unprocess_gen.pipeline.replay import ADVICE, source_changes, source_root
+from unprocess_gen.pipeline.replay import ADVICE, check_root, source_changes, source_root
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import source_file
 
@@ -44,11 +44,7 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
             "leave source.root out"
         )
     root = None if kind == "synthetic" else source_root(manifest, root)
-    if kind != "synthetic" and root is None:
-        raise ConfigError(
-            f"again: source.root is missing: {folder} does not record the folder of its sources; expected "
-            "that folder; give source.root=…"
-        )
+    check_root(folder, kind, root, "again: ")
     config = replaced(config, {**changes, **source_changes(root, folder)})
     validate_config(config)
     place = config.source.place

@@ -27,7 +27,7 @@ from unprocess_gen.dataset.manifest import read_rows, write_rows
 from unprocess_gen.dataset.row import columns_of, has_frames
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, source_changes
+from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, check_root, source_changes
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, Tally, tar_name
 from unprocess_gen.pipeline.verify import CONFIG, DATASET, MANIFEST, expected_samples, shard_rows, verify
@@ -65,11 +65,7 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
             yield RepairStep(f"{CONFIG}: restored from {DATASET}")
         config, kind = _read_config(folder, root)
         if facts and MANIFEST in damaged:
-            if root is None and kind != "synthetic":
-                raise ConfigError(
-                    f"source.root is missing: {folder} does not record the folder of its sources; expected that "
-                    "folder; give source.root=…"
-                )
+            check_root(folder, kind, root)
             _restore_manifest(place, replaced(config, {"noise.dark_frames": dark_frames}), facts["manifest_sha256"])
             yield RepairStep(f"{MANIFEST}: regenerated from the settings and the sources")
             damaged = {damage.file for damage in verify(folder)}

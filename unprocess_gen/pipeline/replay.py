@@ -88,6 +88,15 @@ def source_root(manifest: AnyPath, root: str | None) -> str | None:
     return root if root is not None else recorded.root
 
 
+def check_root(folder: AnyPath, kind: str, root: str | None, verb: str = "") -> None:
+    """Raise ConfigError if sources of this kind are files and their place is unknown; ``verb`` begins the sentence."""
+    if kind != "synthetic" and root is None:
+        raise ConfigError(
+            f"{verb}source.root is missing: {folder} does not record the folder of its sources; expected that "
+            "folder; give source.root=…"
+        )
+
+
 def source_changes(root: str | None, folder: AnyPath) -> dict[str, Any]:
     """Settings that give the place of the sources, and the list that ``dataset.json`` records."""
     recorded = _recorded_places(folder / "manifest.csv").source.list
