@@ -190,7 +190,7 @@ def make_pair(
     else:
         raise ConfigError("make_pair: a plan has its own seed and key; expected them with a config only")
     if isinstance(config, Plan) or config.self_test == "stop":
-        self_test.check(self_test.kernels(image.plans[0]))
+        self_test.check(image.plans[:1])
     patch, plan, pair = next(image.pairs())
     return RawPair(pair, plan, source, patch)
 

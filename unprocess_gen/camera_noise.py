@@ -131,7 +131,7 @@ class CameraNoise:
             index, self._calls = self._calls, self._calls + 1
         _, image = plan_array(pixels, self._settings, operator.index(index))
         if self._settings.config.self_test == "stop":
-            self_test.check(self_test.kernels(image.plans[0]))
+            self_test.check(image.plans[:1])
         _, plan, pair = next(image.pairs())
         has_noise = set(plan.noise.effects) != {"quantise"}
         codes = int(np.iinfo(pixels.dtype).max) + 1

@@ -40,9 +40,15 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> str:
     return f"source.root={fill(tmp_path_factory.mktemp('self_test') / 'photographs', 2)}"
 
 
-@pytest.mark.parametrize("kernels", sorted(set(map(selftest.kernels, selftest.GOLDEN_PLANS.values()))))
+@pytest.mark.parametrize("kernels", selftest.kernels([*selftest.GOLDEN_PLANS.values()]))
 def test_this_machine_passes_the_self_test(kernels: str) -> None:
     assert selftest.failures(kernels) == ()
+
+
+def test_kernels_are_compiled_once_they_were_tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selftest, "kernel_cache_folder", lambda: tmp_path)
+    selftest.failures("gaussian")
+    assert [*map(selftest.are_compiled, ("gaussian", "electrons", "reference"))] == [True, False, True]
 
 
 @pytest.mark.parametrize("name", selftest.GOLDEN)
@@ -102,11 +108,10 @@ def test_kernels_are_tested_when_a_plan_first_needs_them(
     """The plans of all noise levels of an image count."""
     proved: list[str] = []
     monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
-    kinds = iter(["electrons", "float32", "electrons", "gaussian"])
-    monkeypatch.setattr(selftest, "kernels", lambda plan: next(kinds))
+    monkeypatch.setattr(selftest, "kernels", lambda plans, _=(): [f"draw {plan.place.draw}" for plan in plans])
 
     assert run_main("n_jobs=1", two, "noise.draws=2").code == 0
-    assert list(dict.fromkeys(proved)) == ["electrons", "float32", "gaussian"]
+    assert list(dict.fromkeys(proved)) == ["draw 0", "draw 1"]
 
 
 def test_every_law_of_the_noise_has_a_golden_pair() -> None:
@@ -142,7 +147,7 @@ def test_a_table_one_unit_off_is_detected(module: ModuleType, build: str, monkey
         with pytest.raises(
             MachineError, match=r"the self-test failed: results differ \(a table has SHA-256 [0-9a-f]{64}; expected"
         ):
-            selftest.check("gaussian")
+            selftest.check([selftest.GOLDEN_PLAN])
     finally:
         tone_curves._linear_table.cache_clear()
         lookup_tables.normal_table.cache_clear()

@@ -29,7 +29,7 @@ from unprocess_gen.dataset.reader import DatasetPath, Sample, check_split, datas
 from unprocess_gen.dataset.row import COLUMNS
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
-from unprocess_gen.pipeline.pairs import PairSettings, kernels_for, levels_of, targets_of
+from unprocess_gen.pipeline.pairs import PairSettings, levels_of, targets_of
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of
@@ -222,8 +222,7 @@ class LivePairs:
         prepared = kept.get(key)
         if prepared is None:
             plan = self._redrawn(settings, image, srgb, plan_epoch, number) if plan_epoch else image.plan
-            for kernels in kernels_for(self._targets, [plan]):
-                self_test.check(kernels)
+            self_test.check([plan], self._targets)
             make = crop_maker(plan, shape, frame, patch.origin, 256**srgb.itemsize, settings.dark_folder)
             prepared = kept.keep(key, (plan, make))
         if plan_epoch and redraws and (rule := patch_rule(settings.config.source)) is not None:

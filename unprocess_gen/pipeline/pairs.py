@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.arrays import FLOAT32, Array, Frame, Srgb
+from unprocess_gen.core.arrays import Array, Frame, Srgb
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Value
@@ -21,12 +21,11 @@ from unprocess_gen.dataset.training import noise_std
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.raw_source import with_raw_sensor
-from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.facts import DarkFrames, Facts
 from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import linear_rgb, make_pairs
-from unprocess_gen.simulation.plan import EXACT, Plan
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.patches import crop_patch, list_patches
@@ -64,13 +63,12 @@ class PlannedImage:
     def pairs(self) -> Iterator[tuple[Patch, Plan, Pair]]:
         """Simulate the pairs of every patch, in the order of the manifest; pairs of a patch share their clean frame."""
         for patch in self.patches:
-            pairs = make_pairs(crop_patch(self.srgb, patch), self.plans, patch.origin, self.dark_folder)
-            for plan, pair in zip(self.plans, pairs, strict=True):
+            for plan, pair in zip(self.plans, self.pairs_of(patch), strict=True):
                 yield patch, plan, pair
 
-    def without_frames(self) -> Iterator[tuple[Patch, Plan, None]]:
-        """Yield patches and plans as `pairs`, and simulate nothing."""
-        return ((patch, plan, None) for patch in self.patches for plan in self.plans)
+    def pairs_of(self, patch: Patch) -> Iterator[Pair]:
+        """Simulate the pairs of a patch, one for each plan."""
+        return make_pairs(crop_patch(self.srgb, patch), self.plans, patch.origin, self.dark_folder)
 
 
 def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, sha256: str) -> PlannedImage:
@@ -106,14 +104,6 @@ def targets_of(
 def levels_of(plan: Plan) -> dict[str, Value]:
     """Levels of a plan as columns of a row."""
     return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
-
-
-def kernels_for(names: Sequence[str], plans: Sequence[Plan]) -> list[str]:
-    """Sets of kernels that simulate plans and their targets, each once (`self_test.kernels`)."""
-    if LINEAR_RGB in names:
-        exact = [plan.replace(accuracy=EXACT) for plan in plans]
-        plans = [*plans, *exact, *(plan.replace(clean_dtype=FLOAT32) for plan in exact)]
-    return list(dict.fromkeys(map(self_test.kernels, plans)))
 
 
 def _noise(name: str, frame: Frame, plan: Plan, as_float: bool) -> NDArray[np.float32]:

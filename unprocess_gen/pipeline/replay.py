@@ -30,7 +30,7 @@ from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
 from unprocess_gen.dataset.row import has_frames, patch_from_row, plan_from_row
 from unprocess_gen.dataset.shards import arrays_of
-from unprocess_gen.pipeline.pairs import PlannedImage, Targets, kernels_for, targets_of
+from unprocess_gen.pipeline.pairs import PlannedImage, Targets, targets_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan, SourcePlan
 from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
@@ -166,8 +166,7 @@ class PairRegenerator:
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
         """
         plan, names = plan_from_row(row), [LINEAR_RGB] if row["targets"] else []
-        for kernels in kernels_for(names, [plan]):
-            self_test.check(kernels)
+        self_test.check([plan], names)
         photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source)
         patch = patch_from_row(row)
         height, width = photograph.srgb.shape[:2]

@@ -8,6 +8,7 @@ its memory, for minutes.
 from __future__ import annotations
 
 import ctypes
+import itertools
 import os
 import signal
 import sys
@@ -27,7 +28,7 @@ from unprocess_gen.dataset.row import columns_of, failed_row, has_frames, pair_r
 from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
 from unprocess_gen.pipeline.deaths import counted_attempt
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.pairs import PlannedImage, kernels_for, plan_pixels, targets_of
+from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels, targets_of
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, commit_shard
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
@@ -111,34 +112,32 @@ def make_image(
     if config.output.frames:
         _test_kernels(context, image, made)
     identity = source, sha256, photograph.orientation, shard
-    rows, sample = list[Row](), list[Row]()
-    pairs = image.pairs() if config.output.frames else image.without_frames()
-    while True:
-        with timed("simulate_s"):
-            made_pair = next(pairs, None)
-        if made_pair is None:
-            return rows
-        patch, plan, pair = made_pair
-        key = patch_key(source.index, patch, several=config.source.patch is not None)
-        row_key = pair_key(key, plan, several=len(image.plans) > 1)
-        if pair is None:
-            rows.append(pair_row(row_key, *identity, plan, None, ("", ""), patch, noise_dn))
-            continue
-        if plan is image.plans[0]:
-            sample, clean_xxh3 = [], array_xxh3(pair.clean)
+    rows = list[Row]()
+    for patch in image.patches:
+        key, sample = patch_key(source.index, patch, several=config.source.patch is not None), list[Row]()
+        pairs = image.pairs_of(patch) if config.output.frames else itertools.repeat(None)
+        for plan in image.plans:
+            row_key = pair_key(key, plan, several=len(image.plans) > 1)
             with timed("simulate_s"):
-                targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
-            stored_targets = targets_cell(targets)
-        row = pair_row(row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn)
-        row = {**row, "targets": stored_targets}
-        arrays = {"clean": pair.clean, "noisy": pair.noisy, **targets}
-        for name, stored in arrays_of(row).items():
-            if not sample or name == "noisy":
-                writer.add_frame(key, stored.member, arrays[name])
-        sample.append(row)
-        if plan is image.plans[-1]:
+                pair = next(pairs)
+            if pair is None:
+                sample.append(pair_row(row_key, *identity, plan, None, ("", ""), patch, noise_dn))
+                continue
+            if not sample:
+                with timed("simulate_s"):
+                    targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
+                clean_xxh3, stored_targets = array_xxh3(pair.clean), targets_cell(targets)
+            row = pair_row(row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn)
+            row = {**row, "targets": stored_targets}
+            arrays = {"clean": pair.clean, "noisy": pair.noisy, **targets}
+            for name, stored in arrays_of(row).items():
+                if not sample or name == "noisy":
+                    writer.add_frame(key, stored.member, arrays[name])
+            sample.append(row)
+        if config.output.frames:
             writer.add_rows(key, row_json(sample))
-            rows += sample
+        rows += sample
+    return rows
 
 
 def _test_kernels(context: RunContext, image: PlannedImage, made: ShardResult) -> None:
@@ -147,12 +146,13 @@ def _test_kernels(context: RunContext, image: PlannedImage, made: ShardResult) -
     MachineError if they fail and ``self_test=stop``; else the failures go to ``made``.
     """
     config = context.config
-    for kernels in kernels_for(config.output.targets, image.plans):
+    used = image.plans, config.output.targets
+    for kernels in self_test.kernels(*used):
         if not self_test.are_compiled(kernels):
             context.compiling_path.touch()
-        if config.self_test == "stop":
-            self_test.check(kernels, ", or set self_test=go_on")
         made.self_test.update(dict.fromkeys(self_test.failures(kernels)))
+    if made.self_test and config.self_test == "stop":
+        self_test.check(*used, ", or set self_test=go_on")
 
 
 def _check_not_deleted(config: Config, source: Source, error: SourceError) -> None:

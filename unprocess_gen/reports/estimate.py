@@ -149,7 +149,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
 
 def _compile_kernels(plans: Sequence[Plan]) -> None:
     """Load and test the kernels of plans; report first if they must be compiled, which takes up to 20 seconds."""
-    for kernels in {self_test.kernels(plan) for plan in plans}:
+    for kernels in self_test.kernels(plans):
         if not self_test.are_compiled(kernels):
             LOGGER.info(COMPILING)
         self_test.failures(kernels)

@@ -14,8 +14,9 @@ and both ends of the sensor's range. The 16-bit curves are checked when they are
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -23,8 +24,9 @@ from unprocess_gen.core.arrays import FLOAT32, Float, Srgb
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.random_streams import philox4x32
+from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS
-from unprocess_gen.simulation.kernels.jit import has_run, kernel, note_run
+from unprocess_gen.simulation.kernels.jit import kernel, kernel_cache_folder, numba_config
 from unprocess_gen.simulation.kernels.render import uses_float32
 from unprocess_gen.simulation.lookup_tables import normal_table
 from unprocess_gen.simulation.pair import make_pair
@@ -110,28 +112,42 @@ GOLDEN = {
 }
 
 
-def kernels(plan: Plan) -> str:
-    """Return the name of the set of kernels that simulates a plan; sets are compiled one by one, in seconds."""
-    if plan.accuracy == REFERENCE:
-        return "reference"
-    noise = "electrons" if plan.counts_electrons else "gaussian"
-    if plan.output.clean_normalised:
-        return f"{'normalised' if plan.output.normalised else 'float_clean'}_{noise}"
-    return "float32" if uses_float32(plan) else noise
+def kernels(plans: Sequence[Plan], targets: Sequence[str] = ()) -> list[str]:
+    """Names of the sets of kernels that simulate plans and targets; sets are compiled one by one, in seconds."""
+    if LINEAR_RGB in targets:
+        exact = [plan.replace(accuracy=EXACT) for plan in plans]
+        plans = [*plans, *exact, *(plan.replace(clean_dtype=FLOAT32) for plan in exact)]
+    sets: dict[str, None] = {}
+    for plan in plans:
+        noise = "electrons" if plan.counts_electrons else "gaussian"
+        if plan.accuracy == REFERENCE:
+            noise = "reference"
+        elif plan.output.clean_normalised:
+            noise = f"{'normalised' if plan.output.normalised else 'float_clean'}_{noise}"
+        elif uses_float32(plan):
+            noise = "float32"
+        sets[noise] = None
+    return [*sets]
 
 
 def are_compiled(kernel_set: str) -> bool:
-    """True if a set of kernels has machine code, so that the first pair does not wait for the compiler."""
-    return kernel_set == "reference" or has_run(kernel_set)
+    """True if nothing of a set of kernels is left to compile, so that the first pair does not wait.
+
+    Another processor or version of Numba may compile again.
+    """
+    folder = kernel_cache_folder()
+    has_run = folder is not None and (folder / f"{kernel_set}.run").exists()
+    return has_run or kernel_set == "reference" or bool(numba_config.DISABLE_JIT)
 
 
-def check(kernel_set: str, advice: str = "") -> None:
+def check(plans: Sequence[Plan], targets: Sequence[str] = (), advice: str = "") -> None:
     """Raise MachineError if this process computes other values than every other machine; end it with ``advice``."""
-    if failures(kernel_set):
-        raise MachineError(
-            f"the self-test failed: results differ ({'; '.join(failures(kernel_set))}); expected those of every "
-            f"machine; try other versions of numpy and numba{advice}"
-        )
+    for kernel_set in kernels(plans, targets):
+        if failures(kernel_set):
+            raise MachineError(
+                f"the self-test failed: results differ ({'; '.join(failures(kernel_set))}); expected those of every "
+                f"machine; try other versions of numpy and numba{advice}"
+            )
 
 
 @functools.cache
@@ -155,12 +171,15 @@ def _failures(kernel_set: str) -> Iterator[str]:
     _product_and_sum(np.full(8, 1 + 2.0**-30), np.full(8, -1 - 2.0**-29), difference)
     if difference.any():
         yield "a kernel uses a fused multiply-add"
-    for name in (name for name, plan in GOLDEN_PLANS.items() if kernels(plan) == kernel_set):
+    for name in (name for name, plan in GOLDEN_PLANS.items() if kernels([plan]) == [kernel_set]):
         pair = make_pair(golden_image(), GOLDEN_PLANS[name], (1, 57))
         for member, digest in zip(("clean", "noisy"), GOLDEN[name], strict=True):
             if (actual := array_xxh3(getattr(pair, member))) != digest:
                 yield f"the golden {member} frame ({name}) is {actual}, expected {digest}"
-    note_run(kernel_set)  # also after a failure: nothing is left to compile
+    folder = kernel_cache_folder()
+    if folder is not None and not numba_config.DISABLE_JIT:
+        with contextlib.suppress(OSError):  # only a message of progress depends on it
+            (folder / f"{kernel_set}.run").touch()  # also after a failure: nothing is left to compile
 
 
 @kernel

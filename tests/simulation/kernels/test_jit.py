@@ -16,7 +16,7 @@ import numba
 import pytest
 
 from unprocess_gen.simulation.kernels import jit
-from unprocess_gen.simulation.kernels.jit import KERNEL_PACKAGES, by_class, has_run, inner, kernel, note_run
+from unprocess_gen.simulation.kernels.jit import KERNEL_PACKAGES, by_class, inner, kernel
 
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "unprocess_gen"
@@ -39,10 +39,13 @@ def quarter(x):
 """
 CALL = """
 import sys
-from unprocess_gen.simulation.kernels.jit import has_run, note_run
+from pathlib import Path
+from unprocess_gen.simulation.kernels.jit import kernel_cache_folder
 from unprocess_gen.simulation.caller import quarter
-print(has_run("quarter"), quarter(8.0), len(quarter.stats.cache_hits))
-note_run("quarter")
+note = (kernel_cache_folder() or Path("missing")) / "quarter.run"
+print(note.exists(), quarter(8.0), len(quarter.stats.cache_hits))
+if note.parent.exists():
+    note.touch()
 """
 
 
@@ -193,17 +196,6 @@ def callees(value: Any) -> list[Any]:
         implementations = inspect.getclosurevars(value).nonlocals["implementations"].values()
         return [getattr(function, "py_func", function) for function in implementations]
     return [value.py_func] if hasattr(value, "py_func") else []
-
-
-# Sets of kernels that have run ----------------------------------------------------------------------------------------
-
-
-def test_a_set_has_run_after_it_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jit, "kernel_cache_folder", lambda: tmp_path)
-
-    note_run("gaussian")
-    note_run("gaussian")
-    assert (has_run("gaussian"), has_run("electrons")) == (True, False)
 
 
 # Kernels chosen by class ----------------------------------------------------------------------------------------------

@@ -137,7 +137,7 @@ class Exploration:
         key = f"{source.index:08d}{self.part}"
         key = key if key in parts else next(iter(parts))
         patch, plan = parts[key]
-        self_test.check(self_test.kernels(plan))
+        self_test.check([plan])
         srgb = crop_patch(image.srgb, patch)
         pair = next(make_pairs(srgb, [plan], patch.origin, image.dark_folder))
         digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)

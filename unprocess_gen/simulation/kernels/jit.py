@@ -12,7 +12,6 @@ only kernels of these two packages or of its own file, which Numba checks itself
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import os
@@ -72,24 +71,6 @@ def _implementation(implementations: Mapping[type, Any], kind: type) -> Any:
     if kind not in implementations:
         raise TypeError(f"{kind.__name__}: no kernel takes it")
     return implementations[kind]
-
-
-def has_run(kernels: str) -> bool:
-    """True if `note_run` was called for a set of kernels since the sources changed, so that nothing is compiled.
-
-    True also if nothing is compiled at all (``NUMBA_DISABLE_JIT=1``). Another processor or version of Numba may compile
-    again.
-    """
-    folder = kernel_cache_folder()
-    return bool(numba_config.DISABLE_JIT) or (folder is not None and (folder / f"{kernels}.run").exists())
-
-
-def note_run(kernels: str) -> None:
-    """Record next to the machine code that a set of kernels has run."""
-    folder = kernel_cache_folder()
-    if folder is not None and not numba_config.DISABLE_JIT:
-        with contextlib.suppress(OSError):  # only a message of progress depends on it
-            (folder / f"{kernels}.run").touch()
 
 
 @functools.cache
