@@ -30,7 +30,7 @@ from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.manifest import read_columns, read_rows, write_rows
 from unprocess_gen.dataset.row import COLUMN_NAMES
-from unprocess_gen.pipeline.builds import MANIFEST, Build, build_names, read_build
+from unprocess_gen.reports.builds import MANIFEST, Build, build_names, read_build
 from unprocess_gen.simulation.reference.cfa import unpack
 
 FOLDER = Path(__file__).resolve().parent

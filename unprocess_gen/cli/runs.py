@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from unprocess_gen.config.schema import Config
-    from unprocess_gen.pipeline.builds import Build
     from unprocess_gen.pipeline.generate import Summary
+    from unprocess_gen.reports.builds import Build
 
 
 PART_VARIABLES = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDEX")
@@ -138,7 +138,7 @@ def again(call: Call) -> int:
 
 def build(call: Call) -> int:
     """Make a benchmark build, or compare an existing one; list all builds."""
-    from unprocess_gen.pipeline.builds import build_names, read_build
+    from unprocess_gen.reports.builds import build_names, read_build
 
     if call.list:
         if call.place or call.to:

@@ -15,8 +15,8 @@ from helpers.commands import RunMain
 from helpers.processes import imported_first, kill_session, running, unfinished, wait_for
 
 import unprocess_gen as ug
-from unprocess_gen.pipeline import builds
-from unprocess_gen.pipeline.builds import build_names, manifests_dir, read_build
+from unprocess_gen.reports import builds
+from unprocess_gen.reports.builds import build_names, manifests_dir, read_build
 
 SMALL = "photos_patches"
 BUILDS = build_names()
