@@ -86,7 +86,11 @@ An effect is simulated only if the noise profile gives its numbers."""
 def settings_page() -> str:
     """Return the page of all settings: options, keys, distributions and the numbers of noise profiles."""
     defaults = default_options()
-    blocks = [SETTINGS_INTRODUCTION, "## Top level", _keys("", {n: s for g, n, s in all_settings() if not g})]
+    blocks = [
+        SETTINGS_INTRODUCTION,
+        "## Top level",
+        _keys("", {key: one for key, one in all_settings().items() if "." not in key}),
+    ]
     for group, kind in GROUPS.items():
         blocks += [f"## `{group}`", _first_line(kind)]
         options = [option for option in group_options(group) if option != "default"]
@@ -166,7 +170,7 @@ def _effect_numbers() -> str:
 
 
 def _not_data() -> str:
-    names = [f"`{group}.{name}`".replace("`.", "`") for group, name, one in all_settings() if not one.decides_data]
+    names = [f"`{key}`" for key, one in all_settings().items() if not one.decides_data]
     return (
         "## Settings that do not decide the data\n\n"
         "The bytes of a dataset do not depend on these keys. `config.yaml` omits them, and a rerun may change them:\n"

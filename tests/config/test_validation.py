@@ -267,7 +267,7 @@ def test_config_yaml_has_the_keys_that_decide_data(settings: Settings) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings()))
     groups = {group: loaded.get(group, {}) for group in GROUPS} | {"source.raw": loaded["source"].pop("raw")}
     keys = {f"{group}.{name}" for group, values in groups.items() for name in values} | (loaded.keys() - groups.keys())
-    assert keys | omitted == {f"{group}.{name}".lstrip(".") for group, name, _ in all_settings()}
+    assert keys | omitted == set(all_settings())
     assert not keys & omitted
 
 
@@ -442,7 +442,7 @@ def test_integers_that_no_float_holds_are_refused(number: int) -> None:
 
 
 def test_choices_match_their_implementations() -> None:
-    words = {f"{group}.{name}": one.limit.words for group, name, one in all_settings() if isinstance(one.limit, Choice)}
+    words = {key: one.limit.words for key, one in all_settings().items() if isinstance(one.limit, Choice)}
     assert words["gains.highlight"] == tuple(unprocess.INVERSE_HIGHLIGHTS)
     assert set(words["isp.tone"]) == set(unprocess.INVERSE_TONES) == set(tone_curves.EXACT_INVERSE_TONES)
     assert words["sensor.pattern"] == (*cfa.PATTERNS, cfa.MONO)
@@ -451,5 +451,5 @@ def test_choices_match_their_implementations() -> None:
 
 
 def test_every_setting_has_a_meaning_and_none_is_needed_without_docstrings() -> None:
-    assert all(setting.meaning for _, _, setting in all_settings())
+    assert all(setting.meaning for setting in all_settings().values())
     subprocess.run([sys.executable, "-OO", "-c", "import unprocess_gen.config.schema"], check=True)

@@ -79,7 +79,7 @@ def test_every_setting_and_column_is_explained() -> None:
     """Generated pages list them, like the declarations below (`test_generated_files_follow_from_the_code`)."""
     kinds = (BranchConfig, ProvenanceConfig)
     items = [(name, setting) for kind in kinds for name, setting in settings_of(kind).items()]
-    items += [(name, setting) for _, name, setting in all_settings()]
+    items += [(key.rpartition(".")[2], setting) for key, setting in all_settings().items()]
     for name, declared in [*items, *((column.name, column) for column in COLUMNS)]:
         assert declared.meaning and not declared.meaning.endswith("."), name
         assert str(declared.limit), name
@@ -94,8 +94,9 @@ def test_settings_declare_all_keys_of_the_schema() -> None:
 
 
 def test_null_is_explained_if_it_is_a_default() -> None:
-    for group, name, setting in all_settings():
-        assert setting.null or default_values(group)[name] is not None, f"{group}.{name}"
+    for key, setting in all_settings().items():
+        group, _, name = key.rpartition(".")
+        assert setting.null or default_values(group)[name] is not None, key
 
 
 def test_default_values_are_those_of_a_composed_config(settings: Settings) -> None:

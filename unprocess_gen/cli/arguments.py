@@ -203,7 +203,7 @@ def _setting_hint(verb: Verb, word: str) -> str:
     from unprocess_gen.config.schema import GROUPS, all_settings  # imports NumPy, too slow for --help
 
     name, _, value = word.lstrip("-").partition("=")
-    keys = {*GROUPS, *(f"{group}.{key}".lstrip(".") for group, key, _ in all_settings())} if verb.composes else set()
+    keys = {*GROUPS, *all_settings()} if verb.composes else set()
     return f"; {name} is a setting: write {name}={value or '…'}" if name in {*verb.own_keys, *keys} else ""
 
 

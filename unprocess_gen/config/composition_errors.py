@@ -84,10 +84,9 @@ def _wrong_value(error: OmegaConfBaseException, overrides: Sequence[str]) -> str
 
 def _allowed(key: str) -> str:
     """Allowed values of the setting that a key names, or that it is below; empty if there is none."""
-    settings = {f"{group}.{name}".lstrip("."): setting for group, name, setting in all_settings()}
-    while key and key not in settings:
+    while key and key not in all_settings():
         key = re.sub(r"(^|[.\[])[^.\[]*$", "", key)
-    return settings[key].allowed if key else ""
+    return all_settings()[key].allowed if key else ""
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:

@@ -10,7 +10,8 @@ override replaces a list completely. A mapping would be merged with the default'
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional, TypeVar
@@ -646,11 +647,11 @@ def group_settings(group: str) -> dict[str, Setting]:
     return {**settings_of(GROUPS[group]), **nested}
 
 
-def all_settings() -> Iterator[tuple[str, str, Setting]]:
-    """Yield every setting of a config with its group, ``""`` for the top level; branches are left out."""
-    for group, kind in [*GROUPS.items(), *NESTED.items(), ("", Config)]:
-        for name, setting in settings_of(kind).items():
-            yield group, name, setting
+@functools.cache
+def all_settings() -> Mapping[str, Setting]:
+    """Every setting of a config by its key, such as ``source.raw.pattern``; those of branches are left out."""
+    groups = {**{f"{group}.": kind for group, kind in (GROUPS | NESTED).items()}, "": Config}
+    return {f"{group}{name}": one for group, kind in groups.items() for name, one in settings_of(kind).items()}
 
 
 def replaced(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -104,15 +104,14 @@ def _check_values(config: Config) -> None:
 
 def _check_settings(config: Config) -> None:
     """Check each value against the limit that the schema declares for it, whether it is used or not."""
-    for group, name, setting in all_settings():
-        values = operator.attrgetter(group)(config) if group else config
-        key, value, limit = f"{group}.{name}".lstrip("."), getattr(values, name), setting.limit
+    for key, setting in all_settings().items():
+        value, limit = operator.attrgetter(key)(config), setting.limit
         if value is None and setting.null:
             continue
         if isinstance(limit, Drawn):
             parse_drawn(key, value, limit)
         elif isinstance(limit, LevelRange):
-            limit.check_in(key, value, values)
+            limit.check_in(key, value, operator.attrgetter(key.rpartition(".")[0])(config))
         else:
             setting.check(key, value)
 

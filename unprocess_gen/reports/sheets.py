@@ -10,35 +10,30 @@ Each PNG file names the digest of its manifest: sheets of two datasets in a fold
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.arrays import Float, Srgb
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.row import patch_from_row, plan_from_row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
-from unprocess_gen.pipeline.replay import ADVICE, recorded_source, source_of, source_root
+from unprocess_gen.pipeline.replay import PairRegenerator, source_of, source_root
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
-from unprocess_gen.sources.image.decode import Photograph
-from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
 
 PAIRS_SHOWN = 8
@@ -47,8 +42,6 @@ RMS_SHOWN = 4.0
 """Differences that are drawn black and white, in units of their RMS."""
 MARK = "unprocess_gen"
 """Keyword of the text in a sheet that names its dataset."""
-
-Load = Callable[[SourceConfig, Source], tuple[str, Photograph]]
 
 
 class SheetPair(NamedTuple):
@@ -78,26 +71,16 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
     pairs, manifest = RawPairs(folder), folder / "manifest.csv"
     if not len(pairs):
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
-    root = source_root(manifest, None if source is None else str(source))
-    load = functools.lru_cache(maxsize=1)(load_source)  # pairs of one photograph are adjacent
+    sources = PairRegenerator(source_root(manifest, None if source is None else str(source)))
     for number in select_pairs(manifest, keys).rows if keys else evenly_spaced(range(len(pairs)), PAIRS_SHOWN):
         clean, noisy, row = pairs[number]
-        part, missing = _load_part(row, root, load)
-        yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_from_row(row), part, missing)
-
-
-def _load_part(row: Row, root: str | None, load: Load) -> tuple[Srgb | None, str]:
-    """Load the part of the source that a row's frames show; None and the reason if it is not available."""
-    if root is None and row["source_bytes"] != 0:
-        return None, "the dataset does not record where its photographs are; give source.root=ROOT"
-    source = source_of(row)
-    try:
-        sha256, photograph = load(recorded_source(root, source, plan_from_row(row).source), source)
-    except (SourceError, MachineError, ConfigError) as error:  # the sheet is drawn without this photograph
-        return None, f"{str(error).partition(';')[0]}; {ADVICE}"
-    if sha256 != row["source_sha256"]:
-        return None, f"it has changed: its SHA-256 differs from the row's; {ADVICE}"
-    return crop_patch(photograph.srgb, patch_from_row(row)), ""
+        plan, part, missing = plan_from_row(row), None, ""
+        try:
+            photograph = sources.photograph(source_of(row), str(row["source_sha256"]), plan.source)
+            part = crop_patch(photograph.srgb, patch_from_row(row))
+        except (SourceChangedError, DamageError, ConfigError) as error:  # the sheet is drawn without this photograph
+            missing = str(error)
+        yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan, part, missing)
 
 
 # ------------------------------------------------------------------------------------------------------------- sheets

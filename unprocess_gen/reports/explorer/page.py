@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -25,7 +26,6 @@ from bokeh.plotting import figure
 
 from unprocess_gen.config.option_files import conf_dir, group_options, option_summary
 from unprocess_gen.config.schema import Config, all_settings
-from unprocess_gen.config.settings import Setting
 from unprocess_gen.core.errors import UnprocessGenError
 from unprocess_gen.core.fields import Choice
 from unprocess_gen.reports.explorer import views
@@ -58,7 +58,7 @@ SLIDERS = {"gains.red": (0.5, 4), "gains.blue": (0.5, 4), "gains.inverse_rgb": (
 DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}
 """Keys of which sliders show the value in the plan, which may be drawn."""
 NONE = "(none)"
-SETTINGS: dict[str, Setting] = {f"{group}.{name}".lstrip("."): setting for group, name, setting in all_settings()}
+SETTINGS = all_settings()
 TIPS = [
     ("site", "column $x{%d}, row $y{%d}"),
     ("source", "@r, @g, @b"),
@@ -289,8 +289,7 @@ def _shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], c
         return choices.get(name) or NONE
     if name in settings and name not in SLIDERS:
         return settings[name].strip("'\"")
-    group, _, key = name.rpartition(".")
-    value = getattr(getattr(config, group) if group else config, key)
+    value = operator.attrgetter(name)(config)
     return float(value) if name in SLIDERS else override_text(value).strip("'")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import threading
 import webbrowser
@@ -19,6 +18,10 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
 
     The server has a thread of its own, because an event loop drops exceptions that a signal raises in its callbacks.
     """
+    from bokeh.server.server import Server
+
+    from unprocess_gen.reports.explorer.page import Page
+
     try:
         with socket.create_server((HOST, port)) as probe:
             port = probe.getsockname()[1]
@@ -26,25 +29,6 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
         reason = getattr(error, "strerror", None) or error
         problem = f"cannot be used ({reason}); expected a free port; choose another, or leave --port out"
         raise ConfigError(f"--port {port}: {problem}") from None
-    ready = threading.Event()
-    thread = threading.Thread(target=_run, args=(choices, port, ready), daemon=True)
-    thread.start()
-    while thread.is_alive() and not ready.wait(0.1):
-        pass
-    if thread.is_alive():
-        address = f"http://{HOST}:{port}/"
-        started(address)
-        if shows:
-            webbrowser.open(address)
-        thread.join()
-
-
-def _run(choices: Choices, port: int, ready: threading.Event) -> None:
-    from bokeh.server.server import Server
-
-    from unprocess_gen.reports.explorer.page import Page
-
-    asyncio.set_event_loop(asyncio.new_event_loop())
     origins = [f"{name}:{port}" for name in (HOST, "localhost")]  # no other name that leads to this machine
     server = Server(
         {"/": lambda document: Page(choices, document).fill()},
@@ -53,5 +37,10 @@ def _run(choices: Choices, port: int, ready: threading.Event) -> None:
         allow_websocket_origin=origins,
     )
     server.start()
-    ready.set()
-    server.io_loop.start()
+    thread = threading.Thread(target=server.io_loop.start, daemon=True)
+    thread.start()
+    address = f"http://{HOST}:{port}/"
+    started(address)
+    if shows:
+        webbrowser.open(address)
+    thread.join()
