@@ -92,7 +92,7 @@ class Row:
 def yardstick(plan: Plan) -> Callable[[Srgb], object]:
     """A function that simulates a pair by `algorithm1` with the parameters of a plan."""
     tiny = make_pair(np.zeros((1, 1, 3), np.uint8), plan)
-    values = pair_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""), Patch(0, 0, 0, 1, 1))
+    values = pair_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""), Patch(1, 1))
     row = {name: str(value) for name, value in values.items()}
     rng = np.random.default_rng(0)
 

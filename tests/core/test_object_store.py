@@ -89,7 +89,7 @@ def test_pieces_of_large_objects_are_joined(bucket: ObjectPath, tmp_path: Path) 
 
 
 def test_missing_object_is_a_missing_file(bucket: ObjectPath) -> None:
-    for action in ((bucket / "none").read_bytes, (bucket / "none").open, (bucket / "none").stat):
+    for action in ((bucket / "none").read_bytes, (bucket / "none").open, (bucket / "none").entry):
         with pytest.raises(FileNotFoundError, match=f"s3://{bucket.bucket}/none"):
             action()
 

@@ -216,7 +216,7 @@ def test_row_read_from_csv_or_json_is_the_row_of_the_same_plan(
 
 
 def test_place_of_a_patch_survives_csv(tmp_path: Path) -> None:
-    patch = Patch(7, 2, 4, 2, 3)
+    patch = Patch(3, 2, 7, 2, 4)
     (row,) = through_csv([row_of(DARK, FRAME, KEY, patch)], tmp_path)
     assert (plan_from_row(row), patch_from_row(row)) == (DARK, patch)
     assert patch_from_row(row_of(PLAN)) == PATCH

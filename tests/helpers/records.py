@@ -48,7 +48,7 @@ PLAN = Plan(
 )  # fmt: skip
 
 
-PATCH = Patch(number=0, y=0, x=0, height=2, width=3)
+PATCH = Patch(3, 2)
 
 
 PHYSICS = Physics(

@@ -425,11 +425,11 @@ def test_disk_that_becomes_read_only_ends_the_run_with_5(
 ) -> None:  # fmt: skip
     """The kernel remounts a file system read-only if it finds an error in it."""
 
-    def refuse(temporary: Path, path: Path) -> None:
+    def refuse(path: Path, file: Path) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
 
     with monkeypatch.context() as patch:
-        after_commits(number, lambda: patch.setattr(paths, "commit_file", refuse), patch)
+        after_commits(number, lambda: patch.setattr(paths.LocalPath, "commit", refuse), patch)
         done = run_main(f"source.root={six}", ONE, "n_jobs=1")
     assert (done.code, done.out, len(messages(done.err))) == (5, "", 1), done.err
     assert "Read-only file system" in done.err

@@ -164,15 +164,15 @@ def test_grid_contains_every_place_at_its_stride(side: int, stride: int, down: i
     found = list_patches(PatchRule("grid", side, stride=stride), 0, height, width)
     wanted = [(y, x) for y in range(0, down + 1, stride) for x in range(0, right + 1, stride)]
     assert [patch.origin for patch in found] == wanted
-    assert [patch.number for patch in found] == list(range(len(wanted)))
+    assert [patch.patch for patch in found] == list(range(len(wanted)))
 
 
 @given(lengths, sizes, sizes, st.integers(0, 2**64 - 1))
 def test_random_places_are_even_and_inside(side: int, down: int, right: int, key: int) -> None:
     for patch in list_patches(PatchRule("random", side, count=20), key, side + down, side + right):
-        assert (patch.y % 2, patch.x % 2, patch.height, patch.width) == (0, 0, side, side)
-        assert 0 <= patch.y <= down
-        assert 0 <= patch.x <= right
+        assert (patch.patch_y % 2, patch.patch_x % 2, patch.height, patch.width) == (0, 0, side, side)
+        assert 0 <= patch.patch_y <= down
+        assert 0 <= patch.patch_x <= right
 
 
 def test_random_places_are_uniform() -> None:

@@ -33,7 +33,7 @@ def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> 
         error = ConfigError if verb == "again" else DamageError
         raise error(f"{verb}: {path}: not a dataset; expected {place.expected}")
     if is_sweep and not sweeps and not (path / "dataset.json").exists():
-        datasets = sorted(str(folder) for folder in path.iterdir() if (folder / "dataset.json").is_file())
+        datasets = sorted(str(path / name) for name in path.entries() if (path / name / "dataset.json").is_file())
         example = f", such as {datasets[0]}" if datasets else ""
         raise ConfigError(f"{verb}: {path}: is the folder of a sweep; expected one of its datasets{example}")
     return path

@@ -75,13 +75,6 @@ def free_bytes(path: Path) -> int:
     return shutil.disk_usage(path).free
 
 
-def commit_file(temporary: Path, path: Path) -> None:
-    """Rename a finished file to its final name on the same file system, durably; replace a file of that name."""
-    sync(temporary)
-    os.replace(temporary, path)
-    sync_folder(path.parent)
-
-
 def sync_folder(folder: Path) -> None:
     """Make the renames in a folder survive a loss of power; Windows, which opens no folders, does so by itself."""
     if sys.platform != "win32":

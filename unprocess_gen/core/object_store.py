@@ -21,7 +21,6 @@ from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from unprocess_gen.core.entries import Entry, EntryKind, Item, Result, started_ahead
@@ -157,10 +156,6 @@ class ObjectPath:
         sizes |= dict.fromkeys(listed["common_prefixes"], -1)
         return {name.rstrip("/").rpartition("/")[2]: size for name, size in sizes.items()}
 
-    def iterdir(self) -> Iterator[ObjectPath]:
-        """Yield the objects and prefixes one level below this one."""
-        return (self / name for name in self.entries())
-
     def mkdir(self, mode: int = 0, parents: bool = False, exist_ok: bool = True) -> None:
         """Check that the bucket exists; a prefix needs no creation."""
         self.is_dir()
@@ -188,10 +183,6 @@ class ObjectPath:
         with suppress(FileNotFoundError):
             return self._object().size
         return None
-
-    def stat(self) -> SimpleNamespace:
-        """Size of the object as ``st_size``; FileNotFoundError if there is none."""
-        return SimpleNamespace(st_size=self._object().size)
 
     def _object(self) -> Entry:
         """Describe the object; FileNotFoundError if there is none."""
@@ -254,13 +245,11 @@ class ObjectPath:
 
     # ------------------------------------------------------------------------------------------------------ writing
 
-    def write_bytes(self, content: bytes) -> None:
+    def write_bytes(self, content: bytes, unfinished: str = "") -> None:
         """Write the object; readers see the former object or the new one, never a part."""
         self._put(content, "overwrite")
 
-    def write(self, content: bytes, unfinished: str = "") -> None:
-        """Write the object as `write_bytes`; an object store needs no folder of unfinished files."""
-        self.write_bytes(content)
+    write = write_bytes
 
     def create(self, content: bytes, unfinished: str = "") -> bool:
         """Write the object unless it exists; return whether it was written.
@@ -315,9 +304,6 @@ class _Reader(io.RawIOBase):
 
     def seekable(self) -> bool:
         return True
-
-    def tell(self) -> int:
-        return int(self._file.tell())
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         return int(self._file.seek(offset, whence))

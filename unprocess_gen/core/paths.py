@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from unprocess_gen.core.entries import Entry, EntryKind, Item, Result
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import commit_file, sync, sync_folder
+from unprocess_gen.core.files import sync, sync_folder
 from unprocess_gen.core.object_store import ObjectPath, is_url
 
 # A pipe that replaced a listed file must not block the open for ever.
@@ -81,18 +81,17 @@ class LocalPath(_NativePath):
         waiting = [("", frozenset((_identity(self.stat()),)))]
         while waiting:
             folder, ancestors = waiting.pop()
-            for path, status, error in _scan(str(self), folder):
-                entry = _entry(path, status, error)
-                if entry.kind is EntryKind.FOLDER and status is not None:
-                    if _identity(status) in ancestors:
-                        entry = entry._replace(kind=EntryKind.LOOP)
-                    elif recursive:
-                        waiting.append((path, ancestors | {_identity(status)}))
+            for entry, identity in _scan(str(self), folder):
+                if identity in ancestors:
+                    yield entry._replace(kind=EntryKind.LOOP)
+                    continue
+                if identity is not None and recursive:
+                    waiting.append((entry.path, ancestors | {identity}))
                 yield entry
 
     def entry(self) -> Entry:
         """Describe this file or folder; raise OSError if there is none."""
-        return _entry(self.name, self.stat(), None)
+        return _entry(self.name, self.stat())
 
     def size(self) -> int | None:
         """Size of the file in bytes, None if there is no such file."""
@@ -168,7 +167,9 @@ class LocalPath(_NativePath):
 
     def commit(self, file: Path) -> None:
         """Move a finished file of the same file system here, durably; replace a file of this name."""
-        commit_file(file, self)
+        sync(file)
+        os.replace(file, self)
+        sync_folder(self.parent)
 
     def delete(self) -> None:
         """Delete the file; ignore one that does not exist."""
@@ -240,22 +241,21 @@ def _size_of_regular(descriptor: int) -> int:
     return status.st_size
 
 
-def _scan(root: str, folder: str) -> Iterator[tuple[str, os.stat_result | None, OSError | None]]:
-    """Yield path, status and error of each entry of a folder; the status is None if ``stat`` failed with the error."""
+def _scan(root: str, folder: str) -> Iterator[tuple[Entry, _Identity | None]]:
+    """Yield each entry of a folder below the root, with its identity if it is a folder."""
     prefix = folder + "/" if folder else ""
-    with os.scandir(os.path.join(root, folder)) as entries:
-        for entry in entries:
-            yield prefix + entry.name, *_status(entry)
-
-
-def _status(entry: os.DirEntry[str]) -> tuple[os.stat_result | None, OSError | None]:
-    try:
-        status = entry.stat()
-        if stat.S_ISDIR(status.st_mode) and not status.st_ino:
-            status = Path(entry.path).stat()  # on Windows, DirEntry.stat gives no numbers that identify a folder
-    except OSError as error:
-        return None, error
-    return status, None
+    with os.scandir(os.path.join(root, folder)) as found:
+        for item in found:
+            try:
+                status = item.stat()
+                if stat.S_ISDIR(status.st_mode) and not status.st_ino:
+                    status = Path(item.path).stat()  # on Windows, DirEntry.stat gives no numbers that identify a folder
+            except OSError as error:
+                kind = EntryKind.BROKEN_LINK if error.errno in _BROKEN_LINK else EntryKind.UNREADABLE
+                yield Entry(prefix + item.name, None, kind, problem=error.strerror or str(error)), None
+                continue
+            entry = _entry(prefix + item.name, status)
+            yield entry, _identity(status) if entry.kind is EntryKind.FOLDER else None
 
 
 def _identity(status: os.stat_result) -> _Identity:
@@ -265,11 +265,7 @@ def _identity(status: os.stat_result) -> _Identity:
 _BROKEN_LINK = (errno.ENOENT, errno.ELOOP, errno.ENOTDIR)
 
 
-def _entry(path: str, status: os.stat_result | None, error: OSError | None) -> Entry:
-    if error is not None:
-        kind = EntryKind.BROKEN_LINK if error.errno in _BROKEN_LINK else EntryKind.UNREADABLE
-        return Entry(path, None, kind, problem=error.strerror or str(error))
-    assert status is not None
+def _entry(path: str, status: os.stat_result) -> Entry:
     if stat.S_ISREG(status.st_mode):
         return Entry(path, status.st_size)
     return Entry(path, None, EntryKind.FOLDER if stat.S_ISDIR(status.st_mode) else EntryKind.OTHER)

@@ -11,7 +11,7 @@ import msgspec
 
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import MAX_BYTES, Amount, Count, Digest, check_record, parse_json
 from unprocess_gen.dataset.shards import shard_name
 
@@ -151,7 +151,7 @@ def dataset_text(facts: dict[str, Any]) -> str:
 def read_dataset(path: AnyPath) -> dict[str, Any]:
     """Read a ``dataset.json`` and check it against its own SHA-256; DamageError if it is damaged."""
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if (any_path(path).size() or 0) > MAX_BYTES:
             raise ValueError(f"more than {MAX_BYTES} bytes")
         content = path.read_bytes()
         facts = parse_json(content)

@@ -17,7 +17,7 @@ def key_text(index: int) -> str:
 
 def patch_key(index: int, patch: Patch, several: bool) -> str:
     """Key of a sample in its shard: ``00000003``, or ``00000003-p0007`` if images are cut into several patches."""
-    return f"{key_text(index)}-p{patch.number:04d}" if several else key_text(index)
+    return f"{key_text(index)}-p{patch.patch:04d}" if several else key_text(index)
 
 
 def pair_key(sample: str, plan: Plan, several: bool) -> str:

@@ -27,11 +27,10 @@ from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Column, Row, Value, flatten, places_of, rebuild
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.simulation.effects import dark_variance_dn2
-from unprocess_gen.simulation.frames import Counts, Pair, Patch
+from unprocess_gen.simulation.frames import PATCHES, Counts, Pair, Patch
 from unprocess_gen.simulation.plan import (
     ANY_TEXT,
     CLIPS,
-    COORDINATE,
     COUNT,
     FINITE,
     HEX_128,
@@ -55,11 +54,9 @@ TARGET_BYTES = 12
 
 FRAMES = Condition("output.frames is false", lambda config: config.output.frames)
 FOUND_FILES = Condition("the sources are synthetic pictures", lambda config: config.source.place is not None)
-PATCHES = Condition("source.patch is null", lambda config: config.source.patch is not None)
 STORED_TARGETS = Condition("output.targets is empty", lambda config: bool(config.output.targets))
 
 KEY_TEXT = Text(r"\d{8,12}(-p\d{4,12})?(-l\d\dd\d\d)?", "eight digits, then -pNNNN and -lNNdNN if present")
-SIDE = Integers(1, 2**32)
 
 
 def _is_relative(value: Any) -> bool:
@@ -71,20 +68,6 @@ def _is_relative(value: Any) -> bool:
 
 
 RELATIVE_PATH = Limit("a path below the source folder, relative and without .. segments", _is_relative)
-
-
-class Region(PlanRecord, frozen=True):
-    """Size of the frames of a pair, and their place in the full frame."""
-
-    # fmt: off
-    width: Annotated[int, Field("width of the frame; packed planes have half of it", SIDE, "pixels")]
-    height: Annotated[int, Field("height of the frame; packed planes have half of it", SIDE, "pixels")]
-    patch: Annotated[int, Field("number of the patch in its image, from 0", COORDINATE, needs=PATCHES)] = 0
-    patch_y: Annotated[int, Field(
-        "first row of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)] = 0
-    patch_x: Annotated[int, Field(
-        "first column of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)] = 0
-    # fmt: on
 
 
 class Origin(PlanRecord, frozen=True, kw_only=True):
@@ -105,7 +88,7 @@ class Origin(PlanRecord, frozen=True, kw_only=True):
     reason: Annotated[str, Field(
         "reason of the status", Text("[a-z0-9_]*", "a reason such as corrupt"), empty_if="the status is ok")] = ""
     detail: Annotated[str, Field("explanation of the reason, one line", ANY_TEXT, empty_if="the status is ok")] = ""
-    region: Region | None = None
+    patch: Patch | None = None
     orientation: Annotated[int | None, Field(
         "EXIF orientation that was applied to the source, 1 to 8", Integers(1, 8))] = None
     shard: Annotated[int, Field("number of the shard", Integers(0, 10**9), empty_if="")]
@@ -185,7 +168,7 @@ def pair_row(
         source=source.name,
         source_sha256=sha256,
         source_bytes=source.size_bytes,
-        region=Region(patch.width, patch.height, patch.number, patch.y, patch.x),
+        patch=patch,
         orientation=orientation,
         shard=shard,
         clip=source.clip,
@@ -260,10 +243,9 @@ def plan_from_row(row: Row) -> Plan:
 def patch_from_row(row: Row) -> Patch:
     """Part of the full frame that a row's pair shows; DamageError if a value is not allowed."""
     try:
-        region = rebuild(Region, row)
+        return rebuild(Patch, row)
     except ValueError as error:
         raise DamageError(f"row {_key_of(row)}: not a patch ({error})") from error
-    return Patch(region.patch, region.patch_y, region.patch_x, region.height, region.width)
 
 
 def _key_of(row: Row) -> str:

@@ -63,7 +63,7 @@ def compare(folder: AnyPath, new_folder: AnyPath) -> str:
     if not _have_same_rows(old, new):
         _check_digests(old, new)
         raise DamageError(f"{new}: differs from {old}; check that the sources are the same")
-    if old.stat().st_size == new.stat().st_size:
+    if any_path(old).size() == any_path(new).size():
         return f"the same as {folder}, bit for bit"
     return f"the same rows as {folder}, in its cells; {new} has frames too"
 
@@ -85,7 +85,7 @@ def _check_sizes(manifest: AnyPath, root: str) -> None:
         last = name
         path = decode_name(name)
         try:
-            size = sizes[path] if sizes else source_file(root, path).stat().st_size
+            size = sizes[path] if sizes else source_file(root, path).entry().size
         except (OSError, ValueError, KeyError, SourceError):
             raise SourceChangedError(f"source {name}: is missing from {root}; {ADVICE}") from None
         if size != recorded:

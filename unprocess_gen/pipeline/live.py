@@ -227,7 +227,7 @@ class LivePairs:
             prepared = kept.keep(key, (plan, make))
         if plan_epoch and redraws and (rule := patch_rule(settings.config.source)) is not None:
             plan = image.plan
-            patch = list_patches(rule, plan.stream_key, *frame, plan.output.layout, epoch)[patch.number]
+            patch = list_patches(rule, plan.stream_key, *frame, plan.output.layout, epoch)[patch.patch]
         return prepared[0], patch, prepared[1]
 
     def _redrawn(self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int) -> Plan:
@@ -313,6 +313,6 @@ def _crop(plan: Plan, epoch: int, patch: Patch, side: int, number: int) -> Patch
             "shorter side"
         )
     place = plan.place
-    words = crop_words(plan.stream_key, patch.number, place.level, place.draw, frame_word(place.frame, epoch), number)
+    words = crop_words(plan.stream_key, patch.patch, place.level, place.draw, frame_word(place.frame, epoch), number)
     y, x = even_corner(words, side, patch.height, patch.width)
-    return Patch(patch.number, patch.y + y, patch.x + x, side, side)
+    return Patch(side, side, patch.patch, patch.patch_y + y, patch.patch_x + x)

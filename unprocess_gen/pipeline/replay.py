@@ -170,9 +170,9 @@ class PairRegenerator:
         photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source)
         patch = patch_from_row(row)
         height, width = photograph.srgb.shape[:2]
-        if patch.y + patch.height > height or patch.x + patch.width > width:
+        if patch.patch_y + patch.height > height or patch.patch_x + patch.width > width:
             raise DamageError(
-                f"its patch of {patch.width} x {patch.height} pixels at row {patch.y}, column {patch.x} "
+                f"its patch of {patch.width} x {patch.height} pixels at row {patch.patch_y}, column {patch.patch_x} "
                 f"exceeds its source of {width} x {height} pixels"
             )
         image = PlannedImage(photograph.srgb, (plan,), (patch,), dark_folder=self._dark_pixels(plan))

@@ -108,8 +108,8 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
         else:
             what = f"is missing: the job ended with exit code {exit_code}; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage(DATASET, what),))
-    for name in sorted(path.name for path in folder.iterdir() if (path / ".work").exists()):
-        if name not in jobs and not (folder / name / DATASET).exists():
+    for name in sorted(any_path(folder).entries().keys() - jobs.keys()):
+        if (folder / name / ".work").exists() and not (folder / name / DATASET).exists():
             what = "is missing: the sweep ended before this job; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage(DATASET, what),))
 
@@ -161,7 +161,7 @@ def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], expected: 
     ``listed`` has the entries of shards with a file, in ascending order; ``expected`` is empty if the manifest
     cannot be read. Raises DamageError if that is found out on the way.
     """
-    present = {path.name for path in (folder / "shards").iterdir()} if (folder / "shards").is_dir() else set()
+    present = any_path(folder / "shards").entries()
     foreign, damages = set(present), list[Damage]()
     first = next(expected, None)
     shards = _merged(listed, itertools.chain([] if first is None else [first], expected))

@@ -4,32 +4,34 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from unprocess_gen.core.arrays import Frame
-from unprocess_gen.core.fields import FAILED, Condition, Field
-from unprocess_gen.simulation.plan import COUNT, PlanRecord
+from unprocess_gen.core.fields import FAILED, Condition, Field, Integers
+from unprocess_gen.simulation.plan import COORDINATE, COUNT, PlanRecord
 
+PATCHES = Condition("source.patch is null", lambda config: config.source.patch is not None)
+SIDE = Integers(1, 2**32)
 DIVIDED_LIGHT = Condition(
     "scene.exposure_ratio is 1 or output.frames is false",
     lambda config: config.output.frames and config.scene.exposure_ratio != 1,
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Patch:
-    """Rectangle of a full frame: number in the image, row and column of its first pixel, size in pixels.
+class Patch(PlanRecord, frozen=True):
+    """Rectangle of a full frame, which the arrays of a pair show: an uncut image is patch 0 at row 0, column 0."""
 
-    An uncut image is patch 0 at row 0, column 0.
-    """
-
-    number: int
-    y: int
-    x: int
-    height: int
-    width: int
+    # fmt: off
+    width: Annotated[int, Field("width of the frame; packed planes have half of it", SIDE, "pixels")]
+    height: Annotated[int, Field("height of the frame; packed planes have half of it", SIDE, "pixels")]
+    patch: Annotated[int, Field("number of the patch in its image, from 0", COORDINATE, needs=PATCHES)] = 0
+    patch_y: Annotated[int, Field(
+        "first row of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)] = 0
+    patch_x: Annotated[int, Field(
+        "first column of the arrays in the full frame; even", COORDINATE, "pixels", needs=PATCHES)] = 0
+    # fmt: on
 
     @property
     def origin(self) -> tuple[int, int]:
         """Row and column of the first pixel in the full frame."""
-        return self.y, self.x
+        return self.patch_y, self.patch_x
 
 
 def _sites(meaning: str, **details: Any) -> Field:

@@ -25,7 +25,7 @@ def list_patches(
     """List the patches of an image in order; random ones are elsewhere in each epoch."""
     if rule is None:
         side = 2 if layout == PACKED else 1
-        return (Patch(0, 0, 0, height // side * side, width // side * side),)
+        return (Patch(width // side * side, height // side * side),)
     corners: Iterable[tuple[int, int]]
     if rule.kind == "grid":
         rows, columns = (range(0, length - rule.side + 1, rule.stride) for length in (height, width))
@@ -33,7 +33,7 @@ def list_patches(
     else:
         words = patch_words(stream_key, rule.count, epoch)
         corners = (even_corner(place, rule.side, height, width) for place in words)
-    return tuple(Patch(number, y, x, rule.side, rule.side) for number, (y, x) in enumerate(corners))
+    return tuple(Patch(rule.side, rule.side, number, y, x) for number, (y, x) in enumerate(corners))
 
 
 def even_corner(place: tuple[int, int], side: int, height: int, width: int) -> tuple[int, int]:
@@ -44,4 +44,5 @@ def even_corner(place: tuple[int, int], side: int, height: int, width: int) -> t
 
 def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:
     """Cut the pixels of a patch from [H, W, 3]."""
-    return srgb[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width]
+    y, x = patch.origin
+    return srgb[y : y + patch.height, x : x + patch.width]

@@ -119,7 +119,7 @@ def _repetition(clean_dn: Float, plan: Plan, patch: Patch, dark_pixels: DarkPixe
     noisy_dn = order.noisy(np.clip(light_dn, black_dn, plan.brightest_dn), again, origin, dark_pixels)
     if plan.physics is not None:
         line = 1, clean_dn.shape[1]
-        own, other = (order.crop_of(of_plan, line, (0, patch.x), dark_pixels) for of_plan in (plan, again))
+        own, other = (order.crop_of(of_plan, line, (0, patch.patch_x), dark_pixels) for of_plan in (plan, again))
         for effect in order.effects_of(plan):
             noisy_dn += effect.column_offset_dn(own) - effect.column_offset_dn(other)
     low_dn, high_dn = noisy_limits(plan.sensor.bits, black_dn, plan.sensor.sensor_clip)
