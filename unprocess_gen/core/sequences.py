@@ -16,16 +16,18 @@ def evenly_spaced(items: Sequence[_Item], count: int) -> list[_Item]:
 
 
 class Recent(dict[_Key, _Item]):
-    """Keep a bounded number of values by key; its copies and pickles, for other processes, are empty."""
+    """Keep values by key, up to the sum ``most`` of their sizes; copies and pickles, for other processes, are empty."""
 
     def __init__(self, most: int) -> None:
         super().__init__()
-        self._most = most
+        self._most, self._size = most, 0
 
-    def keep(self, key: _Key, value: _Item) -> _Item:
+    def keep(self, key: _Key, value: _Item, size: int = 1) -> _Item:
         """Add a value and return it; a full mapping is emptied first, in one step, because other threads may read."""
-        if len(self) >= self._most:
+        self._size += size
+        if self._size > self._most:
             self.clear()
+            self._size = size
         self[key] = value
         return value
 

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.paths import any_path
-from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.reader import DatasetPath, RawPairs, dataset_folders
+from unprocess_gen.dataset.reader import DatasetPath, RawPairs
 
 
 class _Frames(NamedTuple):
@@ -86,14 +84,12 @@ class RawClips:
     def __init__(self, path: DatasetPath | Sequence[DatasetPath], *, split: str | None = None) -> None:
         self._pairs = RawPairs(path, split=split)
         self.path = self._pairs.path
-        places = [path] if isinstance(path, DatasetPath) else path
-        folders = [folder for place in places for folder in dataset_folders(any_path(place))]
-        rows = ((folder, row) for folder in folders for row in read_rows(folder / "manifest.csv"))
-        pairs = ((folder, row) for folder, row in rows if row["status"] == "ok" and split in (None, row["split"]))
+        datasets = enumerate(self._pairs._datasets)
+        rows = ((dataset, row) for dataset, pairs in datasets for _, row in pairs.pair_rows(split))
         clips: dict[tuple[Any, ...], list[int]] = {}
-        for number, (folder, row) in enumerate(pairs):
+        for number, (dataset, row) in enumerate(rows):
             if row["clip"]:
-                place = str(folder), row["clip"], row["patch"], row["level"], row["draw"]
+                place = dataset, row["clip"], row["patch"], row["level"], row["draw"]
                 clips.setdefault(place, []).append(number)
         if not clips:
             raise ConfigError(f"RawClips: {path}: has no clips; expected a dataset of source.clips=true; use RawPairs")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import bisect
 import copy
 import csv
+import itertools
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol, Self, SupportsIndex, overload
+from typing import Any, NamedTuple, Self, SupportsIndex, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +19,12 @@ from unprocess_gen.core.arrays import FLOAT32, PACKED, UINT16, Float, Frame
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
+from unprocess_gen.core.sequences import Recent
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
 from unprocess_gen.dataset.row import has_frames
 from unprocess_gen.dataset.shards import (
-    ArrayFormat,
     Member,
     arrays_of,
     map_array,
@@ -100,7 +102,7 @@ class RawPairs:
     are in the order of the manifest, without failed sources. Arrays are mapped from the shard. They can be written to;
     the file does not change.
 
-    No file stays open and only the position of each row is kept (12 bytes), so an instance can be pickled, forked and
+    No file stays open and only the position of each row is kept (8 bytes), so an instance can be pickled, forked and
     shared between threads. Needs neither Numba nor OpenCV nor Hydra.
 
     A pair of an object store takes three requests, and more for the first pair of each shard. Such an instance cannot
@@ -149,32 +151,21 @@ class RawPairs:
     def __init__(
         self, path: DatasetPath | Sequence[DatasetPath], *, arrays_only: bool = False, split: str | None = None
     ) -> None:
-        places = [path] if isinstance(path, DatasetPath) else path
-        roots, is_list = tuple(map(any_path, places)), not isinstance(path, DatasetPath)
-        if not roots:
-            raise ConfigError("RawPairs([]): no dataset; expected at least one folder")
-        self.path = roots if is_list else roots[0]
+        self._datasets = open_datasets("RawPairs", path, split, _Dataset)
+        self.path = any_path(path) if isinstance(path, DatasetPath) else tuple(map(any_path, path))
         self.arrays_only = arrays_only
-        self._datasets = [_Dataset(folder) for root in roots for folder in dataset_folders(root)]
-        if is_list:
-            name_apart(self._datasets)
-        offsets = [dataset.offsets(split) for dataset in self._datasets]
-        if is_list and arrays_only:
+        if arrays_only and isinstance(self.path, tuple):
             _check_formats(self._datasets)
-        if split is not None:
-            check_split("RawPairs", split, self._datasets)
-        self._offsets: NDArray[np.int64] = np.concatenate([np.empty(0, np.int64), *offsets])
-        self._dataset_of: NDArray[np.int32] = np.repeat(
-            np.arange(len(offsets), dtype=np.int32), [len(rows) for rows in offsets]
-        )
+        self._starts = [0, *itertools.accumulate(map(len, self._datasets))]
+        self._numbers = range(self._starts[-1])
 
     @property
     def dataset(self) -> tuple[str, ...]:
         """Folder name of each pair's dataset."""
-        return tuple(self._datasets[number].name for number in self._dataset_of)
+        return tuple(self._place(number)[0].name for number in self._numbers)
 
     def __len__(self) -> int:
-        return len(self._offsets)
+        return len(self._numbers)
 
     def __repr__(self) -> str:
         path = [*map(str, self.path)] if isinstance(self.path, tuple) else str(self.path)
@@ -192,36 +183,60 @@ class RawPairs:
     def __getitem__(self, number: SupportsIndex | slice) -> Any:  # two arrays instead of a Sample with arrays_only
         if isinstance(number, slice):
             part = copy.copy(self)
-            part._offsets, part._dataset_of = self._offsets[number], self._dataset_of[number]
+            part._numbers = self._numbers[number]
             return part
-        place = operator.index(number)
-        dataset: _Dataset = self._datasets[int(self._dataset_of[place])]
-        sample = dataset.read(int(self._offsets[place]))
+        dataset, place = self._place(self._numbers[operator.index(number)])
+        sample = dataset.read(place)
         return (*sample[:2], *sample.targets.values()) if self.arrays_only else sample
 
+    def _place(self, number: int) -> tuple[_Dataset, int]:
+        """Dataset of a pair, and the number of the pair in it."""
+        place = bisect.bisect_right(self._starts, number) - 1
+        return self._datasets[place], number - self._starts[place]
 
-class _Dataset:
-    """Read pairs of one dataset by the byte offsets of their rows."""
 
-    def __init__(self, path: AnyPath) -> None:
-        self.path = path
-        self.name = folder_name(path)
+class DatasetRows:
+    """Rows of the pairs of a dataset, or of those in a split, by number; keeps their places in the manifest alone.
+
+    ``name`` is that of the dataset for users, ``splits`` are all that the manifest has.
+    """
+
+    def __init__(self, path: AnyPath, split: str | None = None) -> None:
+        self.path, self.name = path, folder_name(path)
         self._manifest = path / "manifest.csv"
-        self._columns: tuple[str, ...] = ()
-        self._indexes: dict[int, dict[str, Member]] = {}
-        self._members = 0
-        self.formats: set[tuple[Value, ...]] = set()
-        self.splits: set[str] = set()
-
-    def offsets(self, split: str | None = None) -> NDArray[np.int64]:
-        """Offsets of the rows of all pairs, or of those in a split; note all formats and splits."""
         self._columns = read_columns(self._manifest)
-        rows = rows_with_offsets(self._manifest)
-        return np.fromiter((place for place, row in rows if self._is_pair(row, split)), dtype=np.int64)
+        self.splits: set[str] = set()
+        self._offsets = np.fromiter((offset for offset, _ in self.pair_rows(split)), dtype=np.int64)
 
-    def _is_pair(self, row: Row, split: str | None) -> bool:
-        if row["status"] != "ok":
-            return False
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def row(self, number: int) -> dict[str, Value]:
+        """Row of a pair."""
+        return dict(read_row(self._manifest, int(self._offsets[number]), self._columns))
+
+    def pair_rows(self, split: str | None) -> Iterator[tuple[int, Row]]:
+        """Read the rows of pairs in order, with their places in the manifest."""
+        for offset, row in rows_with_offsets(self._manifest):
+            if row["status"] == "ok":
+                self._note(row)
+                if split in (None, row["split"]):
+                    yield offset, row
+
+    def _note(self, row: Row) -> None:
+        """Note what the rows of all pairs have."""
+        self.splits.add(str(row["split"]))
+
+
+class _Dataset(DatasetRows):
+    """Pairs of one dataset: their rows, and their arrays in the shards."""
+
+    def __init__(self, path: AnyPath, split: str | None) -> None:
+        self.formats: set[tuple[Value, ...]] = set()
+        self._indexes: Recent[int, dict[str, Member]] = Recent(MAX_MEMBERS)
+        super().__init__(path, split)
+
+    def _note(self, row: Row) -> None:
         if not has_frames(row):
             raise ConfigError(
                 f"{self.path}: has a manifest without frames (output.frames=false); expected stored frames; read it "
@@ -229,52 +244,49 @@ class _Dataset:
             )
         clean, targets = row["clean_dtype"] or row["dtype"], str(row["targets"]).partition(":")[0] or "no"
         self.formats.add((row["dtype"], clean, row["layout"], targets))
-        self.splits.add(str(row["split"]))
-        return split in (None, row["split"])
+        super()._note(row)
 
-    def read(self, offset: int) -> Sample:
-        """Pair whose row begins at a byte."""
-        row = dict(read_row(self._manifest, offset, self._columns))
-        shard = int(row["shard"] or 0)
-        arrays = {
-            name: self._array(shard, f"{sample_key(row)}.{stored.member}", stored.array)
-            for name, stored in arrays_of(row).items()
-        }
-        return Sample(arrays.pop("clean"), arrays.pop("noisy"), row, self.name, arrays)
-
-    def _array(self, shard: int, name: str, form: ArrayFormat) -> Frame:
-        path = self.path / "shards" / shard_name(shard)
-        member = self._index(shard, path).get(name)
-        if member is None:
-            raise DamageError(f"{path}: member {name} is missing")
-        return map_array(path, member, form)
-
-    def _index(self, shard: int, path: AnyPath) -> dict[str, Member]:
-        """Members of a shard; keep the members of shards that were read before, up to `MAX_MEMBERS`."""
-        index = self._indexes.get(shard)
+    def read(self, number: int) -> Sample:
+        """Read a pair."""
+        row = self.row(number)
+        shard, arrays = int(row["shard"] or 0), dict[str, Frame]()
+        path, index = self.path / "shards" / shard_name(shard), self._indexes.get(shard)
         if index is None:
             index = read_index(path)
-            self._members += len(index)
-            if self._members > MAX_MEMBERS:
-                self._indexes.clear()  # in one step, because other threads may read
-                self._members = len(index)
-            self._indexes[shard] = index
-        return index
+            self._indexes.keep(shard, index, len(index))
+        for name, stored in arrays_of(row).items():
+            member = f"{sample_key(row)}.{stored.member}"
+            if member not in index:
+                raise DamageError(f"{path}: member {member} is missing")
+            arrays[name] = map_array(path, index[member], stored.array)
+        return Sample(arrays.pop("clean"), arrays.pop("noisy"), row, self.name, arrays)
 
 
-class Folder(Protocol):
-    """Folder of a dataset: its path, its name for users, and its splits."""
-
-    path: AnyPath
-    name: str
-    splits: set[str]
+_Rows = TypeVar("_Rows", bound=DatasetRows)
 
 
-def name_apart(datasets: Sequence[Folder]) -> None:
-    """Name datasets by their paths if folders have the same name."""
-    if len({dataset.name for dataset in datasets}) < len(datasets):
+def open_datasets(
+    reader: str,
+    places: DatasetPath | Sequence[DatasetPath],
+    split: str | None,
+    open_folder: Callable[[AnyPath, str | None], _Rows],
+) -> list[_Rows]:
+    """Open a dataset, those of a sweep, or those of a list, which are named by their paths if names occur twice.
+
+    ConfigError, which begins with the class that reads, if the list is empty or no pair is in the split.
+    """
+    roots = [places] if isinstance(places, DatasetPath) else places
+    if not roots:
+        raise ConfigError(f"{reader}([]): no dataset; expected at least one folder")
+    datasets = [open_folder(folder, split) for root in roots for folder in dataset_folders(any_path(root))]
+    if not isinstance(places, DatasetPath) and len({dataset.name for dataset in datasets}) < len(datasets):
         for dataset in datasets:
             dataset.name = str(dataset.path)
+    names = sorted(set().union(*(dataset.splits for dataset in datasets)) - {""})
+    if split is not None and split not in names:
+        expected = f"expected one of {', '.join(names)}" if names else "there are no splits; generate with split={…}"
+        raise ConfigError(f"{reader}: split={split[:40]!r}: no pair is in it; {expected}")
+    return datasets
 
 
 def _check_formats(datasets: Sequence[_Dataset]) -> None:
@@ -289,25 +301,12 @@ def _check_formats(datasets: Sequence[_Dataset]) -> None:
         raise ConfigError(f"RawPairs: arrays_only=True: {problem} ({kinds}); expected one; use arrays_only=False")
 
 
-def check_split(reader: str, split: str, datasets: Sequence[Folder]) -> None:
-    """Raise ConfigError if no pair is in a split; the sentence begins with the class that reads."""
-    names = sorted(set().union(*(dataset.splits for dataset in datasets)) - {""})
-    if split not in names:
-        expected = f"expected one of {', '.join(names)}" if names else "there are no splits; generate with split={…}"
-        raise ConfigError(f"{reader}: split={split[:40]!r}: no pair is in it; {expected}")
-
-
 def dataset_folders(path: AnyPath) -> list[AnyPath]:
     """Folder of a dataset, or the folders of the finished datasets of a sweep."""
     table = path / SWEEP_TABLE
     if (path / "manifest.csv").exists() or not table.exists():
         return [path]
-    return [path / folder for folder in sweep_folders(table)]
-
-
-def sweep_folders(table: AnyPath) -> list[str]:
-    """Names of the folders of the finished datasets of a sweep; raise as `read_sweep_table`."""
-    return [job["folder"] for job in read_sweep_table(table) if job["exit"] in FINISHED]
+    return [path / job["folder"] for job in read_sweep_table(table) if job["exit"] in FINISHED]
 
 
 def read_sweep_table(table: AnyPath) -> list[dict[str, str]]:

@@ -25,7 +25,7 @@ from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.dataset.columns import Value
-from unprocess_gen.dataset.reader import DatasetPath, Sample, check_split, dataset_folders, name_apart
+from unprocess_gen.dataset.reader import DatasetPath, Sample, open_datasets
 from unprocess_gen.dataset.row import COLUMNS
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.live_sources import KEPT, LiveImage, LiveSource, PlannedPairs, RecordedPairs
@@ -281,13 +281,7 @@ def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[Liv
     """Open datasets, or list the sources of a config or of overrides."""
     places = [dataset] if isinstance(dataset, DatasetPath) else [] if isinstance(dataset, Config) else list(dataset)
     if isinstance(dataset, DatasetPath) or any(_is_dataset(place) for place in places):
-        folders = [folder for place in places for folder in dataset_folders(any_path(place))]
-        recorded = [RecordedPairs(folder, root, split) for folder in folders]
-        if not isinstance(dataset, DatasetPath):
-            name_apart(recorded)
-        if split is not None:
-            check_split("LivePairs", split, recorded)
-        return [*recorded]
+        return [*open_datasets("LivePairs", dataset, split, partial(RecordedPairs, root))]
     if split is not None:
         raise ConfigError(
             f"LivePairs: split={split!r}: splits follow from digests of the images; expected the folder of a "

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-
-import numpy as np
 
 from unprocess_gen.config.interpretation import noise_levels, patch_rule
 from unprocess_gen.config.schema import Config, replaced
@@ -16,13 +14,12 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.paths import AnyPath, folder_name
+from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Value
-from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.keys import pair_key, patch_key
-from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
+from unprocess_gen.dataset.reader import DatasetRows
 from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import PairRegenerator, dark_frames_root, source_of, source_root
@@ -91,46 +88,27 @@ class LiveSource(abc.ABC):
         """Decode the image of a pair."""
 
 
-class RecordedPairs(LiveSource):
+class RecordedPairs(DatasetRows, LiveSource):
     """Pairs of a dataset, or of those in a split; reads its manifest and its sources, and no shard."""
 
-    def __init__(self, folder: AnyPath, root: str | None, split: str | None = None) -> None:
-        self.path, self.name = folder, folder_name(folder)
-        self._manifest = folder / "manifest.csv"
-        check_format(folder)
+    def __init__(self, root: str | None, folder: AnyPath, split: str | None = None) -> None:
+        super().__init__(folder, split)
         config, _ = read_dataset_yaml(folder / "config.yaml")
         dark_frames = dark_frames_root(self._manifest)
         self.settings = PairSettings.read(replaced(config, {"noise.dark_frames": dark_frames}))
         self._sources = PairRegenerator(source_root(self._manifest, root), dark_frames)
-        self._columns = read_columns(self._manifest)
-        self.splits: set[str] = set()
-        self._offsets = np.fromiter(self._places(split), dtype=np.int64)
         self._kept: Recent[int, LiveImage] = Recent(KEPT)
-
-    def __len__(self) -> int:
-        return len(self._offsets)
-
-    def _places(self, split: str | None) -> Iterator[int]:
-        for offset, row in rows_with_offsets(self._manifest):
-            if row["status"] == "ok":
-                self.splits.add(str(row["split"]))
-                if split in (None, row["split"]):
-                    yield offset
-
-    def _read(self, offset: int) -> dict[str, Value]:
-        return dict(read_row(self._manifest, offset, self._columns))
 
     def image(self, number: int) -> LiveImage:
         """Read all that decides the pair of a row."""
         image = self._kept.get(number)
         if image is None:
-            offset = int(self._offsets[number])
-            row = self._read(offset)
+            row = self.row(number)
             numbers, noise_dn = (int(row["orientation"] or 1), int(row["shard"] or 0)), row["source_noise_dn"]
             identity = source_of(row), str(row["source_sha256"]), *numbers, str(row["key"])
             assert not isinstance(noise_dn, str)
             parts = plan_from_row(row), patch_from_row(row), noise_dn
-            recorded = partial(self._read, offset) if row["clean_xxh3"] else None
+            recorded = partial(self.row, number) if row["clean_xxh3"] else None
             image = self._kept.keep(number, LiveImage(*identity, *parts, recorded))
         return image
 
