@@ -32,6 +32,20 @@ def samples_json(out: Path) -> dict[str, Any]:
     return samples
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of each file in a folder."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def flip(path: Path, at: int, bit: int = 0) -> None:
+    """Change one bit of a file."""
+    with path.open("r+b") as stream:
+        stream.seek(at)
+        (byte,) = stream.read(1)
+        stream.seek(at)
+        stream.write(bytes([byte ^ 1 << bit]))
+
+
 sweep_rows = functools.partial(text_rows, name="sweep.csv")
 """Return the rows of the table of a sweep."""
 

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from helpers.commands import COMMAND, environment
+from unprocess_gen.core.locks import LockFile
 
 WAIT_S = 300
 
-
 ONE = "output.pairs_per_shard=1"
-
+COUNT = 12
+"""Photographs of the fixture `twelve`."""
 
 SLOW_DISK = """
 import os, time
@@ -204,6 +205,18 @@ def kill_group(process: subprocess.Popen[str]) -> None:
     process.communicate()
 
 
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Lock a folder as a run does."""
+    (folder / ".work").mkdir(parents=True, exist_ok=True)
+    lock = LockFile(folder / ".work/lock")
+    lock.acquire(wait=False)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def assert_complete(out: Path) -> None:
     assert sorted(os.listdir(out)) == ["config.yaml", "dataset.json", "manifest.csv", "shards"]
     entries = json.loads((out / "dataset.json").read_text())["shards"]
@@ -212,3 +225,8 @@ def assert_complete(out: Path) -> None:
 
 class Killed(BaseException):
     """Simulate a kill at this point."""
+
+
+def interrupt(*_: object) -> None:
+    """Simulate Ctrl-C in place of a function."""
+    raise KeyboardInterrupt
