@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import logging
 import threading
 import time
@@ -72,6 +73,17 @@ def upload(folder: Path, to: ObjectPath) -> None:
     for path in sorted(folder.rglob("*")):
         if path.is_file():
             (to / path.relative_to(folder).as_posix()).write_bytes(path.read_bytes())
+
+
+def assert_same(remote: ObjectPath, local: Path) -> None:
+    """Check that a URL has exactly the objects of a local dataset, with the same bytes; apart from run facts."""
+    names = {path.relative_to(local).as_posix() for path in local.rglob("*") if path.is_file()}
+    assert {entry.path for entry in remote.walk_entries()} == names
+    for name in names - {"dataset.json"}:
+        assert (remote / name).read_bytes() == (local / name).read_bytes(), name
+    facts, others = (json.loads((folder / "dataset.json").read_bytes()) for folder in (remote, local))
+    for key in ("fingerprint", "shards", "pairs", "failed", "sites"):
+        assert facts[key] == others[key]
 
 
 def put(endpoint: str, path: ObjectPath, content: bytes) -> None:

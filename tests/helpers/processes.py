@@ -59,23 +59,6 @@ os.fsync = waits
 """
 
 
-POISON = """
-import hashlib, os, pathlib, signal
-
-killer, sha256 = pathlib.Path(os.environ["KILLER"]), hashlib.sha256
-
-
-def deadly(data=b"", **options):
-    if isinstance(data, bytes) and killer.exists() and data == killer.read_bytes():
-        os.kill(os.getpid(), signal.SIGKILL)
-    return sha256(data, **options)
-
-
-hashlib.sha256 = deadly
-"""
-"""Module for `imported_first`: hashing the photograph that KILLER names kills the process."""
-
-
 def slow_shards(seconds: float) -> str:
     """Return a module for `imported_first`: a shard takes ``seconds`` longer."""
     return f"""

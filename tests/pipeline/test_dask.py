@@ -8,12 +8,10 @@ from __future__ import annotations
 import json
 import os
 import random
-import shutil
 import signal
-import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,12 +20,13 @@ import pytest
 from helpers.commands import Cli, RunMain, messages
 from helpers.dask_cluster import DaskCluster, dask_cluster
 from helpers.datasets import Make, TreeHash
+from helpers.object_store import assert_same
 from helpers.photographs import fill
 from helpers.processes import (
     ONE,
-    POISON,
-    assert_complete,
+    free_port,
     imported_first,
+    interrupt,
     processes_per_core,
     running,
     session,
@@ -38,14 +37,16 @@ from helpers.processes import (
 from helpers.promise_report import Figure
 
 from unprocess_gen.core.object_store import ObjectPath
-from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline.verify import verify
 
-pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra dask")
+pytestmark = [
+    pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra dask"),
+    pytest.mark.usefixtures("photographs"),
+]
 
-COUNT = 12
 ROOT = "source.root=p"
+Check = Callable[[Path], None]
 
 
 @pytest.fixture(scope="module")
@@ -54,24 +55,10 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
         yield started
 
 
-@pytest.fixture(scope="module")
-def undisturbed(make: Make, tree_hash: TreeHash, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Make the dataset of twelve photographs locally, and return its hash."""
-    folder = tmp_path_factory.mktemp("undisturbed")
-    make(fill(folder / "p", COUNT), folder / "ds", ONE)
-    return tree_hash(folder / "ds")
-
-
-@pytest.fixture
-def photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return fill(tmp_path / "p", COUNT)
-
-
-def committed(out: Path) -> dict[str, tuple[int, int]]:
-    """Return inode and time of each shard that has a record."""
+def committed(out: Path) -> dict[str, int]:
+    """Return the inode of each shard that has a record."""
     return {
-        path.name: (path.stat().st_ino, path.stat().st_mtime_ns)
+        path.name: path.stat().st_ino
         for path in (out / "shards").glob("*.tar")
         if (out / ".work/rows" / f"{path.stem.removeprefix('shard-')}.json").exists()
     }
@@ -81,14 +68,12 @@ def committed(out: Path) -> dict[str, tuple[int, int]]:
 
 
 def test_cluster_makes_the_bytes_of_a_local_run(
-    cluster: DaskCluster, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+    cluster: DaskCluster, run_main: RunMain, assert_undisturbed: Check, tmp_path: Path
 ) -> None:
     done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
     assert (done.code, done.out.split(",")[0]) == (0, "ds: 12 pairs"), done.err
     assert "12/12 images" in done.err
-    assert tree_hash(tmp_path / "ds") == undisturbed
-    assert verify(tmp_path / "ds") == []
-    assert_complete(tmp_path / "ds")
+    assert_undisturbed(tmp_path / "ds")
     run = json.loads((tmp_path / "ds/dataset.json").read_text())["run"]
     assert (run["executor"], run["n_jobs"], run["shards_made"]) == ("dask", 2, 12)
     assert run["decode_s"] > 0
@@ -96,61 +81,43 @@ def test_cluster_makes_the_bytes_of_a_local_run(
     assert (again.code, "nothing to do" in again.out) == (0, True)
 
 
-def test_run_that_a_local_one_began_is_finished_by_dask(
-    cluster: DaskCluster, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
-) -> None:
-    assert run_main("part", "0/2", ROOT, ONE, "n_jobs=1", "out=ds", "-q").code == 0
-    before = committed(tmp_path / "ds")
-    done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
-    assert (done.code, len(before)) == (0, 6), done.err
-    assert tree_hash(tmp_path / "ds") == undisturbed
-    assert {path.name: path.stat().st_ino for path in (tmp_path / "ds/shards").iterdir()}.items() >= {
-        name: inode for name, (inode, _) in before.items()
-    }.items()
-
-
-def test_run_that_dask_began_is_finished_locally(
-    cluster: DaskCluster,
-    photographs: Path,
-    run_main: RunMain,
-    undisturbed: str,
-    tree_hash: TreeHash,
-    tmp_path: Path,
+@pytest.mark.parametrize("first", ["local", "dask"])
+def test_run_begun_one_way_is_finished_the_other(
+    first: str, cluster: DaskCluster, run_main: RunMain, assert_undisturbed: Check, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
+) -> None:  # fmt: skip
+    executors = {"local": ("n_jobs=1",), "dask": cluster.overrides}
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "_count", interrupted)
-        done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
-    assert (done.code, len(committed(tmp_path / "ds")) > 0) == (130, True)
-    assert run_main(ROOT, ONE, "n_jobs=1", "out=ds").code == 0
-    assert tree_hash(tmp_path / "ds") == undisturbed
+        patch.setattr(runner, "_count", interrupt)
+        assert run_main(ROOT, ONE, "out=ds", *executors.pop(first)).code == 130
+    before = committed(tmp_path / "ds")
+    assert before
+    ((_, other),) = executors.items()
+    assert run_main(ROOT, ONE, "out=ds", *other).code == 0
+    assert_undisturbed(tmp_path / "ds")
+    assert {path.name: path.stat().st_ino for path in (tmp_path / "ds/shards").iterdir()}.items() >= before.items()
 
 
 # Refusals -------------------------------------------------------------------------------------------------------------
 
 
-def test_no_scheduler_at_the_address_ends_with_one_line(photographs: Path, run_main: RunMain) -> None:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{unused.getsockname()[1]}"
-        done = run_main(ROOT, "executor=dask", f"executor.address={address}", "executor.no_workers_s=1", "out=ds")
-    expected = f"gen-dataset: executor.address={address}: no Dask scheduler answers; start one with dask scheduler, "
-    assert (done.code, done.err) == (5, f"{expected}then rerun\n")
-
-
-@pytest.mark.parametrize("address", ["nowhere", "xyz://127.0.0.1:1"])
-def test_unusable_address_is_refused(address: str, photographs: Path, run_main: RunMain) -> None:
+@pytest.mark.parametrize(
+    ("address", "code", "problem"),
+    [
+        (f"tcp://127.0.0.1:{free_port()}", 5, "no Dask scheduler answers; start one with dask scheduler, then rerun\n"),
+        ("nowhere", 2, "cannot be used"),
+        ("xyz://127.0.0.1:1", 2, "cannot be used"),
+    ],
+    ids=["no scheduler", "no URL", "no protocol"],
+)
+def test_unusable_address_is_reported_in_one_line(address: str, code: int, problem: str, run_main: RunMain) -> None:
     done = run_main(ROOT, "executor=dask", f"executor.address={address}", "executor.no_workers_s=1", "out=ds")
-    assert done.code == 2
-    assert f"executor.address={address}: cannot be used" in done.err
-    assert len(done.err.splitlines()) == 1
+    assert (done.code, done.err.count("\n")) == (code, 1)
+    assert f"gen-dataset: executor.address={address}: {problem}" in done.err
 
 
 @pytest.mark.slow
-def test_scheduler_without_workers_ends_the_run(photographs: Path, run_main: RunMain, tmp_path: Path) -> None:
+def test_scheduler_without_workers_ends_the_run(run_main: RunMain, tmp_path: Path) -> None:
     with dask_cluster(tmp_path / "cluster", workers=0) as empty:
         started = time.monotonic()
         done = run_main(ROOT, ONE, "out=ds", *empty.overrides, "executor.no_workers_s=2")
@@ -165,31 +132,8 @@ def test_scheduler_without_workers_ends_the_run(photographs: Path, run_main: Run
 
 @pytest.mark.slow
 @pytest.mark.linux_only("kills a process by a signal")
-def test_photograph_that_kills_its_workers_gets_provisional_rows(
-    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, figure: Figure, tmp_path: Path
-) -> None:
-    killer = shutil.copy(photographs / "004.png", tmp_path / "killer.png")
-    env = imported_first(tmp_path, POISON) | {"KILLER": str(killer)}
-    with dask_cluster(tmp_path / "cluster", env=env) as cluster:
-        started = time.monotonic()
-        done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
-        seconds = time.monotonic() - started
-        assert done.code == 3, done.err
-        warnings = messages(done.err)
-        assert warnings == ["gen-dataset: 004.png: its worker died four times; run the same command again to retry it"]
-        reasons = [(row["source"], row["reason"]) for row in read_rows(tmp_path / "ds/manifest.csv") if row["reason"]]
-        assert reasons == [("004.png", "worker_died")]
-        assert seconds < 60 * processes_per_core()
-        Path(killer).unlink()
-        assert run_main(ROOT, ONE, "out=ds", *cluster.overrides).code == 0
-    assert tree_hash(tmp_path / "ds") == undisturbed
-    figure("dask", f"photograph that kills its worker: {seconds:.0f} s")
-
-
-@pytest.mark.slow
-@pytest.mark.linux_only("kills a process by a signal")
 def test_scheduler_that_dies_ends_the_run_with_one_line(
-    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+    run_main: RunMain, assert_undisturbed: Check, tmp_path: Path
 ) -> None:
     env = imported_first(tmp_path, slow_shards(0.5))
     with (
@@ -206,22 +150,16 @@ def test_scheduler_that_dies_ends_the_run_with_one_line(
         "shards are kept; run the same command again to resume"
     ]
     assert run_main(ROOT, ONE, "n_jobs=1", "out=ds").code == 0
-    assert tree_hash(tmp_path / "ds") == undisturbed
+    assert_undisturbed(tmp_path / "ds")
 
 
 @pytest.mark.slow
-def test_cluster_writes_to_an_object_store(
-    photographs: Path, run_main: RunMain, bucket: ObjectPath, tmp_path: Path
-) -> None:
-    assert run_main(ROOT, ONE, "n_jobs=1", "out=local").code == 0
-    local = json.loads((tmp_path / "local/dataset.json").read_text())
+def test_cluster_writes_to_an_object_store(twelve: Path, run_main: RunMain, bucket: ObjectPath, tmp_path: Path) -> None:
     with dask_cluster(tmp_path / "cluster") as cluster:
         done = run_main(ROOT, ONE, f"out={bucket}/ds", *cluster.overrides)
     assert done.code == 0, done.err
-    remote = json.loads((bucket / "ds/dataset.json").read_text())
-    assert (remote["fingerprint"], remote["shards"]) == (local["fingerprint"], local["shards"])
+    assert_same(bucket / "ds", twelve / "ds")
     assert verify(bucket / "ds") == []
-    assert sorted(path.name for path in (bucket / "ds").iterdir()) == sorted(os.listdir(tmp_path / "local"))
 
 
 @pytest.mark.slow
@@ -229,11 +167,9 @@ def test_cluster_writes_to_an_object_store(
 @pytest.mark.parametrize("own", [True, False])
 def test_interrupt_ends_the_run_in_a_second(
     own: bool,
-    photographs: Path,
     cluster: DaskCluster,
     cli: Cli,
-    undisturbed: str,
-    tree_hash: TreeHash,
+    assert_undisturbed: Check,
     tmp_path: Path,
 ) -> None:
     executor = ("executor=dask", "n_jobs=2") if own else cluster.overrides
@@ -246,16 +182,13 @@ def test_interrupt_ends_the_run_in_a_second(
         seconds = time.monotonic() - started
         assert process.stderr is not None
         lines = messages(process.stderr.read())
-        assert (code, lines) == (
-            130,
-            ["gen-dataset: interrupted; finished shards are kept; run the same command again to resume"],
-        )
+        text = "gen-dataset: interrupted; finished shards are kept; run the same command again to resume"
+        assert (code, lines) == (130, [text])
         wait_for(lambda: not session(process.pid), 10)
     assert seconds < 2.5 * processes_per_core()
     done = cli(ROOT, ONE, "out=ds", *executor)
     assert (done.returncode, messages(done.stderr)) == (0, [])
-    assert tree_hash(tmp_path / "ds") == undisturbed
-    assert_complete(tmp_path / "ds")
+    assert_undisturbed(tmp_path / "ds")
 
 
 OTHER_VERSION = """
@@ -267,7 +200,7 @@ importlib.metadata.version = lambda name: "9.9" if name == "unprocess_gen" else 
 
 
 @pytest.mark.slow
-def test_worker_of_another_version_is_refused(photographs: Path, run_main: RunMain, tmp_path: Path) -> None:
+def test_worker_of_another_version_is_refused(run_main: RunMain, tmp_path: Path) -> None:
     with dask_cluster(tmp_path / "cluster", workers=0) as cluster:
         cluster.add_worker(**imported_first(tmp_path, OTHER_VERSION))
         done = run_main(ROOT, ONE, "out=ds", *cluster.overrides)

@@ -14,21 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import object_store as servers
-from helpers.commands import RunMain
-from helpers.configs import composed
+from helpers.commands import RunMain, messages
 from helpers.datasets import Make
-from helpers.object_store import Proxy
-from helpers.photographs import fill
+from helpers.object_store import Proxy, assert_same
 from helpers.processes import ONE, kill_group, running, wait_for
 
 import unprocess_gen as ug
-from unprocess_gen.config.schema import Config, replaced
-from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.object_store import TEMPORARY_PREFIX, ObjectPath
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.generate import Summary, generate
+from unprocess_gen.pipeline.generate import Summary
 from unprocess_gen.pipeline.run import LISTING
 
 
@@ -42,63 +38,33 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def twelve(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return fill(tmp_path_factory.mktemp("twelve") / "p", 12)
+@pytest.fixture
+def photos(twelve: Path, bucket: ObjectPath) -> ObjectPath:
+    """Return a URL with the twelve photographs."""
+    servers.upload(twelve / "p", bucket / "photos")
+    return bucket / "photos"
 
 
-@pytest.fixture(scope="module")
-def undisturbed(twelve: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a local dataset of `twelve`, one pair in a shard."""
-    out = tmp_path_factory.mktemp("undisturbed") / "ds"
-    make(twelve, out, ONE)
-    return out
-
-
-def config_of(root: object, out: object, *overrides: str) -> Config:
-    config = composed(ONE, "n_jobs=1", *overrides)
-    config = replaced(config, {"source.root": str(root), "out": str(out)})
-    validate_config(config)
-    return config
-
-
-def assert_same(remote: ObjectPath, local: Path) -> None:
-    """Check that a URL has exactly the objects of a local dataset, with the same bytes; apart from run facts."""
-    names = {path.relative_to(local).as_posix() for path in local.rglob("*") if path.is_file()}
-    assert {entry.path for entry in remote.walk_entries()} == names
-    for name in names - {"dataset.json"}:
-        assert (remote / name).read_bytes() == (local / name).read_bytes(), name
-    facts, others = (
-        json.loads((remote / "dataset.json").read_bytes()),
-        json.loads((local / "dataset.json").read_bytes()),
-    )
-    for key in ("fingerprint", "shards", "pairs", "failed", "sites"):
-        assert facts[key] == others[key]
-
-
-def test_url_gets_the_bytes_of_a_folder(
-    twelve: Path, bucket: ObjectPath, undisturbed: Path, scratch: Path, run_main: RunMain
-) -> None:
+def test_url_gets_the_bytes_of_a_folder(twelve: Path, bucket: ObjectPath, scratch: Path, run_main: RunMain) -> None:
     out = bucket / "made" / "ds"
-    arguments = (f"source.root={twelve}", f"out={out}", ONE, "n_jobs=1")
+    arguments = (f"source.root={twelve / 'p'}", f"out={out}", ONE, "n_jobs=1")
     done = run_main(*arguments)
     assert (done.code, done.out.startswith(f"{out}: 12 pairs, 0.1 MB, ")) == (0, True)
-    assert_same(out, undisturbed)
+    assert_same(out, twelve / "ds")
     assert not list(scratch.iterdir())
     again = run_main(*arguments)
     assert (again.code, again.out.partition(":")[0]) == (0, f"{out} is complete".partition(":")[0])
-    np.testing.assert_array_equal(ug.RawPairs(str(out))[3].noisy, ug.RawPairs(undisturbed)[3].noisy)
+    np.testing.assert_array_equal(ug.RawPairs(str(out))[3].noisy, ug.RawPairs(twelve / "ds")[3].noisy)
     assert ug.verify(str(out)) == []
 
 
 @pytest.mark.slow
 def test_bucket_to_bucket_records_both_urls(
-    twelve: Path, bucket: ObjectPath, undisturbed: Path, run_main: RunMain, tmp_path: Path
+    twelve: Path, photos: ObjectPath, bucket: ObjectPath, run_main: RunMain, make: Make
 ) -> None:
-    servers.upload(twelve, bucket / "photos")
-    generate(config_of(bucket / "photos", bucket / "ds"))
-    assert_same(bucket / "ds", undisturbed)
-    assert json.loads((bucket / "ds/dataset.json").read_bytes())["source"]["root"] == str(bucket / "photos")
+    make(photos, bucket / "ds", ONE)
+    assert_same(bucket / "ds", twelve / "ds")
+    assert json.loads((bucket / "ds/dataset.json").read_bytes())["source"]["root"] == str(photos)
     done = run_main("again", str(bucket / "ds"), f"out={bucket}/again", "n_jobs=1")
     assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {bucket}/ds, bit for bit")
     done = run_main("again", str(bucket / "ds"), f"out={bucket}/ds")
@@ -106,17 +72,16 @@ def test_bucket_to_bucket_records_both_urls(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [20])
 def test_killed_run_ends_as_if_undisturbed(
-    kills: int, twelve: Path, bucket: ObjectPath, undisturbed: Path, scratch: Path, proxy: Proxy, tmp_path: Path
+    twelve: Path, bucket: ObjectPath, scratch: Path, proxy: Proxy, tmp_path: Path
 ) -> None:
     """Each kill comes a few random milliseconds after the next request that writes; no shard is ever incomplete."""
     moment = random.Random(18)
     out = bucket / "ds"
-    arguments = (f"source.root={twelve}", f"out={out}", ONE)
-    sizes = {path.name: path.stat().st_size for path in (undisturbed / "shards").iterdir()}
+    arguments = (f"source.root={twelve / 'p'}", f"out={out}", ONE)
+    sizes = {path.name: path.stat().st_size for path in (twelve / "ds/shards").iterdir()}
     proxy.delay_s = 0.02
-    for kill in range(kills):
+    for kill in range(20):
         wanted = proxy.count("PUT") + kill % 3
         with running(*arguments, f"n_jobs={1 + kill % 2}", cwd=tmp_path) as process:
             wait_for(lambda n=wanted: proxy.count("PUT") > n or process.poll() is not None)
@@ -126,36 +91,34 @@ def test_killed_run_ends_as_if_undisturbed(
     proxy.delay_s = 0
     with running(*arguments, "n_jobs=1", cwd=tmp_path) as process:
         assert process.wait() == 0, process.communicate()
-    assert_same(out, undisturbed)
+    assert_same(out, twelve / "ds")
     assert not list(scratch.glob(f"{TEMPORARY_PREFIX}*"))
 
 
-def test_committed_shards_are_not_made_twice(
-    twelve: Path, bucket: ObjectPath, undisturbed: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = config_of(twelve, bucket / "ds")
-
-    def fail_at_seventh(method: str, path: str) -> int:
-        return 403 if method == "PUT" and path.endswith("00007.tar") else 0
-
-    proxy.answer = fail_at_seventh
+def make_seven(make: Make, proxy: Proxy, root: object, out: ObjectPath) -> None:
+    """Begin a run whose eighth shard cannot be written."""
+    proxy.answer = lambda method, path: 403 if method == "PUT" and path.endswith("00007.tar") else 0
     with pytest.raises(MachineError, match=r"shard-00007\.tar: access was refused"):
-        generate(config)
-    assert len((bucket / "ds/.work/rows").entries()) == len((bucket / "ds/shards").entries()) == 7
+        make(root, out, ONE)
     proxy.answer = lambda *_: 0
+    assert len((out / ".work/rows").entries()) == len((out / "shards").entries()) == 7
+
+
+def test_committed_shards_are_not_made_twice(twelve: Path, bucket: ObjectPath, proxy: Proxy, make: Make) -> None:
+    make_seven(make, proxy, twelve / "p", bucket / "ds")
     proxy.requests.clear()
-    assert generate(config).made == 5
+    assert make(twelve / "p", bucket / "ds", ONE).made == 5
     written = [path for method, path in proxy.requests if method == "PUT" and "/shards/" in path]
     assert len(written) == 5
-    assert_same(bucket / "ds", undisturbed)
+    assert_same(bucket / "ds", twelve / "ds")
 
 
-def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, undisturbed: Path) -> None:
+def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, make: Make) -> None:
     outcomes: list[Summary | Exception] = []
 
     def run() -> None:
         try:
-            outcomes.append(generate(config_of(twelve, bucket / "ds")))
+            outcomes.append(make(twelve / "p", bucket / "ds", ONE))
         except Exception as error:
             outcomes.append(error)
 
@@ -166,33 +129,32 @@ def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, un
         thread.join()
     assert any(isinstance(outcome, Summary) for outcome in outcomes), outcomes
     assert all(isinstance(outcome, Summary | MachineError | DamageError) for outcome in outcomes), outcomes
-    assert generate(config_of(twelve, bucket / "ds")).made == 0
-    assert_same(bucket / "ds", undisturbed)
+    assert make(twelve / "p", bucket / "ds", ONE).made == 0
+    assert_same(bucket / "ds", twelve / "ds")
 
 
 @pytest.mark.slow
 def test_run_with_other_settings_loses_the_race(
-    twelve: Path, bucket: ObjectPath, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+    twelve: Path, bucket: ObjectPath, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     create = OutFolder.create
 
     def begun_by_another(*arguments: Any) -> bool:
         monkeypatch.setattr(OutFolder, "create", create)
-        generate(config_of(twelve, bucket / "ds"))
+        make(twelve / "p", bucket / "ds", ONE)
         return create(*arguments)
 
     monkeypatch.setattr(OutFolder, "create", begun_by_another)
     with pytest.raises(ConfigError, match=r"was begun with other settings: seed=4 \(there: 0\)"):
-        generate(config_of(twelve, bucket / "ds", "seed=4"))
-    assert_same(bucket / "ds", undisturbed)
+        make(twelve / "p", bucket / "ds", ONE, "seed=4")
+    assert_same(bucket / "ds", twelve / "ds")
 
 
-def test_run_with_other_sources_loses_the_race(twelve: Path, bucket: ObjectPath) -> None:
+def test_run_with_other_sources_loses_the_race(twelve: Path, bucket: ObjectPath, make: Make) -> None:
     """The listing is never replaced."""
-
     OutFolder(bucket / "ds").create(LISTING, b'["000.png",1]\n')
     with pytest.raises(ConfigError, match=r"ds: was begun with other sources"):
-        generate(config_of(twelve, bucket / "ds"))
+        make(twelve / "p", bucket / "ds", ONE)
 
 
 def test_interrupted_upload_leaves_no_object(bucket: ObjectPath, proxy: Proxy, tmp_path: Path) -> None:
@@ -204,55 +166,49 @@ def test_interrupted_upload_leaves_no_object(bucket: ObjectPath, proxy: Proxy, t
     assert not (bucket / "shard").exists()
 
 
-def test_object_changed_between_runs_is_refused(twelve: Path, bucket: ObjectPath, proxy: Proxy) -> None:
-    servers.upload(twelve, bucket / "photos")
-    config = config_of(bucket / "photos", bucket / "ds")
-    proxy.answer = lambda method, path: 403 if path.endswith("00007.tar") else 0
-    with pytest.raises(MachineError):
-        generate(config)
-    proxy.answer = lambda *_: 0
-    changed = next((bucket / "photos").walk_entries())
-    content = bytearray((bucket / "photos" / changed.path).read_bytes())
-    content[-1] ^= 1
-    (bucket / "photos" / changed.path).write_bytes(bytes(content))
-    with pytest.raises(ConfigError, match=f"was begun with other sources: {changed.path} has other bytes than it had"):
-        generate(config)
+def last_of(photos: ObjectPath) -> str:
+    return sorted(entry.path for entry in photos.walk_entries())[-1]
 
 
-def test_object_changed_during_a_run_ends_with_5(
-    twelve: Path, bucket: ObjectPath, proxy: Proxy, run_main: RunMain
+def changed(path: ObjectPath) -> bytes:
+    """Return the content of an object with one bit changed."""
+    content = path.read_bytes()
+    return content[:-1] + bytes([content[-1] ^ 1])
+
+
+def test_object_changed_between_runs_is_refused(
+    photos: ObjectPath, bucket: ObjectPath, proxy: Proxy, make: Make
 ) -> None:
-    servers.upload(twelve, bucket / "photos")
-    last = sorted(entry.path for entry in (bucket / "photos").walk_entries())[-1]
+    make_seven(make, proxy, photos, bucket / "ds")
+    last = last_of(photos)
+    (photos / last).write_bytes(changed(photos / last))
+    with pytest.raises(ConfigError, match=f"was begun with other sources: {last} has other bytes than it had"):
+        make(photos, bucket / "ds", ONE)
 
-    def change(method: str, path: str) -> int:
-        if method == "PUT" and path.endswith("00000.tar"):
+
+@pytest.mark.parametrize("fault", ["changed since it was listed", "was deleted or moved after listing"])
+def test_object_changed_or_deleted_during_a_run_ends_with_5(
+    fault: str, photos: ObjectPath, bucket: ObjectPath, proxy: Proxy, run_main: RunMain
+) -> None:
+    last = last_of(photos)
+    content = changed(photos / last)
+
+    def answer(method: str, path: str) -> int:
+        if fault.startswith("changed") and method == "PUT" and path.endswith("00000.tar"):
             proxy.answer = lambda *_: 0
-            content = (twelve / last).read_bytes()
-            servers.put(proxy.target, bucket / "photos" / last, content[:-1] + bytes([content[-1] ^ 1]))
-        return 0
+            servers.put(proxy.target, photos / last, content)
+        return 404 if "deleted" in fault and method in ("GET", "HEAD") and path.endswith(last) else 0
 
-    proxy.answer = change
-    done = run_main(f"source.root={bucket}/photos", f"out={bucket}/ds", ONE, "n_jobs=1", "check_disk=false")
-    assert done.code == 5
-    assert f"source {last} changed since it was listed" in done.err and "Traceback" not in done.err
-
-
-def test_deleted_object_ends_with_5(twelve: Path, bucket: ObjectPath, proxy: Proxy, run_main: RunMain) -> None:
-    servers.upload(twelve, bucket / "photos")
-    last = sorted(entry.path for entry in (bucket / "photos").walk_entries())[-1]
-    proxy.answer = lambda method, path: 404 if method in ("GET", "HEAD") and path.endswith(last) else 0
-    done = run_main(f"source.root={bucket}/photos", f"out={bucket}/ds", ONE, "n_jobs=1", "check_disk=false")
-    assert done.code == 5
-    assert f"{last} was deleted or moved after listing" in done.err
+    proxy.answer = answer
+    done = run_main(f"source.root={photos}", f"out={bucket}/ds", ONE, "n_jobs=1", "check_disk=false")
+    assert (done.code, f"{last} {fault}" in done.err, len(messages(done.err))) == (5, True, 1), done.err
 
 
 def test_run_in_parts_writes_the_same_bytes(
-    twelve: Path, bucket: ObjectPath, undisturbed: Path, scratch: Path, run_main: RunMain
+    twelve: Path, photos: ObjectPath, bucket: ObjectPath, scratch: Path, run_main: RunMain
 ) -> None:
     out = bucket / "ds"
-    servers.upload(twelve, bucket / "photos")
-    settings = (f"source.root={bucket}/photos", f"out={out}", ONE, "n_jobs=1", "-q")
+    settings = (f"source.root={photos}", f"out={out}", ONE, "n_jobs=1", "-q")
     for number in (2, 0, 2):
         assert run_main("part", f"{number}/3", *settings).code == 0
     early = run_main("merge", str(out))
@@ -260,17 +216,14 @@ def test_run_in_parts_writes_the_same_bytes(
     assert not (out / "dataset.json").exists()
     assert run_main("part", "1/3", *settings).code == 0
     assert run_main("merge", str(out)).code == 0
-    assert_same(out, undisturbed)
+    assert_same(out, twelve / "ds")
     assert not list(scratch.iterdir())
 
 
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (
-            ("out=s3://no-such-bucket/ds",),
-            "out=s3://no-such-bucket/ds: the bucket no-such-bucket does not exist (404 Not Found, NoSuchBucket",
-        ),
+        (("out=s3://none/ds",), "out=s3://none/ds: the bucket none does not exist (404 Not Found, NoSuchBucket"),
         (("out={}/ds/inner",), "out={}/ds/inner: is inside the dataset {}/ds"),
         (("out={}/foreign",), "out={}/foreign: contains notes.txt, but no config.yaml"),
         (("out={}/ds", "seed=1"), "out={}/ds: was begun with other settings: seed=1 (there: 0)"),
@@ -280,12 +233,12 @@ def test_run_in_parts_writes_the_same_bytes(
     ids=["bucket", "inner", "foreign", "settings", "sweep", "report"],
 )
 def test_wrong_out_is_refused_before_anything_is_written(
-    arguments: tuple[str, ...], error: str, twelve: Path, bucket: ObjectPath, run_main: RunMain
+    arguments: tuple[str, ...], error: str, twelve: Path, bucket: ObjectPath, run_main: RunMain, make: Make
 ) -> None:
-    generate(config_of(twelve, bucket / "ds", "source.limit=1"))
+    make(twelve / "p", bucket / "ds", ONE, "source.limit=1")
     (bucket / "foreign/notes.txt").write_bytes(b"mine")
     before = sorted(bucket.walk_entries())
-    done = run_main(*(word.format(bucket) for word in arguments), f"source.root={twelve}", "source.limit=1", ONE)
+    done = run_main(*(word.format(bucket) for word in arguments), f"source.root={twelve / 'p'}", "source.limit=1", ONE)
     assert done.code == 2
     assert error.format(bucket, bucket) in done.err and "Traceback" not in done.err
     assert sorted(bucket.walk_entries()) == before
@@ -296,7 +249,7 @@ def test_signal_ends_a_run_without_leftovers(
     twelve: Path, bucket: ObjectPath, proxy: Proxy, scratch: Path, tmp_path: Path
 ) -> None:
     proxy.delay_s = 0.05
-    with running(f"source.root={twelve}", f"out={bucket}/ds", ONE, "n_jobs=1", cwd=tmp_path) as process:
+    with running(f"source.root={twelve / 'p'}", f"out={bucket}/ds", ONE, "n_jobs=1", cwd=tmp_path) as process:
         wait_for(lambda: any("shard-00001.tar" in path for _, path in proxy.requests))
         process.send_signal(signal.SIGTERM)
         assert process.wait() == 143
