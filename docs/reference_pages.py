@@ -12,12 +12,13 @@ from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Flag, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_options, default_values
-from unprocess_gen.config.distributions import DISTRIBUTIONS, ISO_FORMS
+from unprocess_gen.config.distributions import DISTRIBUTIONS
 from unprocess_gen.config.distributions import spelled as spelled_form
 from unprocess_gen.config.interpretation import needed_numbers
+from unprocess_gen.config.iso_forms import ISO_FORMS
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, ProvenanceConfig, all_settings, group_settings
-from unprocess_gen.config.settings import Setting, settings_of
+from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, ProvenanceConfig
+from unprocess_gen.config.settings import Setting, all_settings, settings_of
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.core.fields import value_text
 from unprocess_gen.dataset.columns import TYPE_NAMES
@@ -86,17 +87,13 @@ An effect is simulated only if the noise profile gives its numbers."""
 def settings_page() -> str:
     """Return the page of all settings: options, keys, distributions and the numbers of noise profiles."""
     defaults = default_options()
-    blocks = [
-        SETTINGS_INTRODUCTION,
-        "## Top level",
-        _keys("", {key: one for key, one in all_settings().items() if "." not in key}),
-    ]
+    blocks = [SETTINGS_INTRODUCTION, "## Top level", _keys("", settings_of(Config))]
     for group, kind in GROUPS.items():
         blocks += [f"## `{group}`", _first_line(kind)]
         options = [option for option in group_options(group) if option != "default"]
         if options:
             blocks.append(_options(group, options, defaults[group]))
-        settings = group_settings(group)
+        settings = all_settings(kind)
         if options and len(options) > 1:
             chosen = f", with their values in `{group}={defaults[group]}`" if defaults[group] else ""
             blocks.append(f"Keys{chosen}:")
@@ -136,9 +133,6 @@ def _options(group: str, options: Iterable[str], default: str) -> str:
 def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
     """Return the table of a group's keys; ``None`` stands for the branches, which have no defaults."""
     values = {} if group is None else default_values(group)
-    for nested in NESTED:
-        outer, _, inner = nested.partition(".")
-        values |= {f"{inner}.{key}": value for key, value in default_values(nested).items() if outer == group}
     head = ["key", "default", "unit", "allowed", "meaning"]
     rows = [
         [
@@ -158,7 +152,7 @@ def _forms(forms: Mapping[str, object]) -> str:
     rows = []
     for name, form in {**DISTRIBUTIONS, **ISO_FORMS}.items():
         if name in forms:
-            written = "a number" if name == "constant" else spelled_form(name, form)
+            written = "a number" if name == "constant" else spelled_form(name, form.numbers)
             rows.append([code(written), form.meaning])
     return table(["form", "meaning"], rows)
 
@@ -170,7 +164,7 @@ def _effect_numbers() -> str:
 
 
 def _not_data() -> str:
-    names = [f"`{key}`" for key, one in all_settings().items() if not one.decides_data]
+    names = [f"`{name}`" for name, one in all_settings(Config).items() if not one.decides_data]
     return (
         "## Settings that do not decide the data\n\n"
         "The bytes of a dataset do not depend on these keys. `config.yaml` omits them, and a rerun may change them:\n"

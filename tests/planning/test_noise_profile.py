@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.interpretation import provenance_at
-from unprocess_gen.config.noise_validation import value_at
+from unprocess_gen.config.iso_forms import value_at
 from unprocess_gen.config.schema import PHYSICAL_NUMBERS, BranchConfig, Config, ProvenanceConfig, replaced
 from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
 from unprocess_gen.config.settings import settings_of

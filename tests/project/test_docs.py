@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 import re
 import sys
 from pathlib import Path
@@ -17,10 +18,11 @@ from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD
 from unprocess_gen.cli.help import global_help
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
-from unprocess_gen.config.distributions import DISTRIBUTIONS, ISO_FORMS
+from unprocess_gen.config.distributions import DISTRIBUTIONS
+from unprocess_gen.config.iso_forms import ISO_FORMS
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, NESTED, BranchConfig, Config, ProvenanceConfig, all_settings
-from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, ProvenanceConfig, RawConfig
+from unprocess_gen.config.settings import all_settings, groups_in, settings_of
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.dataset.row import COLUMNS
 
@@ -79,7 +81,7 @@ def test_every_setting_and_column_is_explained() -> None:
     """Generated pages list them, like the declarations below (`test_generated_files_follow_from_the_code`)."""
     kinds = (BranchConfig, ProvenanceConfig)
     items = [(name, setting) for kind in kinds for name, setting in settings_of(kind).items()]
-    items += [(key.rpartition(".")[2], setting) for key, setting in all_settings().items()]
+    items += [(key.rpartition(".")[2], setting) for key, setting in all_settings(Config).items()]
     for name, declared in [*items, *((column.name, column) for column in COLUMNS)]:
         assert declared.meaning and not declared.meaning.endswith("."), name
         assert str(declared.limit), name
@@ -87,16 +89,14 @@ def test_every_setting_and_column_is_explained() -> None:
 
 
 def test_settings_declare_all_keys_of_the_schema() -> None:
-    for kind in (*GROUPS.values(), *NESTED.values(), BranchConfig, ProvenanceConfig, Config):
-        plain = {field.name for field in dataclasses.fields(kind)} - set(settings_of(kind))
-        nested = {place.partition(".")[2] for place in NESTED if kind is GROUPS.get(place.partition(".")[0])}
-        assert plain == (set(GROUPS) if kind is Config else nested)
+    for kind in (*GROUPS.values(), RawConfig, BranchConfig, ProvenanceConfig, Config):
+        assert {field.name for field in dataclasses.fields(kind)} == {*settings_of(kind), *groups_in(kind)}
 
 
 def test_null_is_explained_if_it_is_a_default() -> None:
-    for key, setting in all_settings().items():
-        group, _, name = key.rpartition(".")
-        assert setting.null or default_values(group)[name] is not None, key
+    for group in ("", *GROUPS):
+        for name, setting in (all_settings(GROUPS[group]) if group else settings_of(Config)).items():
+            assert setting.null or default_values(group)[name] is not None, f"{group}.{name}"
 
 
 def test_default_values_are_those_of_a_composed_config(settings: Settings) -> None:
@@ -104,7 +104,7 @@ def test_default_values_are_those_of_a_composed_config(settings: Settings) -> No
     for group in ("", *GROUPS):
         composed = getattr(config, group) if group else config
         for name, written in default_values(group).items():
-            value = getattr(composed, name)
+            value = operator.attrgetter(name)(composed)
             assert (tuple(written) if isinstance(written, list) else written) == value, f"{group}.{name}"
 
 

@@ -200,10 +200,11 @@ def path_hint(word: str) -> str:
 
 def _setting_hint(verb: Verb, word: str) -> str:
     """Remedy for a setting with hyphens, such as ``--out``; empty for other flags."""
-    from unprocess_gen.config.schema import GROUPS, all_settings  # imports NumPy, too slow for --help
+    from unprocess_gen.config.schema import GROUPS, Config  # imports NumPy, too slow for --help
+    from unprocess_gen.config.settings import all_settings
 
     name, _, value = word.lstrip("-").partition("=")
-    keys = {*GROUPS, *all_settings()} if verb.composes else set()
+    keys = {*GROUPS, *all_settings(Config)} if verb.composes else set()
     return f"; {name} is a setting: write {name}={value or '…'}" if name in {*verb.own_keys, *keys} else ""
 
 

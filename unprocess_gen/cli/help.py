@@ -92,7 +92,8 @@ def _group_lines() -> Iterable[tuple[str, str]]:
 def group_help(group: str) -> str:
     """Help of one group of settings: its options and its keys."""
     from unprocess_gen.config.defaults import default_options, default_values
-    from unprocess_gen.config.schema import GROUPS, group_settings
+    from unprocess_gen.config.schema import GROUPS
+    from unprocess_gen.config.settings import all_settings
     from unprocess_gen.core.fields import value_text
 
     parts = []
@@ -101,13 +102,11 @@ def group_help(group: str) -> str:
         lines = ((option, option_summary(group, option)) for option in options)
         parts.append(_section(f"Options of {group} ({plus}{group}=OPTION)", lines))
     if group in GROUPS:
-        settings = group_settings(group)
-        nested = {name.rpartition(".")[0] for name in settings if "." in name}
-        inside = {f"{key}.{name}": value for key in nested for name, value in default_values(f"{group}.{key}").items()}
-        values, option = default_values(group) | inside, default_options().get(group) or "default"
+        values, option = default_values(group), default_options().get(group) or "default"
         chosen = f" with {group}={option}" if option != "default" else ""
         spelled = (
-            (f"{name}={value_text(values[name])}"[: HELP_WIDTH - 2], settings[name].description) for name in settings
+            (f"{name}={value_text(values[name])}"[: HELP_WIDTH - 2], setting.description)
+            for name, setting in all_settings(GROUPS[group]).items()
         )
         parts.append(_section(f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}", spelled))
     return "\n".join(parts)

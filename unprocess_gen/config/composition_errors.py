@@ -11,8 +11,8 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
 from unprocess_gen.config.option_files import ADDED_GROUPS, file_hint
-from unprocess_gen.config.schema import BranchConfig, Config, ProvenanceConfig, all_settings
-from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.schema import BranchConfig, Config, ProvenanceConfig
+from unprocess_gen.config.settings import all_settings, settings_of
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.suggestions import did_you_mean
 
@@ -84,9 +84,10 @@ def _wrong_value(error: OmegaConfBaseException, overrides: Sequence[str]) -> str
 
 def _allowed(key: str) -> str:
     """Allowed values of the setting that a key names, or that it is below; empty if there is none."""
-    while key and key not in all_settings():
+    settings = all_settings(Config)
+    while key and key not in settings:
         key = re.sub(r"(^|[.\[])[^.\[]*$", "", key)
-    return all_settings()[key].allowed if key else ""
+    return settings[key].allowed if key else ""
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
+import operator
 from functools import cache
 from typing import Any
 
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import GROUPS, NESTED, Config
-from unprocess_gen.config.settings import settings_of
-from unprocess_gen.config.yaml_files import read_yaml_mapping
+from unprocess_gen.config.schema import GROUPS, Config
+from unprocess_gen.config.settings import all_settings, settings_of
+from unprocess_gen.config.yaml_files import flat, read_yaml_mapping
 
 
 def default_options() -> dict[str, str | None]:
-    """Return the default option of each group that has option files; None if that is no option."""
+    """Default option of each group that has option files; None if that is no option."""
     entries = _read("config")["defaults"]
     chosen = {group: option for entry in entries if isinstance(entry, dict) for group, option in entry.items()}
     return {group: option for group, option in chosen.items() if group in GROUPS}
 
 
 def default_values(group: str) -> dict[str, Any]:
-    """Return the default values of a group, or of the top level (``""``), as YAML has them; interpolations are text."""
-    if group in NESTED:
-        outer, _, name = group.partition(".")
-        return {**vars(NESTED[group]()), **_written(outer)[name]}
-    schema = GROUPS[group]() if group else Config()
-    values = {name: getattr(schema, name) for name in settings_of(schema)}
-    return values | {name: value for name, value in _written(group).items() if name in values}
+    """Default values of a group, or of the top level (``""``), by key as YAML has them; interpolations are text."""
+    kind = GROUPS[group] if group else Config
+    written = flat(_written(group))
+    return {
+        key: written.get(key, operator.attrgetter(key)(kind()))
+        for key in (all_settings(kind) if group else settings_of(kind))
+    }
 
 
 def _written(group: str) -> dict[str, Any]:

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
-from unprocess_gen.config.limits import Drawn
-from unprocess_gen.config.values import refusal
+from unprocess_gen.config.values import GroupLimit, refusal
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_quantile
-from unprocess_gen.core.fields import is_number
+from unprocess_gen.core.fields import Numbers, is_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,14 +160,6 @@ def _check_line(slope: float, intercept: float, std: float) -> str | None:
     return None
 
 
-class Form(NamedTuple):
-    """A list ``[name, number, …]``: names of its numbers, its meaning, and how many at the end are ``optional``."""
-
-    numbers: tuple[str, ...]
-    meaning: str
-    optional: int = 0
-
-
 class Kind(NamedTuple):
     """A distribution: its form, its value at a uniform in (0, 1), a slope a and its numbers, and their `problem`."""
 
@@ -199,30 +190,17 @@ DISTRIBUTIONS = {
                    lambda *values: None if values else "expected at least one value"),
 }
 """Distributions that a parameter can be drawn from."""
-
-ISO_FORMS = {
-    "line": Form(
-        ("slope", "intercept", "scatter"),
-        "a gain or standard deviation x with ln x = slope · ln ISO + intercept + scatter · n (0 if it is left out), "
-        "where n is a standard normal deviate, drawn for each camera body with `noise.scatter=unit`", optional=1),
-    "by_iso": Form(
-        ("ISO", "value", "…"),
-        "values at these ISOs in ascending order; between them, gains and standard deviations are interpolated in "
-        "their logarithms, shapes and black-level errors linearly, both against ln ISO; a value of `black_error_dn` is "
-        "one number, or four: R, G of the red rows, B, G of the blue rows"),
-}
-"""Functions of ISO that the number of a branch can be; `planning.noise_profile` evaluates them."""
 # fmt: on
 
 
-def spelled(name: str, form: Form | Kind) -> str:
-    """Form as users write it, such as ``[uniform, lowest, highest]``."""
-    return f"[{', '.join((name, *form.numbers))}]"
+def spelled(name: str, numbers: Sequence[str]) -> str:
+    """List as users write it, such as ``[uniform, lowest, highest]``."""
+    return f"[{', '.join((name, *numbers))}]"
 
 
 def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distribution:
     """Parse a number (kind ``constant``) or a distribution ``[kind, number, …]`` of an allowed kind."""
-    forms = "; ".join(spelled(kind, DISTRIBUTIONS[kind]) for kind in allowed)
+    forms = "; ".join(spelled(kind, DISTRIBUTIONS[kind].numbers) for kind in allowed)
     if is_number(value):
         return Distribution("constant", (float(value),))
     if not isinstance(value, list | tuple) or not value or value[0] not in allowed:
@@ -230,24 +208,36 @@ def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distri
     kind, numbers = str(value[0]), value[1:]
     form = DISTRIBUTIONS[kind]
     if (len(numbers) != len(form.numbers) and kind != "choice") or not all(is_number(number) for number in numbers):
-        raise refusal(key, value, f"expected finite numbers: {spelled(kind, form)}")
+        raise refusal(key, value, f"expected finite numbers: {spelled(kind, form.numbers)}")
     problem = form.problem(*numbers)
     if problem:
         raise refusal(key, value, problem)
     return Distribution(kind, tuple(float(number) for number in numbers))
 
 
-def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
-    """Parse a number or a distribution, and check the range of its draws.
+class Drawn(GroupLimit):
+    """A number, or a distribution of one of ``kinds``, all of whose draws are within ``numbers``.
 
     The range of ``log_linear_in_a`` depends on a and is not checked.
     """
-    distribution = parse_distribution(key, value, limit.kinds)
-    if distribution.kind != "log_linear_in_a" and not (
-        limit.numbers.low <= lowest(distribution) and highest(distribution) <= limit.numbers.high
-    ):
-        raise refusal(key, value, f"expected {limit.range}")
-    return distribution
+
+    def __init__(self, kinds: tuple[str, ...], numbers: Numbers, range_text: str = "") -> None:
+        self.kinds, self.numbers, self.range = kinds, numbers, range_text or str(numbers)
+        super().__init__(f"{self.range}; constant, or drawn: {', '.join(kinds)}")
+        self.is_float = True
+
+    def parse(self, key: str, value: Any) -> Distribution:
+        """Distribution that a value states; ConfigError unless all of its draws are allowed."""
+        distribution = parse_distribution(key, value, self.kinds)
+        if distribution.kind != "log_linear_in_a" and not (
+            self.numbers.low <= lowest(distribution) and highest(distribution) <= self.numbers.high
+        ):
+            raise refusal(key, value, f"expected {self.range}")
+        return distribution
+
+    def check(self, key: str, value: Any, group: Any) -> None:
+        """Raise ConfigError unless the value can be parsed."""
+        self.parse(key, value)
 
 
 def lowest(distribution: Distribution) -> float:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from unprocess_gen.config import limits
-from unprocess_gen.config.distributions import Distribution, lowest, parse_drawn
+from unprocess_gen.config.distributions import Distribution, lowest
 from unprocess_gen.config.schema import (
     BRANCH_FIELDS,
     BranchConfig,
@@ -39,16 +39,16 @@ def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, 
                 raise refusal(f"gains.{name}", getattr(gains, name), problem)
         gains = dataclasses.replace(gains, red=1.0, blue=1.0)
     return (
-        parse_drawn("gains.red", gains.red, limits.GAIN),
-        parse_drawn("gains.blue", gains.blue, limits.GAIN),
-        parse_drawn("gains.inverse_rgb", gains.inverse_rgb, limits.INVERSE_GAIN),
+        limits.GAIN.parse("gains.red", gains.red),
+        limits.GAIN.parse("gains.blue", gains.blue),
+        limits.INVERSE_GAIN.parse("gains.inverse_rgb", gains.inverse_rgb),
     )
 
 
 def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]:
     """Parse the distributions of the two numbers of a noise profile."""
-    a = parse_drawn("noise.a", noise.a, limits.VARIANCE_SLOPE)
-    b = parse_drawn("noise.b", noise.b, limits.VARIANCE_OFFSET)
+    a = limits.VARIANCE_SLOPE.parse("noise.a", noise.a)
+    b = limits.VARIANCE_OFFSET.parse("noise.b", noise.b)
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
         raise refusal("noise.a", noise.a, "expected more than 0, because noise.b depends on ln a")
     return a, b

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from unprocess_gen.config.values import refusal
+from unprocess_gen.config.distributions import Drawn
+from unprocess_gen.config.values import GroupLimit, one_of, refusal
 from unprocess_gen.core.fields import Choice, Limit, Numbers, is_number, value_text
 from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.targets import LINEAR_RGB
@@ -19,14 +20,14 @@ def text(what: str) -> Limit:
     return Limit(what, bool, repr)
 
 
-class LevelRange(Limit):
+class LevelRange(GroupLimit):
     """An integer whose range follows from other keys of its group; ``ends`` computes it."""
 
     def __init__(self, text: str, ends: Callable[[Any], tuple[int, int]], remark: str = "") -> None:
         super().__init__(f"{text}{remark}")
         self._ends, self._remark = ends, remark
 
-    def check_in(self, key: str, value: int, group: Any) -> None:
+    def check(self, key: str, value: Any, group: Any) -> None:
         """Raise ConfigError unless the value is in the range that the group gives; it may lack ``bits`` or a level."""
         if None in (group.bits, group.black_level_dn):
             return
@@ -35,16 +36,19 @@ class LevelRange(Limit):
             raise refusal(key, value, f"expected {low} to {high}{self._remark}")
 
 
-class Drawn(Limit):
-    """A number, or a distribution of one of ``kinds``, all of whose draws are within ``numbers``.
+class Names(GroupLimit):
+    """A list of some of ``names``, at least of ``least``."""
 
-    `distributions.parse_drawn` checks values.
-    """
+    def __init__(self, text: str, names: Sequence[str], least: int = 0) -> None:
+        super().__init__(text)
+        self._names, self._least = names, least
 
-    def __init__(self, kinds: tuple[str, ...], numbers: Numbers, range_text: str = "") -> None:
-        self.kinds, self.numbers, self.range = kinds, numbers, range_text or str(numbers)
-        super().__init__(f"{self.range}; constant, or drawn: {', '.join(kinds)}")
-        self.is_float = True
+    def check(self, key: str, value: Any, group: Any) -> None:
+        """Raise ConfigError, which lists the names, for others and for too few."""
+        if len(value) < self._least:
+            raise refusal(key, [], f"expected at least one of {', '.join(self._names)}")
+        for name in value:
+            one_of(key, name, self._names)
 
 
 # ------------------------------------------------------------------------------------- limits that several modules use
@@ -63,9 +67,6 @@ MIN_PATCH, MAX_PATCH = 2, 2**15
 
 MAX_RANDOM_PATCHES = 10**4
 """Most patches at random places of one image: keys have four digits for them."""
-
-MAX_BRANCH_NUMBER = 1e9
-"""Largest number in a branch of a physical profile, and largest standard deviation in DN that a line gives."""
 
 MAX_SPLITS = 16
 """Most splits. Chosen: more than any benchmark has."""
@@ -127,11 +128,6 @@ ISO, EXPOSURE_S, TEMPERATURE_C, EXPOSURE_RATIO = (
     for name in ("iso", "exposure_s", "temperature_c", "exposure_ratio")
 )
 
-READ_SHAPE = Limit(
-    "a shape of more than -0.5, where the Tukey-lambda distribution has a variance, and less than 10, or a table, "
-    "[by_iso, ISO, shape, …]"
-)
-
 PATCH = Limit(
     "null, a side, [grid, side], [grid, side, stride] or [random, side, count]; side and stride are even, "
     f"{MIN_PATCH} to {MAX_PATCH} pixels, count is 1 to {MAX_RANDOM_PATCHES}"
@@ -142,10 +138,11 @@ DIGEST = Limit(
     lambda value: re.fullmatch("[0-9a-f]{64}", value) is not None,
     lambda value: value_text(value)[:80],
 )
-ISO_RANGE = Limit("the lowest and the highest ISO, [100, 6400]")
-BLACK_ERROR = Limit(
-    "a number, four (R, G of the red rows, B, G of the blue rows), or a table of such values, [by_iso, ISO, value, …]"
+ISO_RANGE = Limit(
+    "the lowest and the highest ISO, [100, 6400]",
+    lambda value: len(value) == 2 and 0 < value[0] <= value[1] <= ISO.numbers.high,
 )
+ISO_RANGE_OR_ALL = Limit(f"{ISO_RANGE}, or [] for all ISOs", lambda value: not value or ISO_RANGE.allows(value))
 
 
 def _are_shares(value: Any) -> bool:
@@ -172,10 +169,3 @@ WHITE_LEVEL = LevelRange(
     lambda group: (group.black_level_dn + 1, 2**group.bits - 1),
     " (above the black level, within the bits)",
 )
-
-
-class IsoForm(Limit):
-    """A number, or one of `distributions.ISO_FORMS`; `noise_validation` checks it."""
-
-    def __init__(self) -> None:
-        super().__init__(f"a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: line, by_iso")

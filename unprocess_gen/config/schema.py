@@ -10,15 +10,14 @@ override replaces a list completely. A mapping would be merged with the default'
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional, TypeVar
 
 from unprocess_gen.config import limits
-from unprocess_gen.config.limits import IsoForm
-from unprocess_gen.config.settings import Setting, documented, key, settings_of
+from unprocess_gen.config.iso_forms import BLACK_ERROR, READ_SHAPE, IsoNumber
+from unprocess_gen.config.settings import documented, groups_in, key, settings_of
 from unprocess_gen.core.fields import Choice, Integers, Limit, NumberList, NumberOrWord, Numbers, is_number
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
@@ -289,11 +288,11 @@ def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
 def _limit(number: Number) -> Limit:
     """Values that the key of a number allows."""
     if number.kind in (SHAPE, SITES):
-        return limits.READ_SHAPE if number.kind == SHAPE else limits.BLACK_ERROR
+        return READ_SHAPE if number.kind == SHAPE else BLACK_ERROR
     if isinstance(number.limit, Choice):
         return number.limit
     if number.in_branch:
-        return IsoForm()
+        return IsoNumber()
     numbers = number.key_limit or number.limit
     return NumberList(number.count, numbers) if isinstance(numbers, Numbers) and number.count > 1 else numbers
 
@@ -304,7 +303,21 @@ def _number_fields(in_branch: bool) -> Fields:
     return {name: _number_field(*number) for name, number in declared if number[1].in_branch == in_branch}
 
 
+PHYSICAL_NUMBERS = tuple(
+    name for name, (_, number) in profile_keys().items() if number.count == 1 and not number.in_branch
+)
+"""Keys of the numbers of a physical profile that do not depend on ISO."""
+
+ASSUMABLE = (
+    *PHYSICAL_NUMBERS,
+    *(name for name, (_, number) in profile_keys().items() if number.in_branch and number.may_be_unknown),
+)
+"""Keys that ``noise.assumed`` may name: numbers of a physical profile, and those of a branch that may be unknown."""
+
+LEVELS = ("black_level_dn", "white_level_dn")
 BRANCH_FIELDS = _number_fields(in_branch=True)
+SOURCED = (*LEVELS, *(name for name in BRANCH_FIELDS if name != "read_law"), *PHYSICAL_NUMBERS)
+"""Keys whose source a profile may state."""
 SWITCH_FIELDS: Fields = {
     effect.name: (
         Optional[str],
@@ -321,7 +334,7 @@ SWITCH_FIELDS: Fields = {
 class BranchConfig(EffectGroup):
     """Numbers of a physical noise profile that depend on ISO, for one range of ISO.
 
-    A number may be written as a form of `distributions.ISO_FORMS`.
+    A number may be written as a form of `iso_forms.ISO_FORMS`.
 
     Attributes
     ----------
@@ -349,8 +362,8 @@ class ProvenanceConfig(Group):
         how far the numbers may be off, or how far sources differ
     """
 
-    numbers: tuple[str, ...] = key((), Limit("a list of keys whose values are numbers"))
-    iso: tuple[float, ...] = key((), limits.ISO_RANGE)
+    numbers: tuple[str, ...] = key((), limits.Names("a list of keys whose values are numbers", SOURCED, least=1))
+    iso: tuple[float, ...] = key((), limits.ISO_RANGE_OR_ALL)
     source: str = key("", limits.text("a text"))
     uncertainty: str = key("", limits.text("a text"))
 
@@ -435,24 +448,13 @@ class NoiseConfig(EffectGroup):
         None, Numbers(0, 65535), CHOSEN, unit="DN of the profile",
         null="the black level in the raw files, else the mean of the pixels without 0.01 % at each end")
     branches: tuple[BranchConfig, ...] = key((), Limit("a list of mappings with the keys of a branch"), PHYSICAL)
-    assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), PHYSICAL)
-    unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), PHYSICAL)
+    assumed: tuple[str, ...] = key(
+        (), limits.Names("a list of keys of this section or of a branch", ASSUMABLE), PHYSICAL)
+    unsourced: tuple[str, ...] = key((), limits.Names("a list of keys of assumed", ASSUMABLE), PHYSICAL)
     provenance: tuple[ProvenanceConfig, ...] = key(
         (), Limit("a list of mappings with the keys numbers, iso, source and uncertainty"), PHYSICAL,
         decides_data=False)
     # fmt: on
-
-
-PHYSICAL_NUMBERS = tuple(
-    name for name, (_, number) in profile_keys().items() if number.count == 1 and not number.in_branch
-)
-"""Keys of the numbers of a physical profile that do not depend on ISO."""
-
-ASSUMABLE = (
-    *PHYSICAL_NUMBERS,
-    *(name for name, (_, number) in profile_keys().items() if number.in_branch and number.may_be_unknown),
-)
-"""Keys that ``noise.assumed`` may name: numbers of a physical profile, and those of a branch that may be unknown."""
 
 
 @documented
@@ -628,30 +630,8 @@ class Config(Group):
             object.__setattr__(self, "split", FrozenMapping(shares))
 
 
-GROUPS: dict[str, type[Any]] = {
-    group.name: group.default_factory  # type: ignore[misc]
-    for group in fields(Config)
-    if isinstance(group.default_factory, type)
-}
+GROUPS = groups_in(Config)
 """Dataclass of each config group, in the order of the config."""
-
-
-NESTED: dict[str, type[Any]] = {"source.raw": RawConfig}
-"""Dataclasses of the groups inside of groups."""
-
-
-def group_settings(group: str) -> dict[str, Setting]:
-    """Settings of a group by key, and those of the groups inside of it: ``raw.pattern``."""
-    inside = {place.removeprefix(f"{group}."): kind for place, kind in NESTED.items() if place.startswith(f"{group}.")}
-    nested = {f"{place}.{key}": setting for place, kind in inside.items() for key, setting in settings_of(kind).items()}
-    return {**settings_of(GROUPS[group]), **nested}
-
-
-@functools.cache
-def all_settings() -> Mapping[str, Setting]:
-    """Every setting of a config by its key, such as ``source.raw.pattern``; those of branches are left out."""
-    groups = {**{f"{group}.": kind for group, kind in (GROUPS | NESTED).items()}, "": Config}
-    return {f"{group}{name}": one for group, kind in groups.items() for name, one in settings_of(kind).items()}
 
 
 def replaced(config: Config, changes: Mapping[str, Any]) -> Config:

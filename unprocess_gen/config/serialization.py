@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any
 
+import msgspec
 import yaml
 
 from unprocess_gen.config.interpretation import (
@@ -21,10 +23,10 @@ from unprocess_gen.config.schema import (
     GROUPS,
     Config,
 )
-from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.settings import groups_in, settings_of
 from unprocess_gen.config.validation import check_values
-from unprocess_gen.config.values import error_in_one_line, one_of
-from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_mapping, read_yaml_text
+from unprocess_gen.config.values import error_in_one_line, one_of, refusal
+from unprocess_gen.config.yaml_files import flat, parse_yaml_mapping, read_yaml_mapping, read_yaml_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import is_number, value_text
 from unprocess_gen.core.paths import AnyPath
@@ -35,13 +37,9 @@ if TYPE_CHECKING:
 
 def data_keys(group: Any) -> tuple[str, ...]:
     """Keys of a dataclass of the schema that decide the bytes of a dataset; ``config.yaml`` omits the others."""
-    settings = settings_of(group)
-    inner = {field.name: field.default_factory for field in dataclasses.fields(group) if field.name not in settings}
-    return tuple(
-        field.name
-        for field in dataclasses.fields(group)
-        if (settings[field.name].decides_data if field.name in settings else data_keys(cast(Any, inner[field.name])))
-    )
+    settings, inner = settings_of(group), groups_in(group)
+    names = (field.name for field in dataclasses.fields(group))
+    return tuple(name for name in names if (data_keys(inner[name]) if name in inner else settings[name].decides_data))
 
 
 SOURCE_KINDS = ("folder", "synthetic", "raw")
@@ -71,9 +69,8 @@ def recorded(value: Any, is_float: bool = False) -> Any:
     if isinstance(value, dict):
         return {name: recorded(item) for name, item in value.items()}
     if dataclasses.is_dataclass(value):
-        settings, group = settings_of(value), cast(type[Any], type(value))
-        numbers = {name for name, setting in settings.items() if setting.limit.is_float}
-        return {name: recorded(getattr(value, name), name in numbers) for name in data_keys(group)}
+        numbers = {name for name, setting in settings_of(value).items() if setting.limit.is_float}
+        return {name: recorded(getattr(value, name), name in numbers) for name in data_keys(value)}
     return float(value) if is_float and is_number(value) else value
 
 
@@ -103,43 +100,20 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
     kind = loaded["source"].pop("kind")
     one_of("source.kind", kind, SOURCE_KINDS)
     loaded["source"]["kind"] = "raw" if kind == "raw" else "srgb"
-    config = _build(Config, loaded, "")
-    assert isinstance(config, Config)
-    return config, str(kind)
-
-
-def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
-    """Dataclass of the schema from a mapping; ``prefix`` is its dotted path, with a dot at the end."""
-    if not isinstance(loaded, dict):
-        raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
-    fields = set(data_keys(group))
-    missing, unknown = fields - loaded.keys(), loaded.keys() - fields
-    for problem, keys in (("missing", missing), ("unknown", unknown)):
+    try:
+        config = msgspec.convert(loaded, Config)
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).rstrip("`").partition(" - at `$.")
+        steps = (int(step) if step.isdigit() else step for step in re.findall(r"\w+", place))
+        value: Any = loaded
+        for step in steps:
+            value = value[step]
+        raise refusal(place, value, problem[0].lower() + problem[1:]) from None
+    given, known = flat(loaded).keys(), flat(recorded(config)).keys()
+    for problem, keys in (("missing", known - given), ("unknown", given - known)):
         if keys:
-            raise ConfigError(f"{problem} key {', '.join(prefix + key for key in sorted(keys))[:200]}")
-    types = get_type_hints(group)
-    return group(**{key: _convert(types[key], value, prefix + key) for key, value in loaded.items()})
-
-
-def _convert(kind: Any, value: Any, key: str) -> Any:
-    """Value as the type of its field; ConfigError if the type does not fit."""
-    if kind is Any:
-        return value
-    if get_origin(kind) is Union:
-        return None if value is None else _convert(get_args(kind)[0], value, key)
-    if dataclasses.is_dataclass(kind):
-        return _build(cast(type[Any], kind), value, f"{key}.")
-    if get_origin(kind) is tuple:
-        if isinstance(value, list):
-            return tuple(_convert(get_args(kind)[0], item, f"{key}[{index}]") for index, item in enumerate(value))
-    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    elif kind is str and isinstance(value, str | bool | int | float):
-        return str(value)  # on and off without quotes are booleans in YAML; a name may be a number
-    elif type(value) is kind:
-        return value
-    name = "list" if get_origin(kind) is tuple else kind.__name__
-    raise ConfigError(f"{key}={value_text(value)[:60]}: expected a value of type {name}")
+            raise ConfigError(f"{problem} key {', '.join(sorted(keys))[:200]}")
+    return config, str(kind)
 
 
 def writable_node(group: type[Any]) -> DictConfig:
@@ -175,7 +149,7 @@ def read_option(group: str, name: str | Path) -> Any:
 
 def differences(config_yaml: str, other_yaml: str) -> list[str]:
     """List the differences between two ``config.yaml`` texts, ``key=value (there: value)``, sorted by key."""
-    here, there = _flat(parse_yaml_mapping(config_yaml)), _flat(parse_yaml_mapping(other_yaml))
+    here, there = flat(parse_yaml_mapping(config_yaml)), flat(parse_yaml_mapping(other_yaml))
     return [
         "{}={} (there: {})".format(key, *_shortened(value_text(here.get(key)), value_text(there.get(key))))
         for key in sorted(here.keys() | there.keys())
@@ -193,12 +167,3 @@ def _shortened(*values: str) -> Iterator[str]:
     for value in values:
         part = value[start : start + CHARACTERS_SHOWN]
         yield "…" * (start > 0) + part + "…" * (len(value) > start + len(part))
-
-
-def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(settings, dict):
-        return {prefix.rstrip("."): settings}
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        flat |= _flat(value, f"{prefix}{key}.")
-    return flat

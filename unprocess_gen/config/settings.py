@@ -1,4 +1,4 @@
-"""Describe settings: `key` declares a field of the schema, `settings_of` returns what it declared.
+"""Describe settings: `key` declares a field of the schema, `settings_of` and `all_settings` return what it declared.
 
 The field's metadata has the description. Its words are those of the plan's field, or of the docstring of the group
 (`documented`). Checks and messages (`validation`), ``--help`` and ``docs/reference/settings.md`` read it.
@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from unprocess_gen.config.values import GroupLimit
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import Limit
 from unprocess_gen.simulation.plan import FIELDS
@@ -52,9 +53,13 @@ class Setting:
         null = f"; null: {self.null}" if self.null else ""
         return f"{self.meaning}{unit}. Allowed: {self.limit}{null}"
 
-    def check(self, key: str, value: Any) -> None:
-        """Check a value by itself; limits that depend on other settings are checked by `validation`."""
-        if not (value is None and self.null) and not self.limit.allows(value):
+    def check(self, key: str, value: Any, group: Any) -> None:
+        """Raise ConfigError unless the setting allows a value, given the other values of its group."""
+        if value is None and self.null:
+            return
+        if isinstance(self.limit, GroupLimit):
+            self.limit.check(key, value, group)
+        elif not self.limit.allows(value):
             raise ConfigError(f"{key}={self.limit.shown(value)}: expected {self.allowed}")
 
 
@@ -73,6 +78,19 @@ def key(default: Any, limit: Limit | None = None, section: str = "", of: str = "
 def settings_of(group: Any) -> Mapping[str, Setting]:
     """Settings of a group by key."""
     return {field.name: field.metadata[METADATA] for field in dataclasses.fields(group) if METADATA in field.metadata}
+
+
+def groups_in(group: Any) -> dict[str, type[Any]]:
+    """Dataclasses of the groups inside of a group, by key."""
+    made: Any = ((field.name, field.default_factory) for field in dataclasses.fields(group))
+    return {name: kind for name, kind in made if isinstance(kind, type)}
+
+
+def all_settings(group: Any) -> dict[str, Setting]:
+    """Settings of a group and of the groups inside of it, by dotted key: ``raw.pattern``; branches are left out."""
+    inner = {name: all_settings(kind) for name, kind in groups_in(group).items()}
+    nested = {f"{name}.{key}": setting for name, settings in inner.items() for key, setting in settings.items()}
+    return {**settings_of(group), **nested}
 
 
 def documented(group: GroupType) -> GroupType:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import itertools
 import math
-import operator
 import pickle
 from pathlib import Path
+from typing import Any
 
-from unprocess_gen.config.distributions import parse_drawn
 from unprocess_gen.config.interpretation import (
     UNCLIPPED,
     effect_switch,
@@ -25,16 +24,16 @@ from unprocess_gen.config.interpretation import (
     patch_rule,
     uses_dark_frames,
 )
-from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, MIN_GAIN, SWITCH, Drawn, LevelRange
+from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, MIN_GAIN, SWITCH
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.raw_validation import check_raw_source
 from unprocess_gen.config.schema import (
     CameraConfig,
     Config,
     EffectsConfig,
+    Group,
     NoiseConfig,
     SourceConfig,
-    all_settings,
 )
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import one_of, refusal
@@ -70,7 +69,7 @@ def validate_config(config: Config) -> None:
 
 def check_values(config: Config) -> None:
     """Check the values of a configuration, composed or recorded, independent of files and installed packages."""
-    SEED.check("seed", config.seed)
+    SEED.check("seed", config.seed, config)
     values = pickle.dumps([value for name, value in vars(config).items() if name != "seed"])
     if values not in _allowed:
         _check_values(config)
@@ -102,18 +101,17 @@ def _check_values(config: Config) -> None:
         raise refusal("executor.address", executor.address, problem)
 
 
-def _check_settings(config: Config) -> None:
-    """Check each value against the limit that the schema declares for it, whether it is used or not."""
-    for key, setting in all_settings().items():
-        value, limit = operator.attrgetter(key)(config), setting.limit
-        if value is None and setting.null:
-            continue
-        if isinstance(limit, Drawn):
-            parse_drawn(key, value, limit)
-        elif isinstance(limit, LevelRange):
-            limit.check_in(key, value, operator.attrgetter(key.rpartition(".")[0])(config))
-        else:
-            setting.check(key, value)
+def _check_settings(group: Any, prefix: str = "") -> None:
+    """Check each value of a group against the limit that the schema declares for it, whether it is used or not."""
+    settings = settings_of(group)
+    for name, value in vars(group).items():
+        if name in settings:
+            settings[name].check(f"{prefix}{name}", value, group)
+        if isinstance(value, Group):
+            _check_settings(value, f"{prefix}{name}.")
+        for number, item in enumerate(value if isinstance(value, tuple) else ()):
+            if isinstance(item, Group):
+                _check_settings(item, f"{prefix}{name}[{number}].")
 
 
 # ---------------------------------------------------------------------------------------- source, camera and sensor
@@ -212,7 +210,7 @@ def _check_dark_frames(config: Config) -> None:
         raise refusal("noise.dark_frames", frames, f"{problem}; expected a physical profile")
     for level in noise_levels(noise):
         iso = config.scene.iso if level.iso is None else level.iso
-        if parse_drawn("iso", iso, ISO).kind != "constant" or level.iso != noise.iso:
+        if ISO.parse("iso", iso).kind != "constant" or level.iso != noise.iso:
             problem = "the frames are of one ISO, and the run has several; expected one"
             advice = "set noise.iso to that of the frames, and leave noise.levels out"
             raise refusal("noise.dark_frames", frames, f"{problem}; {advice}")

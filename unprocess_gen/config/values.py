@@ -6,10 +6,18 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.fields import value_text
+from unprocess_gen.core.fields import Limit, value_text
 
 LONGEST_VALUE = 80
 """Characters of a value that a message quotes."""
+
+
+class GroupLimit(Limit):
+    """Values of a setting that are parsed, or checked together with other settings of the group."""
+
+    def check(self, key: str, value: Any, group: Any) -> None:
+        """Raise ConfigError unless the value is allowed in its group."""
+        raise NotImplementedError
 
 
 def refusal(key: str, value: Any, problem: str) -> ConfigError:

@@ -94,6 +94,17 @@ def parse_yaml_mapping(text: str) -> dict[str, Any]:
     return loaded
 
 
+def flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Values of mappings in mappings and in lists, by dotted key: ``noise.branches[0].iso``."""
+    if isinstance(value, dict):
+        items = [(f"{prefix}.{key}".lstrip("."), item) for key, item in value.items()]
+    elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        items = [(f"{prefix}[{index}]", item) for index, item in enumerate(value)]
+    else:
+        return {prefix: value}
+    return {key: leaf for name, item in items for key, leaf in flat(item, name).items()}
+
+
 def _check_events(text: str) -> None:
     """Raise ValueError if a text exceeds a limit; PyYAML yields events without recursion."""
     open_anchors: list[str | None] = []  # of the mappings and lists around an event

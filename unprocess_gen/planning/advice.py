@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 from unprocess_gen.config.defaults import default_options, default_values
-from unprocess_gen.config.distributions import highest, lowest, parse_drawn
+from unprocess_gen.config.distributions import highest, lowest
 from unprocess_gen.config.interpretation import is_physical
 from unprocess_gen.config.limits import EXPOSURE_RATIO, ISO
 from unprocess_gen.config.option_files import conf_dir, group_options
@@ -24,10 +24,10 @@ def dark_scene_warning(config: Config) -> str:
     """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text."""
     if is_physical(config.noise):
         return ""
-    ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
+    ratio = EXPOSURE_RATIO.parse("scene.exposure_ratio", config.scene.exposure_ratio)
     if highest(ratio) <= 1:
         return ""
-    iso = parse_drawn("scene.iso", config.scene.iso, ISO)
+    iso = ISO.parse("scene.iso", config.scene.iso)
     ratios, isos = (value_range((lowest(drawn), highest(drawn))) for drawn in (ratio, iso))
     return (
         f"scene={config.scene.name}: light is divided by {ratios}, but noise={config.noise.name} ignores ISO {isos}; "

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unprocess_gen.config import interpretation
-from unprocess_gen.config.distributions import lowest, parse_drawn
+from unprocess_gen.config.distributions import lowest
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.arrays import Srgb
@@ -124,7 +124,7 @@ class EffectRules:
 
     def __init__(self, config: Config) -> None:
         noise, sensor, effects = config.noise, config.sensor, PHYSICAL_EFFECTS
-        ratio = lowest(parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO))
+        ratio = lowest(EXPOSURE_RATIO.parse("scene.exposure_ratio", config.scene.exposure_ratio))
         self.forced = {effect: _forced_decision(config, effect) for effect in effects}
         self.on = frozenset(effect for effect, decision in self.forced.items() if decision is None or decision.on)
         free = [effect for effect, decision in self.forced.items() if decision is None]

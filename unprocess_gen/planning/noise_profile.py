@@ -1,7 +1,7 @@
 """Evaluate a physical noise profile for the ISO, exposure and temperature of one image.
 
 Profiles are in electrons before the system gain K, and behind it in DN of the sensor they were calibrated on. A number
-may depend on ISO (`distributions.ISO_FORMS`). A profile is valid for the calibrated ISOs only; a dual-gain sensor has
+may depend on ISO (`iso_forms.ISO_FORMS`). A profile is valid for the calibrated ISOs only; a dual-gain sensor has
 a branch on each side of the switch. Exponentials and logarithms are defined in `decimal` and rounded once, because the
 last bit of libm's results differs between machines. `core.fixed_point` finds those of lines faster.
 """
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
-from unprocess_gen.config.distributions import draw_parameter, parse_drawn
+from unprocess_gen.config.distributions import draw_parameter
 from unprocess_gen.config.limits import EXPOSURE_S, ISO, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
@@ -48,9 +48,9 @@ class PhysicalNoise:
         self.noise, self.sensor = noise, sensor
         self.fixed_pattern_in_clean = config.clean.includes_fixed_pattern
         self.distributions = {
-            Draw.ISO: parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, ISO),
-            Draw.EXPOSURE_S: parse_drawn("exposure_s", scene.exposure_s, EXPOSURE_S),
-            Draw.TEMPERATURE_C: parse_drawn("temperature_c", scene.temperature_c, TEMPERATURE_C),
+            Draw.ISO: ISO.parse("iso", scene.iso if noise.iso is None else noise.iso),
+            Draw.EXPOSURE_S: EXPOSURE_S.parse("exposure_s", scene.exposure_s),
+            Draw.TEMPERATURE_C: TEMPERATURE_C.parse("temperature_c", scene.temperature_c),
         }
         self.scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
         self.has_lens_shading = any(noise.lens_shading or ())
@@ -108,7 +108,7 @@ class PhysicalNoise:
 
 
 def evaluate(form: Any, iso: float, uniform: float = MIDDLE) -> float:
-    """Evaluate a gain or standard deviation of a branch: a number, or one of `distributions.ISO_FORMS`.
+    """Evaluate a gain or standard deviation of a branch: a number, or one of `iso_forms.ISO_FORMS`.
 
     ``uniform`` draws the scatter of a line.
     """

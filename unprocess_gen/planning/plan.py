@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from unprocess_gen.config import interpretation
-from unprocess_gen.config.distributions import draw_parameter, parse_drawn
+from unprocess_gen.config.distributions import draw_parameter
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.arrays import FLOAT32
@@ -149,7 +149,7 @@ class Planner:
         self._camera, self._needs_dark_frames = config.camera, interpretation.uses_dark_frames(config.noise)
         self._red, self._blue, self._inverse_rgb = interpretation.gain_distributions(config.gains)
         self._lights = interpretation.lights(config)
-        self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
+        self._exposure_ratio = EXPOSURE_RATIO.parse("scene.exposure_ratio", config.scene.exposure_ratio)
         self._is_physical = interpretation.is_physical(config.noise)
         kind, levels = PhysicalLevel if self._is_physical else TwoNumberLevel, interpretation.noise_levels(config.noise)
         self._levels = [kind(replace(config, noise=noise)) for noise in levels]

@@ -29,7 +29,7 @@ class Number(Field):
     count : int
         Numbers in the value; a list if more than 1.
     by_iso : bool
-        Whether the key belongs to the branches of a profile, and its value may depend on ISO (`config.distributions`).
+        Whether the key belongs to the branches of a profile, and its value may depend on ISO (`config.iso_forms`).
     key : str
         Key of the profile; empty if it has the name of the field.
     key_meaning, key_unit, key_limit : str, str, Numbers or None

@@ -9,8 +9,9 @@ from typing import Any
 from unprocess_gen.config.composition import compose_node, load_config, typed_config
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import Config, all_settings
+from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import recorded
+from unprocess_gen.config.settings import all_settings
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import is_number
 
@@ -34,7 +35,7 @@ def overrides_of(config: Config) -> dict[str, str]:
 
 def _deciding_values(config: Config) -> dict[str, Any]:
     """Values of the keys that decide data, as ``config.yaml`` has them."""
-    deciding = (key for key, setting in all_settings().items() if setting.decides_data)
+    deciding = (key for key, setting in all_settings(Config).items() if setting.decides_data)
     return {key: recorded(operator.attrgetter(key)(config)) for key in deciding}
 
 

@@ -25,7 +25,8 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from unprocess_gen.config.option_files import conf_dir, group_options, option_summary
-from unprocess_gen.config.schema import Config, all_settings
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.settings import all_settings
 from unprocess_gen.core.errors import UnprocessGenError
 from unprocess_gen.core.fields import Choice
 from unprocess_gen.reports.explorer import views
@@ -58,7 +59,7 @@ SLIDERS = {"gains.red": (0.5, 4), "gains.blue": (0.5, 4), "gains.inverse_rgb": (
 DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}
 """Keys of which sliders show the value in the plan, which may be drawn."""
 NONE = "(none)"
-SETTINGS = all_settings()
+SETTINGS = all_settings(Config)
 TIPS = [
     ("site", "column $x{%d}, row $y{%d}"),
     ("source", "@r, @g, @b"),
