@@ -14,7 +14,7 @@ from helpers.cases import slow_except
 from helpers.commands import RunMain, messages
 from helpers.configs import with_branch
 from helpers.datasets import Settings
-from helpers.flats import body_part, response
+from helpers.flats import response
 from helpers.photographs import fill
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,12 +26,11 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.planning.effect_selection import EffectRules, Prediction, Selection, facts_of, omit_weakest
 from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.plan import plan_image, plan_levels
-from unprocess_gen.simulation.effects import BY_NAME, order
+from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
-from unprocess_gen.simulation.effects.black_error import BlackError
-from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, Plan
+from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.sensor import to_dn
@@ -45,10 +44,10 @@ SCENES = ("daylight", "indoor", "low_light", "night", "video_night", "long_expos
 def unrounded(srgb: Srgb, plan: Plan) -> tuple[Float, Float]:
     """Return the clean and the noisy frame in DN, before rounding."""
     light = unprocess(srgb, plan) * plan.scene.exposure
-    factor = order.light_factor(plan, light.shape)
+    factor = electrons.light_factor(plan, light.shape)
     light = light if factor is None else light * factor
     clean_dn = to_dn(light, plan.sensor.black_level_dn, plan.sensor.white_level_dn, plan.brightest)
-    return clean_dn, order.noisy(clean_dn, plan)
+    return clean_dn, electrons.noisy(clean_dn, plan)
 
 
 def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[str, Float]:
@@ -61,7 +60,7 @@ def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[
     clips = ([unrounded(srgb, plan.replace(frame=n))[1] for n in range(frames)] for plan in (everything, auto))
     with_all, with_some = (np.mean(clip, axis=0) for clip in clips)
     omitted = with_all - with_some
-    variance = noise_variance(clean_dn, auto) + 1 / 12
+    variance = electrons.noise_variance(clean_dn, auto) + 1 / 12
     if auto.physics is not None and "dark_current" in auto.noise.effects:
         variance = variance + auto.physics.dn_per_e**2 * auto.physics.dark_e
     variance = variance / frames
@@ -287,7 +286,7 @@ def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, 
                 patterned = light * response(physics, light.shape)
                 part += to_dn(patterned, *levels) - to_dn(light, *levels)
             if "black_error" not in auto.noise.effects:
-                part += BlackError().plane_offset_dn(body_part(physics, light.shape))
+                part += electrons.by_site(physics.black_error_dn, (light.shape[0], light.shape[1]), (0, 0))
             left_out += len(set(fixed) - set(auto.noise.effects))
             for statistic, count in ((part, 1), (part.mean(1), part.shape[1]), (part.mean(0), part.shape[0])):
                 rms = math.sqrt(float((statistic**2).mean()) * count * 12)
@@ -697,7 +696,7 @@ def test_masking_noise_is_the_noise_of_the_plan(base: tuple[Config, Physics]) ->
     column = next(
         one for one in all_predictions(config, physics, FACTS, SignalRange(0.0, 3000.0)) if one.effect == "column"
     )
-    variance = float(noise_variance(np.full((1, 1), float(plan.sensor.black_level_dn)), plan)[0, 0]) + 1 / 12
+    variance = float(electrons.noise_variance(np.full((1, 1), float(plan.sensor.black_level_dn)), plan)[0, 0]) + 1 / 12
     assert math.isclose(column.masking_dn, math.sqrt(variance / FACTS.height), rel_tol=1e-12)
 
 

@@ -21,10 +21,10 @@ from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.accuracy import measure, report
 from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
-from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.kernels.render import uses_float32
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE, TIERS
+from unprocess_gen.simulation.reference.electrons import noise_variance
 from unprocess_gen.sources.listing import list_photographs
 
 

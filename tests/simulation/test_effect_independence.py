@@ -10,8 +10,8 @@ from helpers.flats import SILENT, bounds_off, dead, flat, noisy_dn, plan_with, s
 from helpers.promise_report import Figure
 
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
-from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.reference import electrons
 
 COUNTED = {"dark_e": 3.0, "hot_pixel_share": 0.3, "hot_pixel_e": 20.0, "dn_per_e": 16.0}
 
@@ -41,9 +41,9 @@ ALL = {
 def test_omitted_effect_in_dn_removes_only_its_values(effect: str) -> None:
     clean_dn = np.full((64, 96), 20000.0)
     on = [one for one in EFFECTS[:-1] if one != "dead_pixels"]
-    with_it = order.noisy(clean_dn, plan_with(*on, **ALL))
-    without = order.noisy(clean_dn, plan_with(*(one for one in on if one != effect), **ALL))
-    alone = order.noisy(clean_dn, plan_with(effect, **ALL)) - clean_dn
+    with_it = electrons.noisy(clean_dn, plan_with(*on, **ALL))
+    without = electrons.noisy(clean_dn, plan_with(*(one for one in on if one != effect), **ALL))
+    alone = electrons.noisy(clean_dn, plan_with(effect, **ALL)) - clean_dn
     assert np.abs(alone).max() > 1
     np.testing.assert_allclose(with_it - without, alone, rtol=0, atol=1e-10)
 

@@ -27,7 +27,7 @@ from helpers.flats import (
 )
 from helpers.moments import REACH, bernstein
 
-from unprocess_gen.simulation.effects import EFFECTS, PHYSICAL_EFFECTS, order
+from unprocess_gen.simulation.effects import EFFECTS, PHYSICAL_EFFECTS
 from unprocess_gen.simulation.effects.dsnu import Dsnu
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.effects.prnu import Prnu
@@ -35,6 +35,7 @@ from unprocess_gen.simulation.lookup_tables import exponential_levels
 from unprocess_gen.simulation.pair import crop_maker, make_pair
 from unprocess_gen.simulation.plan import DarkFramePlan
 from unprocess_gen.simulation.plan_slots import slots_of
+from unprocess_gen.simulation.reference.electrons import columns_dn
 from unprocess_gen.simulation.self_test import GOLDEN_PHYSICS, GOLDEN_PLAN, golden_image
 from unprocess_gen.simulation.slots import Patterns, Slots
 
@@ -393,8 +394,7 @@ def test_mean_of_frames_does_not_exceed_full_well() -> None:
         column_std_dn=20.0, fixed_pattern_in_clean=True,
     )  # fmt: skip
     clean = make_pair(flat(5000, *size), plan).clean.astype(np.float64)
-    columns_dn = order.offsets(order.crop_of(plan, size), order.effects_of(plan), fixed_only=True)
-    full = np.rint(8 * 2000 + BLACK + columns_dn)
+    full = np.rint(8 * 2000 + BLACK + np.tile(columns_dn(slots_of(plan).fixed_columns, size, (0, 0)), (size[0], 1)))
     assert (clean <= full).all()
     assert 0.1 < (clean == full).mean() < 0.3
     noisy = np.array([make_pair(flat(5000, *size), plan.replace(stream_key=key)).noisy for key in range(frames)])

@@ -17,12 +17,11 @@ from dataclasses import replace
 import numpy as np
 
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, Float, Frame, Normalised, Srgb
-from unprocess_gen.simulation.effects import order
-from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Counts, Pair
 from unprocess_gen.simulation.kernels.render import CODES, CropRenderer, pass_key, render_clean, render_pairs
 from unprocess_gen.simulation.plan import EXACT, REFERENCE, Plan
+from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
 from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
@@ -32,7 +31,7 @@ from unprocess_gen.simulation.tone_curves import linear_table
 def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None) -> Pair:
     """Simulate the clean and noisy raw frame of one image.
 
-    The result depends only on the arguments, not on machine, worker, method or order.
+    The result depends only on the arguments, not on machine, worker, method or electrons.
 
     Parameters
     ----------
@@ -190,13 +189,13 @@ def _reference_pair(
     photograph = unprocess(srgb, plan, origin, curve)
     light = _scene_light(photograph, plan, origin)
     clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest)
-    noisy_dn = order.noisy(clean_dn, plan, origin, dark_pixels)
+    noisy_dn = electrons.noisy(clean_dn, plan, origin, dark_pixels)
     if plan.pins_saturated:
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
 
     limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, plan.sensor.sensor_clip)
     levels_dn = sensor.black_level_dn, sensor.white_level_dn
-    averaged_dn = order.average(clean_dn, plan, origin) if plan.averaged else clean_dn
+    averaged_dn = electrons.average(clean_dn, plan, origin) if plan.averaged else clean_dn
     clean = _frame_of(averaged_dn, limits_dn if plan.averaged else levels_dn, output.clean_normalised, levels_dn)
     noisy = _frame_of(noisy_dn, limits_dn, output.normalised, levels_dn)
     read_dn = noisy_dn if output.normalised else np.rint(noisy_dn)
@@ -206,7 +205,7 @@ def _reference_pair(
         noisy_clipped_low=int((read_dn < limits_dn[0]).sum()),
         noisy_clipped_high=int((read_dn > limits_dn[1]).sum()),
         saturated=int((clean == plan.saturated_value).sum()),
-        zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
+        zero_variance=int((electrons.noise_variance(clean_dn, plan) == 0).sum()),
         light_clipped_high=None if plan.scene.exposure == 1 else int((photograph > 1).sum()),
     )
     if output.layout == PACKED:
@@ -218,7 +217,7 @@ def _scene_light(light: Float, plan: Plan, origin: tuple[int, int]) -> Float:
     """Return the light of the scene at each CFA site, from the photograph's light, before clipping to the levels."""
     if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
         light = np.minimum(light, 1) * plan.scene.exposure
-    factor = order.light_factor(plan, light.shape, origin)
+    factor = electrons.light_factor(plan, (light.shape[0], light.shape[1]), origin)
     return light if factor is None else light * factor
 
 

@@ -6,8 +6,7 @@ import functools
 import math
 from typing import Any
 
-from unprocess_gen.simulation.effects import heteroscedastic, shot
-from unprocess_gen.simulation.effects.order import effects_of
+from unprocess_gen.simulation.effects import EFFECTS, heteroscedastic, shot
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.slots import Patterns, SiteNoise, Slots
 
@@ -19,7 +18,7 @@ def slots_of(plan: Plan) -> Slots:
     if physics is None:
         return _two_numbers(plan, black_dn)
     filled, names = dict[str, Any](), dict[str, str]()
-    for effect in effects_of(plan):
+    for effect in (effect for effect in EFFECTS if effect.name in plan.noise.effects):
         for slot, value in effect.slots(plan).items():
             assert slot not in filled, f"the effects {names[slot]} and {effect.name} both fill the slot {slot}"
             filled[slot], names[slot] = value, effect.name

@@ -1,7 +1,7 @@
-"""Define the slots of a noisy frame: what kernels simulate, whatever effects ask for it.
+"""Define the slots of a noisy frame: what reference and kernels simulate, whatever effects ask for it.
 
-An effect of the sensor fills one slot or more (`plan_slots`). Kernels know the slots and no effect, so a new effect
-that fits a slot touches no kernel. Light meets the slots in this order:
+An effect of the sensor fills one slot or more (`plan_slots`). Reference and kernels know the slots and no effect, so a
+new effect that fits a slot touches neither. Light meets the slots in this order:
 
     light factor → electron factor → counts of light → counts of one rate → defects → limit of the well
     → gain by plane → noise of a site → offsets by row, column and plane → offsets by site → dead pixels
@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
+from unprocess_gen.core.random_streams import Words, words
 
 
 class RadialFactor(NamedTuple):
@@ -83,6 +85,12 @@ class FrameWords(NamedTuple):
     level: int
     draw: int
     frame: int
+
+
+def draw_words(stream: UnitWords | FrameWords, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> Words:
+    """Random words of a sensor unit or of a frame, [H, W]; ``origin`` is their place in the full frame."""
+    numbers = stream._asdict()
+    return words(numbers.pop("key"), numbers.pop("stream"), shape, origin=origin, **numbers)
 
 
 class ColumnOffsets(NamedTuple):

@@ -15,8 +15,9 @@ from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.core import exact_distributions
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.effects.heteroscedastic import STREAM, heteroscedastic, noise_variance
+from unprocess_gen.simulation.effects.heteroscedastic import STREAM
 from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.reference.electrons import noise_variance, noisy
 from unprocess_gen.simulation.reference.noise import normals
 
 LAST = 2**31 - 1
@@ -102,4 +103,4 @@ def test_noise_is_the_standard_deviation_times_the_streams_normals(plan: Plan) -
     clean = np.linspace(240, 4095, 12 * 70).reshape(12, 70)
     n = normals(words(plan.stream_key, STREAM, (12, 70)))
     expected = clean + np.sqrt(plan.noise.a_dn * (clean - 240) + plan.noise.b_dn2) * n
-    assert (heteroscedastic(clean, plan) == expected).all()
+    assert (noisy(clean, plan) == expected).all()

@@ -37,12 +37,12 @@ from unprocess_gen.reports.formatting import counted
 from unprocess_gen.reports.pictures import picture_jpeg
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
-from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.render import render_clean
 from unprocess_gen.simulation.kernels.site_patterns import forget_patterns
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan
+from unprocess_gen.simulation.reference.electrons import noise_variance
 from unprocess_gen.simulation.reference.sensor import in_dn
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.listing import list_photographs

@@ -17,11 +17,11 @@ from unprocess_gen.core.arrays import Float, Frame
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.dataset.row import patch_from_row, plan_from_row
-from unprocess_gen.simulation.effects import order
-from unprocess_gen.simulation.effects.hot_pixels import HotPixels
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.plan_slots import slots_of
+from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 EPOCH = 2**14 - 1
@@ -88,9 +88,10 @@ def measure_noise(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels 
 
 def _hot_sites(plan: Plan, patch: Patch, weight: Float) -> NDArray[np.bool_]:
     """Sites whose mean excess is three times as far as outliers, so that each frame shows it."""
-    if "hot_pixels" not in plan.noise.effects:
+    bright = slots_of(plan).patterns.bright
+    if bright is None:
         return np.zeros(weight.shape, np.bool_)
-    mean_e = HotPixels().mean_electrons(order.crop_of(plan, weight.shape, patch.origin))
+    mean_e = electrons.bright_means_e(bright, (weight.shape[0], weight.shape[1]), patch.origin)
     return np.asarray(mean_e * plan.numbers.dn_per_e * weight > 3 * FAR_Z)
 
 
@@ -115,12 +116,11 @@ def _repetition(clean_dn: Float, plan: Plan, patch: Patch, dark_pixels: DarkPixe
     if not plan.output.clean_normalised:
         light_dn = clean_dn + np.random.default_rng(plan.stream_key).uniform(-0.5, 0.5, clean_dn.shape)
     if plan.averaged:  # the clean frame contains the fixed patterns
-        light_dn = light_dn - (order.average(np.full_like(clean_dn, black_dn), plan, origin) - black_dn)
-    noisy_dn = order.noisy(np.clip(light_dn, black_dn, plan.brightest_dn), again, origin, dark_pixels)
-    if plan.physics is not None:
-        line = 1, clean_dn.shape[1]
-        own, other = (order.crop_of(of_plan, line, (0, patch.patch_x), dark_pixels) for of_plan in (plan, again))
-        for effect in order.effects_of(plan):
-            noisy_dn += effect.column_offset_dn(own) - effect.column_offset_dn(other)
+        light_dn = light_dn - (electrons.average(np.full_like(clean_dn, black_dn), plan, origin) - black_dn)
+    noisy_dn = electrons.noisy(np.clip(light_dn, black_dn, plan.brightest_dn), again, origin, dark_pixels)
+    own_dn, other_dn = (
+        electrons.columns_dn(slots_of(frame).columns, (1, clean_dn.shape[1]), origin) for frame in (plan, again)
+    )
+    noisy_dn += own_dn - other_dn
     low_dn, high_dn = noisy_limits(plan.sensor.bits, black_dn, plan.sensor.sensor_clip)
     return np.clip(noisy_dn if plan.output.normalised else np.rint(noisy_dn), low_dn, high_dn)

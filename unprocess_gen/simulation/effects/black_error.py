@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from unprocess_gen.core.arrays import Float
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.plan import Plan
 
@@ -15,10 +14,6 @@ class BlackError(Effect):
     meaning = "difference between black and the black level, by CFA site; fixed pattern"
     numbers = ("black_error_dn",)
     is_fixed = is_in_dark_frames = True
-
-    def plane_offset_dn(self, crop: Crop) -> Float:
-        """Return the error of each site, [H, W] DN."""
-        return crop.by_site(crop.physics.black_error_dn)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the largest error as an offset of all pixels."""

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues, slot_words
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import ColumnOffsets
 
 
@@ -21,11 +17,6 @@ class ColumnTemporal(Effect):
     meaning = "an offset of each column, new in every frame"
     numbers = ("column_temporal_std_dn",)
     is_in_dark_frames = True
-
-    def column_offset_dn(self, crop: Crop) -> Float:
-        """Draw the offset of each column, [1, W] DN."""
-        words = crop.frame_words(self.stream, (1, crop.shape[1]), (0, crop.origin[1]))
-        return np.asarray(crop.physics.column_temporal_std_dn * normals(words))
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict independent offsets of columns, new in every frame."""

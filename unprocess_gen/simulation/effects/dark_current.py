@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.fields import Numbers
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.numbers import Number
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import UniformCounts
 
 HEAT = {
@@ -34,16 +30,6 @@ class DarkCurrent(Effect):
     numbers = ("dark_e",)
     keys = HEAT
     heat = is_before_well = is_in_dark_frames = masks = True
-
-    def electrons(self, electrons: Float, crop: Crop) -> Float:
-        """Add a count to each pixel."""
-        physics = crop.physics
-        count = poisson(crop.frame_words(self.stream), np.full(crop.shape, physics.dark_e))
-        return electrons + (count - (physics.dark_e if physics.dark_offset == "removed" else 0.0))
-
-    def mean_electrons(self, crop: Crop) -> float | None:
-        """Return the mean if the camera keeps it."""
-        return crop.physics.dark_e if crop.physics.dark_offset == "kept" else None
 
     def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return K² times the mean, DN²."""

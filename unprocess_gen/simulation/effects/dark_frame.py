@@ -8,13 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, Shape, SlotValues
 from unprocess_gen.simulation.facts import DarkPixels
-from unprocess_gen.simulation.lookup_tables import quantile_table
 from unprocess_gen.simulation.plan import DarkFramePlan, Plan
-from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 
 DITHER_DISTRIBUTION, DITHER_SHAPE = "tukey_lambda", 1.0
@@ -80,15 +77,6 @@ class DarkFrameNoise(Effect):
     stream = declare_stream("dark_dither", 15)
     meaning = "noise of the read-out, sampled from dark frames"
     has_switch = False
-
-    def noise_dn(self, crop: Crop) -> Float:
-        """Draw the dither, uniform in ±½ DN of the dark frame."""
-        uniform = by_inverse_cdf(crop.frame_words(self.stream), quantile_table(DITHER_DISTRIBUTION, DITHER_SHAPE))
-        return dither_std_dn(crop.plan) * uniform
-
-    def site_offset_dn(self, crop: Crop) -> NDArray[np.float32]:
-        """Return the dark frame."""
-        return dark_frame_offsets(crop.plan, crop.dark_pixels, crop.shape, crop.origin)
 
     def slots(self, plan: Plan) -> SlotValues:
         """Fill the noise of a site with the dither, and the offsets by site."""

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.slots import DeadSlot
 
 if TYPE_CHECKING:
@@ -29,12 +25,6 @@ class DeadPixels(Effect):
     meaning = "few pixels that record no light; fixed pattern"
     numbers = ("dead_pixel_share", "dead_pixel_level")
     is_fixed = has_outliers = True
-
-    def output_dn(self, noisy_dn: Float, crop: Crop) -> Float:
-        """Set dead pixels to their value."""
-        physics = crop.physics
-        dead_dn = dead_pixel_dn(physics, crop.plan.sensor.black_level_dn)
-        return np.where(is_among(crop.body_words(self.stream), physics.dead_pixel_share), dead_dn, noisy_dn)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict pixels that lose their signal."""

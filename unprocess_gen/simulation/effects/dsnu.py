@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.slots import NormalPattern
 
 
@@ -21,12 +17,6 @@ class Dsnu(Effect):
     meaning = "unequal offsets of pixels; fixed pattern"
     numbers = ("dsnu_std_e",)
     is_fixed = is_in_dark_frames = True
-
-    def site_offset_dn(self, crop: Crop) -> Float:
-        """Return the offset of each pixel, [H, W] DN; values of float32, in which kernels store the pattern."""
-        std_dn = crop.physics.dsnu_std_e * crop.physics.dn_per_e
-        offset_dn = std_dn * normals(crop.body_words(self.stream))
-        return offset_dn.astype(np.float32).astype(np.float64)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict independent offsets of pixels, the same in all frames."""

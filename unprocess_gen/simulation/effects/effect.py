@@ -1,73 +1,18 @@
-"""Define what each effect of the sensor states: its numbers, formulas, streams, prediction and slots."""
+"""Define what each effect of the sensor states: its numbers, streams, prediction and slots."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from unprocess_gen.core.arrays import Float
-from unprocess_gen.core.random_streams import Words, words
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.numbers import Number
-from unprocess_gen.simulation.plan import NUMBERS, Physics, Plan
+from unprocess_gen.simulation.plan import NUMBERS, Plan
 from unprocess_gen.simulation.slots import FrameWords
 
 Shape = tuple[int, int]
 SlotValues = dict[str, Any]
 """What an effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
-
-
-def frame_words(plan: Plan, stream: int, shape: tuple[int, ...], origin: Shape = (0, 0)) -> Words:
-    """Return the random words of a plan's frame, level and draw, [H, W]."""
-    place = plan.place
-    numbers = {"frame": place.frame_word, "level": place.level, "draw": place.draw}
-    return words(plan.stream_key, stream, (shape[0], shape[1]), origin=origin, **numbers)
-
-
-@dataclass(frozen=True)
-class Crop:
-    """Crop of a frame that is simulated.
-
-    Attributes
-    ----------
-    plan : Plan
-        Parameters of the pair.
-    physics : Physics
-        Numbers of its physical profile.
-    shape, origin : (int, int)
-        Height and width, and row and column of the first pixel in the full frame.
-    dark_pixels : DarkPixels or None
-        Access to the dark frame that the plan names.
-    relative_gain : ndarray of float64, [H, W]
-        System gain of each site relative to ``dn_per_e``.
-    """
-
-    plan: Plan
-    physics: Physics
-    shape: Shape
-    origin: Shape = (0, 0)
-    dark_pixels: DarkPixels | None = None
-    relative_gain: Float | float = 1.0
-
-    def frame_words(self, stream: int, shape: Shape | None = None, origin: Shape | None = None) -> Words:
-        """Return the random words of a frame, [H, W]; of the crop, or of another one."""
-        return frame_words(self.plan, stream, shape or self.shape, self.origin if origin is None else origin)
-
-    def body_words(self, stream: int, shape: Shape | None = None, origin: Shape | None = None, draw: int = 0) -> Words:
-        """Return the random words of a fixed pattern of the camera body, [H, W]; of the crop, or of another one."""
-        origin = self.origin if origin is None else origin
-        return words(self.physics.body_key, stream, shape or self.shape, origin=origin, draw=draw)
-
-    def by_site(self, sites: Sequence[float]) -> Float:
-        """Repeat the values of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the 2x2 tile, [H, W]."""
-        tile = np.array(sites).reshape(2, 2)
-        y, x = (np.arange(start, start + count) % 2 for start, count in zip(self.origin, self.shape, strict=True))
-        return np.asarray(tile[y[:, None], x[None, :]])
 
 
 def slot_words(plan: Plan, stream: int) -> FrameWords:
@@ -127,41 +72,6 @@ class Effect:
     def declared(self) -> dict[str, Number]:
         """Numbers by the names of their fields."""
         return {name: NUMBERS[name] for name in self.numbers}
-
-    def light_factor(self, crop: Crop) -> Float | None:
-        """Return the factor on the light of the clean frame, [H, W] of float32 values; None if it is 1."""
-
-    def plane_gains(self, plan: Plan) -> tuple[float, ...] | None:
-        """Return the system gain of the four sites of the 2x2 tile relative to ``dn_per_e``; None if it is 1."""
-
-    def electrons(self, electrons: Float, crop: Crop) -> Float:
-        """Return the electrons of each site after the effect, [H, W]."""
-        return electrons
-
-    def noise_dn(self, crop: Crop) -> Float | None:
-        """Return independent noise of each site, [H, W] DN."""
-
-    def row_offset_dn(self, crop: Crop) -> Float | float:
-        """Return the offset of each row, [H, 1] DN."""
-        return 0.0
-
-    def column_offset_dn(self, crop: Crop) -> Float | float:
-        """Return the offset of each column, [1, W] DN."""
-        return 0.0
-
-    def plane_offset_dn(self, crop: Crop) -> Float | float:
-        """Return the offset of the colour plane of each site, [H, W] DN."""
-        return 0.0
-
-    def site_offset_dn(self, crop: Crop) -> Float | NDArray[np.float32] | None:
-        """Return other offsets by site, [H, W] DN."""
-
-    def output_dn(self, noisy_dn: Float, crop: Crop) -> Float:
-        """Return the values that the converter sees, [H, W] DN."""
-        return noisy_dn
-
-    def mean_electrons(self, crop: Crop) -> Float | float | None:
-        """Return the electrons that the effect adds to the average of many frames."""
 
     def slots(self, plan: Plan) -> SlotValues:
         """Return the slots that the effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""

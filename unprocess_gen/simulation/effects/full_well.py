@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from unprocess_gen.core.arrays import Float
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.plan import Plan
 
@@ -21,10 +18,6 @@ class FullWell(Effect):
     name = "full_well"
     meaning = "saturation capacity, at which the clean and the noisy frame are clipped"
     numbers = ("full_well_e",)
-
-    def electrons(self, electrons: Float, crop: Crop) -> Float:
-        """Limit the electrons."""
-        return np.minimum(electrons, crop.physics.full_well_e / crop.relative_gain)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the most that any pixel can lose; nothing if the converter ends below the full well."""

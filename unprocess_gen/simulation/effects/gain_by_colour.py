@@ -7,9 +7,6 @@ import math
 from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.cfa import tile
-
-COLOURS = ("red", "green", "blue")
 
 
 class GainByColour(Effect):
@@ -19,10 +16,6 @@ class GainByColour(Effect):
     meaning = "a system gain of its own for each colour"
     numbers = ("gain_by_colour",)
 
-    def plane_gains(self, plan: Plan) -> tuple[float, ...]:
-        """Return the gain of the colour of each site of the tile; the gain of green for a sensor without filters."""
-        return tuple(plan.numbers.gain_by_colour[channel] for row in tile(plan.sensor.pattern) for channel in row)
-
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict a change of the shot noise: its standard deviation differs by a factor √gain."""
         shot_dn = math.sqrt(frame.physics.dn_per_e * level_dn)
@@ -30,5 +23,6 @@ class GainByColour(Effect):
         return independent(frame, most_dn * most_dn)
 
     def slots(self, plan: Plan) -> SlotValues:
-        """Fill the gains by plane."""
-        return {"plane_gains": self.plane_gains(plan)}
+        """Fill the gains by plane; a sensor without filters has that of green."""
+        gains = dict(zip("RGB", plan.numbers.gain_by_colour, strict=True))
+        return {"plane_gains": tuple(gains.get(colour, gains["G"]) for colour in plan.sensor.pattern)}

@@ -6,16 +6,10 @@ import functools
 import math
 from decimal import Decimal, localcontext
 
-import numpy as np
-
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
-from unprocess_gen.simulation.lookup_tables import exponential_levels
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.noise import is_among
-from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.slots import BrightPixels
 
 
@@ -27,17 +21,6 @@ class HotPixels(Effect):
     meaning = "few pixels with a far larger dark current; fixed pattern"
     numbers = ("hot_pixel_share", "hot_pixel_e")
     heat = is_fixed = is_before_well = is_in_dark_frames = has_outliers = True
-
-    def electrons(self, electrons: Float, crop: Crop) -> Float:
-        """Add a Poisson count of its mean to each hot pixel."""
-        return electrons + poisson(crop.frame_words(self.stream), self.mean_electrons(crop))
-
-    def mean_electrons(self, crop: Crop) -> Float:
-        """Return the mean excess of each pixel, [H, W] electrons; 0 except for hot pixels."""
-        physics = crop.physics
-        hot = is_among(crop.body_words(self.stream), physics.hot_pixel_share)
-        step = crop.body_words(self.stream, draw=1) >> np.uint32(22)
-        return np.where(hot, physics.hot_pixel_e * exponential_levels()[step], 0.0)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict Poisson counts with exponentially distributed mean m, whose mean square is m + 2m²."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Float
-from unprocess_gen.simulation.effects.effect import Crop, Effect, Shape, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, Shape, SlotValues
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.slots import RadialFactor
@@ -61,11 +61,6 @@ class LensShading(Effect):
     meaning = "less light towards the corners, in the clean and the noisy frame"
     numbers = ("lens_shading",)
     in_both_frames = True
-
-    def light_factor(self, crop: Crop) -> Float:
-        """Return the relative illumination, [H, W]; values of float32, in which kernels store the pattern."""
-        physics = crop.physics
-        return illumination(physics.lens_shading, physics.frame_size, crop.shape, crop.origin).astype(np.float64)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the light that the darkest place loses."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues
 from unprocess_gen.simulation.effects.prediction import FrameFacts
-from unprocess_gen.simulation.lookup_tables import quantile_table
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.noise import by_inverse_cdf
 from unprocess_gen.simulation.slots import SiteNoise
 
 
@@ -20,12 +17,6 @@ class ReadNoise(Effect):
     meaning = "noise of the amplifier and the converter"
     numbers = ("read_law", "read_shape", "read_std_dn")
     masks = True
-
-    def noise_dn(self, crop: Crop) -> Float:
-        """Draw the noise by the inverse distribution function."""
-        physics = crop.physics
-        table = quantile_table(physics.read_law, physics.read_shape)
-        return physics.read_std_dn * by_inverse_cdf(crop.frame_words(self.stream), table)
 
     def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return the square of the standard deviation, DN²."""

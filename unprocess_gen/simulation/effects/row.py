@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.random_streams import declare_stream
-from unprocess_gen.simulation.effects.effect import Crop, Effect, SlotValues, slot_words
+from unprocess_gen.simulation.effects.effect import Effect, SlotValues, slot_words
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.noise import autoregressive, normals
 from unprocess_gen.simulation.slots import RowOffsets
 
 
@@ -26,14 +22,6 @@ class RowNoise(Effect):
     meaning = "an offset of each row, new in every frame"
     numbers = ("row_std_dn", "row_correlation")
     is_in_dark_frames = True
-
-    def row_offset_dn(self, crop: Crop) -> Float:
-        """Draw the offset of each row, [H, 1] DN."""
-        physics, (height, _), (top, _) = crop.physics, crop.shape, crop.origin
-        if physics.row_correlation == 0:
-            return np.asarray(physics.row_std_dn * normals(crop.frame_words(self.stream, (height, 1), (top, 0))))
-        independent = normals(crop.frame_words(self.stream, (top + height, 1), (0, 0)))[:, 0]
-        return (physics.row_std_dn * autoregressive(independent, physics.row_correlation)[top:])[:, None]
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict row offsets; correlation r divides the number of independent rows by (1 + r) / (1 - r)."""

@@ -1,4 +1,4 @@
-"""Sample noise effect by effect, in electrons and then in DN: the order of `effects.order.noisy`.
+"""Sample noise effect by effect, in electrons and then in DN: the order of `reference.electrons.noisy`.
 
 The way of a strip of a noisy frame. Left, the function; right, the `Buffers` that it fills::
 
@@ -253,7 +253,7 @@ def _count_defects(noise: Electrons, strip: Strip, buffers: Buffers) -> None:
 def _sum_dn(
     electrons: Any, full_well_e: Any, dn_per_e: Any, black_dn: Any, noise_dn: Any, offset_dn: Any, site_dn: Any
 ) -> Any:
-    """Return DN in the order of `effects.order.noisy`: of one site, or of eight as vectors."""
+    """Return DN in the order of `reference.electrons.noisy`: of one site, or of eight as vectors."""
     dn = simd.minimum(electrons, full_well_e) * dn_per_e + black_dn
     return ((dn + noise_dn) + offset_dn) + site_dn
 
@@ -349,7 +349,7 @@ def _exact_dark(noise: Electrons, frame: FrameNumbers, x: int, buffers: Buffers)
 
 @inner
 def average_electrons(noise: Electrons, strip: Strip, buffers: Buffers) -> None:
-    """Add the fixed patterns to the unrounded clean frame, as `effects.order.average`."""
+    """Add the fixed patterns to the unrounded clean frame, as `reference.electrons.average`."""
     frame, clean_dn, defects_e = load_frame(noise, np.int64(0)), buffers.unrounded_dn, buffers.defects_e
     _fill_defects(noise.patterns, strip, buffers)
     kept_e, sites_dn = frame.dark_e - frame.removed_e, strip_values(noise.patterns.sites_dn, strip)

@@ -82,7 +82,7 @@ def _means_e(mean_e: float) -> Float:
 def light_factor(
     slots: Patterns, patterns: SitePatterns, shape: Shape, origin: Shape, is_averaged: bool
 ) -> SiteMap | None:
-    """Return the factor on the light of the clean frame, as `effects.order.light_factor`; None without one.
+    """Return the factor on the light of the clean frame, as `reference.electrons.light_factor`; None without one.
 
     ``is_averaged``: the clean frame contains the fixed patterns.
     """
