@@ -28,7 +28,7 @@ def test_sources_are_sampled_and_their_sizes_give_the_bytes(
 
     is_exact = read_all or count == SAMPLE
     assert len(estimate.source_estimates) == (count if read_all else SAMPLE)
-    assert (estimate.exact, estimate.pairs, estimate.shards) == (is_exact, 2 * count, -(-count // 8))
+    assert (estimate.exact, estimate.pairs, estimate.run.shards) == (is_exact, 2 * count, -(-count // 8))
     assert made.bytes < estimate.bytes < 4 * made.bytes  # the rows of these pairs take less than 8 kB
     lines = format_estimate(estimate).splitlines()
     assert lines[2].startswith(f"bytes     about {estimate.bytes:,} in shards, ")

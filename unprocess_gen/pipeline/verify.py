@@ -80,7 +80,7 @@ def verify(folder: AnyPath) -> list[Damage]:
                 damages.append(Damage(DATASET, "is missing"))
         except DamageError as error:
             damages.append(Damage(DATASET, _without_path(error)))
-        damages += _check_files(folder, facts)
+        damages += check_files(folder, facts)
         listed = {number: entry for number, entry in enumerate(facts.get("shards", [])) if entry["file"] is not None}
         try:
             if (folder / MANIFEST).exists():
@@ -118,7 +118,8 @@ def _without_path(error: DamageError) -> str:
     return str(error).partition(": ")[2]
 
 
-def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
+def check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
+    """Compare the digests of config and manifest with those in the contents of ``dataset.json``."""
     for name, field in ((CONFIG, "config_sha256"), (MANIFEST, "manifest_sha256")):
         try:
             digest = file_sha256(folder / name)

@@ -10,10 +10,8 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
-from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.dataset.columns import Row
@@ -23,6 +21,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
+from unprocess_gen.pipeline.verify import check_files
 from unprocess_gen.reports.formatting import byte_size, short_number
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.manifest_statistics import MEANINGS, SITE_COLUMNS, read_statistics, values_text
@@ -57,7 +56,7 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: st
     """Render the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
     from jinja2 import TemplateError  # optional library, extra "figures"
 
-    facts, name = checked_facts(folder), folder_name(folder)
+    facts, name = _checked_facts(folder), folder_name(folder)
     statistics = read_statistics(with_bar(read_rows(folder / "manifest.csv"), "row"))
     first = statistics.first_pair
     try:
@@ -81,21 +80,13 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark_frames: st
         raise DamageError(f"{folder / 'dataset.json'}: cannot be shown ({error_in_one_line(error)})") from error
 
 
-def checked_facts(folder: AnyPath) -> dict[str, Any]:
+def _checked_facts(folder: AnyPath) -> dict[str, Any]:
     """Read ``dataset.json``, and compare the digests of manifest and config."""
     if not (folder / "dataset.json").exists():
         raise DamageError(f"{folder}: dataset.json does not exist; expected a finished dataset")
     facts = read_dataset(folder / "dataset.json")
-    for name, digest in (("manifest.csv", facts["manifest_sha256"]), ("config.yaml", facts["config_sha256"])):
-        path = folder / name
-        if not path.is_file() or file_sha256(path) != digest:
-            raise DamageError(
-                f"{path}: differs from the SHA-256 in dataset.json; run gen-dataset verify {folder} for details"
-            )
-    try:
-        read_dataset_yaml(folder / "config.yaml")
-    except ConfigError as error:
-        raise DamageError(str(error)) from error
+    for damage in check_files(folder, facts):
+        raise DamageError(f"{folder}/{damage}; run gen-dataset verify {folder} for details")
     return facts
 
 

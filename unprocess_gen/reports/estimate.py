@@ -18,12 +18,11 @@ from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
-from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels, targets_of
+from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels, targets_of
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import source_bytes
-from unprocess_gen.planning.effect_selection import Prediction
-from unprocess_gen.planning.plan import plan_levels
+from unprocess_gen.planning.plan import PlanAndPredictions, plan_levels
 from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan
@@ -37,7 +36,7 @@ SAMPLE = 8
 
 @dataclass(frozen=True, slots=True)
 class SourceEstimate:
-    """The pairs of a source, or why it has none; ``levels`` and ``predictions`` have an item for each noise level.
+    """The pairs of a source, or why it has none; ``levels`` has a plan with its predictions for each noise level.
 
     ``bytes`` is their size in a shard, ``seconds`` the time it took to make them, ``noise_ratio`` the noise of the
     source over the simulated noise, if it is known.
@@ -47,8 +46,7 @@ class SourceEstimate:
     seconds: float = 0.0
     failure: SourceError | None = None
     bytes: int = 0
-    levels: tuple[Plan, ...] = ()
-    predictions: tuple[tuple[Prediction, ...], ...] = ()
+    levels: tuple[PlanAndPredictions, ...] = ()
     patches: int = 0
     pairs: int = 0
     noise_ratio: float | None = None
@@ -65,7 +63,6 @@ class RunEstimate:
     run: Run
     n_jobs: int
     source_estimates: tuple[SourceEstimate, ...]
-    shards: int
     bytes: int
     free_bytes: int
     start_seconds: float
@@ -91,20 +88,15 @@ class RunEstimate:
 def estimate_run(config: Config, n_jobs: int, read_all: bool) -> RunEstimate:
     """Estimate a run by making the pairs of a sample of its sources, or of all; the time is divided by ``n_jobs``."""
     start_seconds, run = _import_seconds(), resolve(config)
-    sources, shards = run.sources, run.shards
-    n_jobs = min(n_jobs, shards)
-    sample = sources if read_all else evenly_spaced(sources, SAMPLE)
+    sample = run.sources if read_all else evenly_spaced(run.sources, SAMPLE)
     estimates = tuple(estimate_source(run.settings, source) for source in with_bar(sample, "photograph"))
-    growth = len(sources) / len(sample)
-    size = round(sum(source.bytes for source in estimates) * growth)
-    folder = any_path(config.out).scratch_place("")[0]
+    n_jobs, growth = min(n_jobs, run.shards), len(run.sources) / len(sample)
     return RunEstimate(
         run,
         n_jobs,
         estimates,
-        shards,
-        size,
-        free_bytes=free_bytes(folder),
+        bytes=round(sum(source.bytes for source in estimates) * growth),
+        free_bytes=free_bytes(any_path(config.out).scratch_place("")[0]),
         start_seconds=start_seconds * (1 if n_jobs == 1 else 2),  # workers start after the coordinator
         pair_seconds=sum(source.seconds for source in estimates) * growth / n_jobs,
     )
@@ -124,11 +116,8 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     except SourceError as error:
         return SourceEstimate(source, time.perf_counter() - started, error)
     image = plan_pixels(settings, photograph, source, sha256)
-    assert image.config is not None
-    planned = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
-    levels, predictions = zip(*planned, strict=True)
-    seconds = time.perf_counter() - started
-    _compile_kernels(levels)
+    levels, seconds = predicted_levels(settings, image, source, sha256), time.perf_counter() - started
+    _compile_kernels([plan for plan, _ in levels])
     started = time.perf_counter()
     for patch, plan, pair in image.pairs():
         targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair).values()
@@ -140,11 +129,18 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         seconds=seconds + (time.perf_counter() - started) * config.output.frames,
         bytes=source_bytes(config, *photograph.srgb.shape[:2]),
         levels=levels,
-        predictions=predictions,
         patches=len(image.patches),
         pairs=len(image.patches) * len(image.plans),
-        noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, levels[0]),
+        noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, image.plans[0]),
     )
+
+
+def predicted_levels(
+    settings: PairSettings, image: PlannedImage, source: Source, sha256: str
+) -> tuple[PlanAndPredictions, ...]:
+    """The plan of an image at each noise level, with what decided its effects."""
+    assert image.config is not None
+    return plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
 
 
 def _compile_kernels(plans: Sequence[Plan]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import textwrap
 from collections.abc import Iterable, Sequence
 
@@ -12,6 +13,7 @@ from unprocess_gen.config.values import value_range
 from unprocess_gen.core.fields import value_text
 from unprocess_gen.planning.advice import body_sentence, dark_scene_warning, sensor_warning
 from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
+from unprocess_gen.planning.plan import PlanAndPredictions
 from unprocess_gen.reports.estimate import RunEstimate, SourceEstimate
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
@@ -29,9 +31,10 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
     about = "" if estimate.exact else "about "
     place = config.source.list or config.source.place or "the synthetic pictures"
     listed = f"{len(run.sources)} in {place}; {len(read)} of them read"
-    per_shard = f"{counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}"
+    per_shard = f"{counted(run.shards, 'shard')} of {config.output.pairs_per_shard}"
     size = f"about {estimate.bytes:,} in shards, {byte_size(estimate.bytes)}; {byte_size(estimate.free_bytes)} free"
     total, start, pairs = map(format_duration, (estimate.seconds, estimate.start_seconds, estimate.pair_seconds))
+    levels = [level for source in read for level in source.levels]
     return "\n".join(
         [
             *_labelled("sources", [listed, unmatched_sentence(run.listing.unmatched), *run.listing.warnings]),
@@ -42,20 +45,18 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
             *_labelled("bytes", [size + (": NOT ENOUGH" if estimate.free_bytes < estimate.bytes else "")]),
             f"time      about {total} with {counted(estimate.n_jobs, 'worker')}: start-up {start}, pairs {pairs}",
             *_failure_lines(config, read),
-            *noise_lines(config, [source for source in read if source.levels], run.settings.dark_frames, with_numbers),
+            *noise_lines(config, levels, run.settings.dark_frames, [s.noise_ratio for s in read], with_numbers),
         ]
     )
 
 
 def totals_line(estimates: Sequence[RunEstimate]) -> str:
     """Totals of a planned sweep, whose jobs run one after the other, in one line."""
-    pairs = sum(job.pairs for job in estimates)
     about = "" if all(job.exact for job in estimates) else "about "
-    seconds = sum(job.seconds for job in estimates)
-    return (
-        f"totals    {len(estimates)} jobs: {about}{pairs:,} pairs in {sum(job.shards for job in estimates):,} shards, "
-        f"{about}{sum(job.bytes for job in estimates):,} bytes, about " + format_duration(seconds)
-    )
+    totals = [(job.pairs, job.run.shards, job.bytes, job.seconds) for job in estimates]
+    pairs, shards, size, seconds = map(sum, zip(*totals, strict=True))
+    made = f"{about}{pairs:,} pairs in {shards:,} shards, {about}{size:,} bytes, about {format_duration(seconds)}"
+    return f"totals    {len(estimates)} jobs: {made}"
 
 
 def format_duration(seconds: float) -> str:
@@ -103,13 +104,20 @@ def _failure_lines(config: Config, estimates: Estimates) -> list[str]:
 
 
 def noise_lines(
-    config: Config, estimates: Estimates, dark_frames: DarkFrames | None, with_numbers: bool = False
+    config: Config,
+    levels: Sequence[PlanAndPredictions],
+    dark_frames: DarkFrames | None,
+    noise_ratios: Sequence[float | None] = (),
+    with_numbers: bool = False,
 ) -> list[str]:
-    """Scene, noise, warnings and effects for the sources that can be read."""
-    plans = [plan for source in estimates for plan in source.levels]
+    """Scene, noise, warnings and effects of the plans of all noise levels of the sources that can be read.
+
+    ``noise_ratios`` are the noise of each source over the simulated noise, if it is known.
+    """
+    plans = [plan for plan, _ in levels]
     if not plans:
         return []
-    is_physical = interpretation.is_physical(config.noise)
+    is_physical, noise = interpretation.is_physical(config.noise), plans[0].noise
     return [
         *_labelled("accuracy", [config.accuracy]),
         *_labelled("pattern", ["MONO: no colour filters" if config.sensor.pattern == MONO else ""]),
@@ -118,28 +126,35 @@ def noise_lines(
         *_labelled("noise", (_physical_sentences if is_physical else _line_sentences)(config, plans)),
         *_labelled("dark", [_dark_frames_sentence(config, dark_frames) if dark_frames else ""]),
         *_labelled("numbers", _number_sources(config, plans) if with_numbers else []),
-        *_labelled("source", [_source_noise_sentence(config, [source.noise_ratio for source in estimates])]),
+        *_labelled("source", [_source_noise_sentence(config, noise_ratios)]),
         *_labelled("warning", [dark_scene_warning(config), _rounding_warning(plans), sensor_warning(config)]),
-        *(_effect_table if is_physical else _effect_lines)(config, estimates),
+        *_labelled("effects", [] if is_physical else [", ".join(noise.effects)]),
+        *_labelled("skipped", [] if is_physical else noise.skipped),
+        *(_effect_table(config, [predictions for _, predictions in levels]) if is_physical else []),
     ]
+
+
+def _range(plans: Sequence[Plan], path: str, digits: int = 6) -> str:
+    """Smallest and largest value of a number of the plans: ``sensor.black_level_dn``."""
+    return value_range(list(map(operator.attrgetter(path), plans)), digits)
 
 
 def _scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
     """The scene, and what of it the noise profile ignores."""
-    scene, physics = config.scene, [plan.physics for plan in plans if plan.physics is not None]
+    scene, is_ignored = config.scene, plans[0].physics is None
     iso, seconds, celsius = (
-        value_range([getattr(numbers, name) for numbers in physics]) if physics else value_text(getattr(scene, name))
+        value_text(getattr(scene, name)) if is_ignored else _range(plans, f"physics.{name}")
         for name in ("iso", "exposure_s", "temperature_c")
     )
-    ratio = value_range([plan.scene.exposure_ratio for plan in plans], 4)
-    ignored = "" if physics else f"; {config.noise.name} ignores ISO, time, temperature"
+    ignored = f"; {config.noise.name} ignores ISO, time, temperature" if is_ignored else ""
+    ratio = _range(plans, "scene.exposure_ratio", 4)
     return f"{scene.name}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}{ignored}"
 
 
 def _sensor_text(plans: Sequence[Plan]) -> str:
     """The levels of the pairs: with sensor=source those of the files."""
-    black, white = ([getattr(plan.sensor, f"{end}_level_dn") for plan in plans] for end in ("black", "white"))
-    return f"on this sensor (black {value_range(black)}, white {value_range(white)})"
+    black, white = (_range(plans, f"sensor.{end}_level_dn") for end in ("black", "white"))
+    return f"on this sensor (black {black}, white {white})"
 
 
 def _line_sentences(config: Config, plans: Sequence[Plan]) -> list[str]:
@@ -147,27 +162,24 @@ def _line_sentences(config: Config, plans: Sequence[Plan]) -> list[str]:
     noise = config.noise
     black, white = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
     numbers = "; ".join(dict.fromkeys(f"a={level.a}, b={level.b}" for level in interpretation.noise_levels(noise)))
-    a_dn, b_dn2 = ([getattr(plan.noise, name) for plan in plans] for name in ("a_dn", "b_dn2"))
-    zero_dn = max((-b / a for a, b in zip(a_dn, b_dn2, strict=True) if a), default=0)
+    a_dn, b_dn2 = _range(plans, "noise.a_dn"), _range(plans, "noise.b_dn2")
+    zero_dn = max((-plan.noise.b_dn2 / plan.noise.a_dn for plan in plans if plan.noise.a_dn), default=0)
     return [
         f"{noise.name}: {numbers} ({noise.units}, black {black} {noise.black}, white {white})",
-        f"{_sensor_text(plans)}: a_dn {value_range(a_dn)}, b_dn2 {value_range(b_dn2)}; variance = "
-        "a_dn·(x - black) + b_dn2",
+        f"{_sensor_text(plans)}: a_dn {a_dn}, b_dn2 {b_dn2}; variance = a_dn·(x - black) + b_dn2",
         f"no noise up to {zero_dn:.2f} DN above black, where the variance is negative" if zero_dn > 0 else "",
     ]
 
 
 def _physical_sentences(config: Config, plans: Sequence[Plan]) -> list[str]:
     """The gain and the read noise of a physical profile, and their conversion to the sensor."""
-    noise = config.noise
-    assert noise.white_level_dn is not None and noise.black_level_dn is not None
-    physics = [plan.physics for plan in plans if plan.physics is not None]
-    gains, stds = ([getattr(numbers, name) for numbers in physics] for name in ("dn_per_e", "read_std_dn"))
-    scale = value_range([plan.sensor.span_dn / (noise.white_level_dn - noise.black_level_dn) for plan in plans])
+    name, black, white = config.noise.name, config.noise.black_level_dn, config.noise.white_level_dn
+    assert white is not None and black is not None
+    scale = value_range([plan.sensor.span_dn / (white - black) for plan in plans])
+    gain, std = _range(plans, "physics.dn_per_e", 4), _range(plans, "physics.read_std_dn", 4)
     return [
-        f"{noise.name}: in DN of black {noise.black_level_dn}, white {noise.white_level_dn}; "
-        f"{_sensor_text(plans)} times {scale}",
-        f"system gain {value_range(gains, 4)} DN per electron, read noise {value_range(stds, 4)} DN standard deviation",
+        f"{name}: in DN of black {black}, white {white}; {_sensor_text(plans)} times {scale}",
+        f"system gain {gain} DN per electron, read noise {std} DN standard deviation",
     ]
 
 
@@ -225,16 +237,9 @@ def _source_noise_sentence(config: Config, ratios: Sequence[float | None]) -> st
 _TABLE_LINE = "{:16}{:>13}  {:12} {:>11}  {:9}{}"
 
 
-def _effect_lines(config: Config, estimates: Estimates) -> list[str]:
-    """The effects of a profile with two numbers."""
-    noise = estimates[0].levels[0].noise
-    return [*_labelled("effects", [", ".join(noise.effects)]), *_labelled("skipped", noise.skipped)]
-
-
-def _effect_table(config: Config, estimates: Estimates) -> list[str]:
+def _effect_table(config: Config, levels: Sequence[Sequence[Prediction]]) -> list[str]:
     """A line per effect: what it adds where it is strongest, the noise there, and why it is simulated or not."""
     lines = [_TABLE_LINE.format("effect", "adds", "in", "noise there", "images", "why")]
-    levels = [level for source in estimates for level in source.predictions]
     for by_image in zip(*levels, strict=True):
         effect = BY_NAME[by_image[0].effect]
         strongest = max(by_image, key=lambda image: (image.simulated, image.outliers >= MIN_OUTLIERS, image.ratio))

@@ -105,7 +105,7 @@ class AccuracyReport:
 class Inputs:
     """Files of the runs, as a config of sources, with their number and pixels.
 
-    ``samples`` are the photographs whose pairs are compared, subsampled to a grid: the centre would be brighter.
+    ``samples`` are the photographs, subsampled to a grid, because the centre would be brighter.
     """
 
     source: SourceConfig
@@ -148,37 +148,36 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
 
 
 def select_inputs(config: Config, folder: Path) -> Inputs:
-    """Select the first photographs; synthetic ones are written to ``folder`` as JPEG. ConfigError without one."""
-    place, scenes = config.source.place, folder / "photographs"
-    most_pixels = RUN_PIXELS // frames_per_photograph(config)
-    samples, count, pixels, limit = list[tuple[Photograph, Source, str]](), 0, 0, 0
-    for source in list_photographs(config.source).sources:
-        limit += 1
+    """Select the first photographs; synthetic ones are written to ``folder``. ConfigError without one."""
+    source = config.source if config.source.place is not None else _written_pictures(config.source, folder)
+    listed, most_pixels = list_photographs(source).sources, RUN_PIXELS // frames_per_photograph(config)
+    samples, pixels, limit = list[tuple[Photograph, Source, str]](), 0, 0
+    for number, photo in enumerate(listed, start=1):
         with suppress(SourceError):
-            sha256, photograph = load_source(config.source, source, config.output.layout)
+            sha256, photograph = load_source(source, photo, config.output.layout)
             size = photograph.srgb[..., 0].size
-            if count and pixels + size > most_pixels:
-                limit -= 1
+            if samples and pixels + size > most_pixels:
                 break
-            count, pixels = count + 1, pixels + size
-            if place is None:
-                _, scene = load_source(replace(config.source, downscale=1), source)
-                write_files(scenes, {f"{source.name}.jpg": picture_jpeg(scene.srgb, 95)})
-            if count <= SAMPLES:
-                step = max(1, math.ceil(math.sqrt(size / SAMPLED_PIXELS)))
-                sampled = photograph.srgb[::step, ::step].copy()  # a view would keep all pixels in memory
-                samples.append((replace(photograph, srgb=sampled), source, sha256))
-        if count == RUN_FILES:
+            step = max(1, math.ceil(math.sqrt(size / SAMPLED_PIXELS)))
+            sampled = photograph.srgb[::step, ::step].copy()  # a view would keep all pixels in memory
+            samples.append((replace(photograph, srgb=sampled), photo, sha256))
+            pixels, limit = pixels + size, number
+        if len(samples) == RUN_FILES:
             break
-    if not count:
+    if not samples:
         raise ConfigError(
-            f"source.root={place}: none of {limit} photographs can be read with output.layout={config.output.layout}; "
-            "expected at least one"
+            f"source.root={source.place}: none of {len(listed)} photographs can be read with "
+            f"output.layout={config.output.layout}; expected at least one"
         )
-    files = replace(config.source, limit=limit)
-    if place is None:
-        files = replace(files, root=str(scenes), include=("*.jpg",), clips=False)
-    return Inputs(files, count, pixels, tuple(samples))
+    return Inputs(replace(source, limit=limit), len(samples), pixels, tuple(samples))
+
+
+def _written_pictures(source: SourceConfig, folder: Path) -> SourceConfig:
+    """Write synthetic pictures as JPEG, so that runs read files."""
+    for picture in list_photographs(source).sources[:RUN_FILES]:
+        _, photograph = load_source(replace(source, downscale=1), picture)
+        write_files(folder / "photographs", {f"{picture.name}.jpg": picture_jpeg(photograph.srgb, 95)})
+    return replace(source, root=str(folder / "photographs"), include=("*.jpg",), clips=False)
 
 
 def frames_per_photograph(config: Config) -> int:
@@ -192,16 +191,17 @@ def frames_per_photograph(config: Config) -> int:
 def measure_runs(config: Config, inputs: Inputs, out: Path) -> dict[str, list[RunTimes]]:
     """Times of the runs of every tier by round; of the reference one, or none if its run would be too long."""
     is_short = inputs.pixels * frames_per_photograph(config) <= MOST_REFERENCE_PIXELS
-    rounds = dict.fromkeys(TIERS, ROUNDS) | {REFERENCE: int(is_short)}
+    compiled = [tier for tier in TIERS if tier != REFERENCE]
 
-    def measure(tier: str, number: int) -> RunTimes | None:
-        times = time_run(config, inputs, tier, out) if number <= rounds[tier] else None
+    def measure(tier: str, _: int) -> RunTimes:
+        times = time_run(config, inputs, tier, out)
         progress.advance()
-        return times if number else None
+        return times
 
-    with Progress(len(TIERS) * (ROUNDS + 1), unit="measurement") as progress:
-        times = measure_in_turns({tier: partial(measure, tier) for tier in TIERS}, ROUNDS + 1)
-    return {tier: [run for run in runs if run is not None] for tier, runs in times.items()}
+    with Progress(len(compiled) * (ROUNDS + 1) + is_short, unit="measurement") as progress:
+        times = measure_in_turns({tier: partial(measure, tier) for tier in compiled}, ROUNDS + 1)
+        reference = [measure(REFERENCE, 0)] if is_short else []
+    return {REFERENCE: reference} | {tier: runs[1:] for tier, runs in times.items()}
 
 
 def time_run(config: Config, inputs: Inputs, tier: str, out: Path) -> RunTimes:
@@ -232,7 +232,7 @@ def clean_share(images: Sequence[PlannedImage]) -> float:
     """Share of the clean frames in the time of the pairs of images, from the shortest times of three rounds."""
 
     def time_of(work: Callable[[PlannedImage], object], _: int) -> float:
-        return sum(thread_ns(partial(work, image), 1) for image in images)
+        return thread_ns(lambda: [work(image) for image in images], 1)
 
     works = {"clean": _clean_frame, "pairs": lambda image: list(image.pairs())}
     times = measure_in_turns({name: partial(time_of, work) for name, work in works.items()}, 3)
@@ -253,20 +253,21 @@ def plan_samples(config: Config, tier: str, inputs: Inputs) -> list[PlannedImage
     """Plan the samples in a tier as complete mosaics, with their first noise level and draw."""
     source, output = replace(config.source, patch=None), replace(config.output, layout=MOSAIC)
     settings = PairSettings.read(replace(config, source=source, output=output, accuracy=tier))
-    images = [plan_pixels(settings, *sample) for sample in inputs.samples]
+    images = [plan_pixels(settings, *sample) for sample in inputs.samples[:SAMPLES]]
     return [replace(image, plans=image.plans[:1]) for image in images]
 
 
 def deviations(pairs: Sequence[Pair], reference: Sequence[Pair], plans: Sequence[Plan]) -> dict[str, list[float]]:
     """Errors by stage: last values of a `Measurement`; σ is that of shot, read and rounding noise at each site."""
-    frames: tuple[list[Float], list[Float], list[Float]] = ([], [], [])
+    parts = []
     for pair, exact, plan in zip(pairs, reference, plans, strict=True):
         levels_dn = plan.sensor.black_level_dn, plan.sensor.white_level_dn
-        clean_dn = in_dn(exact.clean, levels_dn)
-        frames[0].append((in_dn(pair.clean, levels_dn) - clean_dn).ravel())
-        frames[1].append((in_dn(pair.noisy, levels_dn) - in_dn(exact.noisy, levels_dn)).ravel())
-        frames[2].append(np.sqrt(noise_variance(clean_dn, plan) + 1 / 12).ravel())
-    clean, noisy, std = map(np.concatenate, frames)
+        clean, noisy, exact_clean, exact_noisy = (
+            in_dn(frame, levels_dn).ravel() for frame in (pair.clean, pair.noisy, exact.clean, exact.noisy)
+        )
+        std = np.sqrt(noise_variance(exact_clean, plan) + 1 / 12)
+        parts.append((clean - exact_clean, noisy - exact_noisy, std))
+    clean, noisy, std = map(np.concatenate, zip(*parts, strict=True))
     errors = _deviation(noisy, noisy / std)
     return {"clean": _deviation(clean, clean / std), "noise": errors, "run": errors}
 

@@ -29,8 +29,7 @@ from unprocess_gen.dataset.row import pair_row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_root
-from unprocess_gen.planning.plan import plan_levels
-from unprocess_gen.reports.estimate import SourceEstimate
+from unprocess_gen.reports.estimate import predicted_levels
 from unprocess_gen.reports.explorer.overrides import override_text, overrides_of
 from unprocess_gen.reports.panels import MosaicArray
 from unprocess_gen.reports.plan_text import noise_lines
@@ -143,9 +142,7 @@ class Exploration:
         digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
         row = pair_row(key, source, sha256, photograph.orientation, 0, plan, pair, digests, patch)
         saturated = pair.clean == plan.saturated_value
-        assert image.config is not None
-        levels = plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
-        estimate = SourceEstimate(source, levels=(plan,), predictions=(levels[plan.place.level][1],))
+        level = predicted_levels(settings, image, source, sha256)[plan.place.level]
         return Shown(
             config=config,
             choices=choices,
@@ -157,7 +154,7 @@ class Exploration:
             saturated=unpack(saturated, plan.sensor.pattern) if plan.output.layout == PACKED else saturated,
             row=row,
             keys=tuple(parts),
-            lines=noise_lines(image.config, [estimate], settings.dark_frames),
+            lines=noise_lines(image.config or config, [level], settings.dark_frames),
             dark_pixels=image.dark_folder,
         )
 

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.calibration.planes import planes_of
 from unprocess_gen.core.arrays import PACKED, Float
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.explorer.exploration import Shown
@@ -28,7 +27,7 @@ PICTURES = {
 """Names and titles of the pictures, in their order on the page."""
 
 VIEW_PX = (360, 480)
-"""Most rows and columns of a picture; of a larger window, means of blocks are drawn."""
+"""Most rows and columns of a picture; of a larger window, means of sites are drawn."""
 
 
 def view(shown: Shown, window: panels.Window, common: bool) -> dict[str, Any]:
@@ -37,44 +36,34 @@ def view(shown: Shown, window: panels.Window, common: bool) -> dict[str, Any]:
     ``common``: raw frames from black to white (square root), developed ones as photographs; else each stretched by
     itself.
     """
-    side = max(-(-(part.stop - part.start) // length) for part, length in zip(window, VIEW_PX, strict=True))
-    side += side % 2 if side > 1 else 0
-    plan, pattern, srgb = shown.plan, shown.plan.sensor.pattern, shown.srgb[window]
-    source = srgb if side == 1 else _block_means(srgb.astype(np.float32), side)
-    columns: dict[str, Any] = {"source": _words(source / np.iinfo(srgb.dtype).max)}
+    plan, pattern = shown.plan, shown.plan.sensor.pattern
+    is_single = all(part.stop - part.start <= length for part, length in zip(window, VIEW_PX, strict=True))
+    columns: dict[str, Any] = {}
     for name, frame in {"clean": shown.clean, "noisy": shown.noisy}.items():
         raw: Any = frame[window]
-        if side == 1:
+        if is_single:
             developed = panels.develop_detail(frame, plan, window)
             developed = np.zeros((*raw.shape, 3)) if developed is None else developed
         else:
-            planes = _plane_means(raw, side)
+            planes = panels.average_planes(raw, VIEW_PX)
             raw, developed = planes.mean(axis=-1), panels.develop_planes(planes, plan)
         columns[name] = _words(panels.common_stretch(raw, plan) if common else panels.stretch(raw))
         columns[f"{name}_developed"] = _words(developed if common else panels.stretch(developed, least=1e-6))
         columns[f"{name}_dn"] = raw if raw.dtype == np.uint16 else raw.astype(np.float32)
-    sites = shown.saturated[window].astype(np.float64)
-    coloured = panels.colour_sites if side == 1 else panels.planes_to_rgb
-    columns["saturated"] = _words(coloured(sites if side == 1 else _plane_means(sites, side), pattern))
-    columns |= {name: np.rint(source[..., channel]).astype(np.uint16) for channel, name in enumerate("rgb")}
     height, width = columns["clean"].shape
-    note = "of this site" if side == 1 else f"means of {side} × {side} sites; zoom in for single sites"
-    place = {"x": window[1].start, "y": window[0].start, "dw": width * side, "dh": height * side}
-    return columns | place | {"note": note}
-
-
-def _block_means(values: NDArray[Any], side: int) -> NDArray[Any]:
-    """Average square blocks that fit into an image."""
-    height, width = (length // side for length in values.shape[:2])
-    blocks = values[: height * side, : width * side]
-    return np.asarray(cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA))
-
-
-def _plane_means(frame: NDArray[Any], side: int) -> Float:
-    """Average the four planes of a mosaic over blocks of an even side, ``[h, w, 4]``."""
-    rows, columns = (length // side * side for length in frame.shape)
-    planes = [plane.astype(np.float32) for plane in planes_of(frame[:rows, :columns])]
-    return np.stack([_block_means(plane, side // 2) for plane in planes], axis=-1)
+    srgb, sites = shown.srgb[window], shown.saturated[window].astype(np.float64)
+    source = srgb if is_single else cv2.resize(srgb, (width, height), interpolation=cv2.INTER_AREA)
+    columns["source"] = _words(source / np.iinfo(srgb.dtype).max)
+    columns |= {name: source[..., channel].astype(np.uint16) for channel, name in enumerate("rgb")}
+    coloured = (
+        panels.colour_sites(sites, pattern)
+        if is_single
+        else panels.planes_to_rgb(panels.average_planes(sites, VIEW_PX), pattern)
+    )
+    dw, dh = (part.stop - part.start for part in (window[1], window[0]))
+    means = f"means of {dh / height:.2g} × {dw / width:.2g} sites; zoom in for single sites"
+    place = {"x": window[1].start, "y": window[0].start, "dw": dw, "dh": dh}
+    return columns | place | {"saturated": _words(coloured), "note": "of this site" if is_single else means}
 
 
 def _words(values: Float) -> NDArray[np.uint32]:
