@@ -216,6 +216,12 @@ def test_merge_names_what_is_missing_and_writes_nothing(begun: Path, part: Part,
     assert contents(begun) == before
 
 
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: os.truncate(path, 600)], ids=["lost", "cut"])
+def test_damaged_shard_of_a_part_is_regenerated(damage: Callable[[Path], None], begun: Path, part: Part) -> None:
+    damage(begun / "shards/shard-00007.tar")
+    assert "2 shards committed, 1 of them (1 row" in part("1/6").out
+
+
 @pytest.mark.parametrize("variable", ["SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDEX"])
 def test_batch_system_gives_the_number(variable: str, part: Part, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(variable, "4")
