@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from helpers.commands import run_process
@@ -230,15 +231,27 @@ def test_generate_verify_and_replay(tmp_path: Path) -> None:
 
 
 @pytest.mark.linux_only("names signals that Windows lacks")
-def test_functions_leave_signals_and_stdout_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE)
-    before = [signal.getsignal(number) for number in numbers]
-    ug.generate(ug.load_config(["source.limit=1", f"out={tmp_path / 'ds'}", "n_jobs=1"]))
-    ug.verify(tmp_path / "ds")
-    ug.replay(tmp_path / "ds")
-    ug.make_pair(SRGB, ug.load_config())
-    assert [signal.getsignal(number) for number in numbers] == before
-    assert capfd.readouterr().out == ""
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_functions_leave_signals_threads_and_streams_alone(
+    n_jobs: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def state() -> list[object]:
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE)
+        return [cv2.getNumThreads(), *(signal.getsignal(number) for number in numbers)]
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        before = state()
+        settings = ["source.limit=2", "output.pairs_per_shard=1", f"out={tmp_path / 'ds'}", f"n_jobs={n_jobs}"]
+        ug.generate(ug.load_config(settings))
+        ug.verify(tmp_path / "ds")
+        ug.replay(tmp_path / "ds")
+        ug.make_pair(SRGB, ug.load_config())
+        assert state() == before
+    finally:
+        cv2.setNumThreads(threads)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_errors_survive_pickling() -> None:

@@ -89,8 +89,9 @@ def test_killed_run_ends_as_if_undisturbed(
             kill_group(process)
         assert (out / "shards").entries().items() <= sizes.items()
     proxy.delay_s = 0
-    with running(*arguments, "n_jobs=1", cwd=tmp_path) as process:
-        assert process.wait() == 0, process.communicate()
+    for codes in ((0, 3), (0,)):  # a photograph at which four kills came is retried by the second run
+        with running(*arguments, "n_jobs=1", cwd=tmp_path) as process:
+            assert process.wait() in codes, process.communicate()
     assert_same(out, twelve / "ds")
     assert not list(scratch.glob(f"{TEMPORARY_PREFIX}*"))
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import errno
-import logging
+import io
 import os
-import resource
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,21 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.commands import RunMain, environment, messages
-from helpers.datasets import Make, Settings
+from helpers.commands import RunMain, messages, run_process
+from helpers.datasets import Make, Settings, flip
 from helpers.photographs import fill
 from helpers.processes import ONE
 
 from unprocess_gen.cli.messages import logging_to_stderr
 from unprocess_gen.cli.process_limits import LEAST_ADDRESS_SPACE
-from unprocess_gen.config.schema import replaced
-from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
+from unprocess_gen.core.errors import RESUME, DamageError, MachineError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.paths import LocalPath
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import progress as progress_module
-from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.replay import replay
@@ -73,15 +68,10 @@ def test_out_inside_a_finished_dataset_is_refused_with_2(
     assert verify(copy / "ds") == []
 
 
-def test_out_inside_an_unfinished_dataset_is_refused(
-    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(runner, "_finish", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            make(fill(tmp_path / "p", 1), tmp_path / "ds", ONE)
-    with pytest.raises(ConfigError, match="is inside the dataset"):
-        make(tmp_path / "p", tmp_path / "ds/inner", ONE)
+def test_out_inside_an_unfinished_dataset_is_refused(run_main: RunMain, tmp_path: Path) -> None:
+    assert run_main("part", "0/2", f"source.root={fill(tmp_path / 'p', 2)}", ONE, "n_jobs=1", "out=ds").code == 0
+    done = run_main("source.limit=1", "out=ds/inner")
+    assert (done.code, "is inside the dataset" in done.err) == (2, True)
 
 
 # Reasons --------------------------------------------------------------------------------------------------------------
@@ -106,14 +96,15 @@ def test_unreadable_shard_is_a_system_error(copy: Path, monkeypatch: pytest.Monk
         verify(copy / "ds")
 
 
+def run_limited(kilobytes: int, folder: Path, *arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """Run the command with a limit of its address space."""
+    command = f'ulimit -v {kilobytes}; exec "$0" -m unprocess_gen source.limit=2 {ONE} "$@"'
+    return run_process("bash", "-c", command, sys.executable, *arguments, cwd=folder, **env)
+
+
 @pytest.mark.parametrize(("kilobytes", "n_jobs"), [(60_000, 1), (LEAST_ADDRESS_SPACE // 1024 - 1, 2)])
 def test_small_address_space_ends_with_5_and_one_line(kilobytes: int, n_jobs: int, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "unprocess_gen", "source.limit=2", ONE, f"n_jobs={n_jobs}"]
-    limit = kilobytes * 1024
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=60, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-    )  # fmt: skip
+    done = run_limited(kilobytes, tmp_path, f"n_jobs={n_jobs}")
     assert (done.returncode, done.stdout) == (5, "")
     assert done.stderr == (
         f"gen-dataset: ulimit -v {kilobytes}: not enough address space; expected at least "
@@ -124,29 +115,18 @@ def test_small_address_space_ends_with_5_and_one_line(kilobytes: int, n_jobs: in
 @pytest.mark.slow
 @pytest.mark.parametrize(("kilobytes", "n_jobs"), [(LEAST_ADDRESS_SPACE // 1024, 1), (1_500_000, 2)])
 def test_smallest_accepted_address_space_compiles_and_runs(kilobytes: int, n_jobs: int, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "unprocess_gen", "source.limit=2", ONE, f"n_jobs={n_jobs}", "noise=sony_a7s2"]
-    limit = kilobytes * 1024
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment(NUMBA_CACHE_DIR=str(tmp_path / "cache")), capture_output=True,
-        text=True, timeout=600, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-    )  # fmt: skip
+    env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = run_limited(kilobytes, tmp_path, f"n_jobs={n_jobs}", "noise=sony_a7s2", **env)
     assert done.returncode == 0, done.stderr
 
 
 # Changed sources ------------------------------------------------------------------------------------------------------
 
 
-def change(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[-20] ^= 1
-    path.write_bytes(content)
+HARMS = {"changed": lambda path: flip(path, 50), "deleted": os.unlink, "cut": lambda path: os.truncate(path, 9)}
 
 
-HARMS = [change, os.unlink, lambda path: os.truncate(path, 9)]
-
-
-@pytest.mark.parametrize("harm", HARMS, ids=["changed", "deleted", "cut"])
+@pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
 @pytest.mark.parametrize("verb", [("replay", "ds"), ("verify", "ds", "--regenerate", "9")])
 def test_changed_source_ends_with_5_and_advice(
     harm: Callable[[Path], None], verb: tuple[str, ...], copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
@@ -166,12 +146,6 @@ def test_edited_row_is_damage_and_no_changed_source(copy: Path) -> None:
 
 
 # Failures -------------------------------------------------------------------------------------------------------------
-
-
-def test_failed_row_records_its_explanation(made: Path) -> None:
-    row = list(read_rows(made / "ds/manifest.csv"))[3]
-    assert (row["status"], row["reason"]) == ("failed", "unsupported")
-    assert row["detail"] and str(made) not in str(row["detail"])
 
 
 def test_run_names_the_first_three_sources_that_fail(run_main: RunMain, tmp_path: Path) -> None:
@@ -195,24 +169,16 @@ def sweep(folder: Path, copy: Path, *rows: tuple[str, str]) -> Path:
     return folder
 
 
-def test_every_dataset_of_a_sweep_is_verified(copy: Path, tmp_path: Path) -> None:
+def test_every_dataset_of_a_sweep_is_verified_and_unfinished_ones_are_named(copy: Path, tmp_path: Path) -> None:
     folder = sweep(tmp_path / "sweep", copy, ("camera=sony_a7r", "0"), ("camera=convex", "0"), ("seed=1", "5"))
     (folder / "camera=convex/shards/shard-00001.tar").unlink()
+    (folder / "seed=2/.work").mkdir(parents=True)
+    (folder / "notes").mkdir()
     results = [(result.folder, [str(damage) for damage in result.damages]) for result in verify_sweep(folder)]
     assert results == [
         ("camera=sony_a7r", []),
         ("camera=convex", ["shards/shard-00001.tar: is missing"]),
         ("seed=1", ["dataset.json: is missing: the job ended with exit code 5; rerun the sweep to finish it"]),
-    ]
-
-
-def test_unfinished_dataset_of_an_interrupted_sweep_is_named(copy: Path, tmp_path: Path) -> None:
-    folder = sweep(tmp_path / "sweep", copy, ("seed=1", "0"))
-    (folder / "seed=2/.work").mkdir(parents=True)
-    (folder / "notes").mkdir()
-    results = [(result.folder, [str(damage) for damage in result.damages]) for result in verify_sweep(folder)]
-    assert results == [
-        ("seed=1", []),
         ("seed=2", ["dataset.json: is missing: the sweep ended before this job; rerun the sweep to finish it"]),
     ]
 
@@ -227,60 +193,38 @@ def test_sweep_table_naming_a_folder_elsewhere_is_refused(name: str, copy: Path,
 # Progress -------------------------------------------------------------------------------------------------------------
 
 
-class Terminal:
-    """Collect what is written to a terminal that reports no width."""
-
-    encoding = "utf-8"
-
-    def __init__(self, error: OSError | None = None) -> None:
-        self.text, self.error = "", error
-
-    def write(self, text: str) -> None:
-        self.text += text
-        if self.error:
-            raise self.error
-
-    def flush(self) -> None: ...
+class Terminal(io.StringIO):
+    """A terminal that reports no width."""
 
     def isatty(self) -> bool:
         return True
 
 
-def run_progress(monkeypatch: pytest.MonkeyPatch, terminal: Terminal, quiet: bool = False, label: str = "") -> str:
+@pytest.mark.parametrize("quiet", [False, True])
+def test_bar_is_shown_without_a_terminal_width_unless_quiet(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
     monkeypatch.delenv("COLUMNS", raising=False)
     monkeypatch.setattr(os, "get_terminal_size", lambda *_: os.terminal_size((0, 0)))
     with logging_to_stderr(quiet=quiet), monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", terminal)
-        with Progress(4, label=label) as progress:
+        with Progress(4) as progress:
             progress.advance(2, failed=1)
             progress.warn("a warning")
             progress.advance(2)
-    return terminal.text
+    assert "gen-dataset: a warning\n" in terminal.getvalue()
+    assert all((text in terminal.getvalue()) is not quiet for text in ("4/4", "100%", "failed=1"))
 
 
-def test_bar_is_shown_without_a_terminal_width(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = run_progress(monkeypatch, Terminal())
-    assert "4/4" in text and "100%" in text and "failed=1" in text and "gen-dataset: a warning\n" in text
-
-
-def test_quiet_hides_the_bar_and_keeps_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert run_progress(monkeypatch, Terminal(), quiet=True) == "gen-dataset: a warning\n"
-
-
-def test_lines_name_the_job_of_a_sweep(capfd: pytest.CaptureFixture[str]) -> None:
-    with logging_to_stderr(), Progress(2, label="3/20 camera=sony_a7r") as progress:
-        progress.advance(2)
-    assert capfd.readouterr().err.startswith("gen-dataset: 3/20 camera=sony_a7r: 2/2 images, ")
-
-
-def test_time_left_leaves_out_compiling(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_lines_name_the_job_and_time_left_without_compiling(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """The first image is finished after a minute of compiling, the next two in six seconds."""
     clock = iter((0.0, 60.0, 66.0))
     monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(clock))
-    with logging_to_stderr(), Progress(9) as progress:
+    with logging_to_stderr(), Progress(9, label="3/20 seed=1") as progress:
         progress.advance(1)
         progress.advance(2)
-    assert capfd.readouterr().err == "gen-dataset: 3/9 images, 0.3 images/s, 0 failed, 18 s left\n"
+    assert capfd.readouterr() == ("", "gen-dataset: 3/20 seed=1: 3/9 images, 0.3 images/s, 0 failed, 18 s left\n")
 
 
 def test_progress_counts_images_inside_shards(settings: Settings, tmp_path: Path) -> None:
@@ -288,32 +232,3 @@ def test_progress_counts_images_inside_shards(settings: Settings, tmp_path: Path
     for shard, image in ((0, 3), (2, 17)):
         (tmp_path / f"{shard}.busy").write_text(str(image))
     assert context.images_in_progress() == 3 + 1
-
-
-# Python ---------------------------------------------------------------------------------------------------------------
-
-
-def test_generate_prints_nothing_and_keeps_signal_handlers(
-    settings: Settings, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    config = settings(ONE)
-    config = replaced(config, {"source.root": str(fill(tmp_path / "p", 3)), "out": str(tmp_path / "ds"), "n_jobs": 2})
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
-    assert not logging.getLogger("unprocess_gen").isEnabledFor(logging.INFO)
-    assert generate(config).pairs == 3
-    assert capfd.readouterr() == ("", "")
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before
-
-
-def test_generate_restores_the_threads_of_opencv(settings: Settings, tmp_path: Path) -> None:
-    import cv2
-
-    config = settings(ONE)
-    config = replaced(config, {"source.root": str(fill(tmp_path / "p", 1)), "out": str(tmp_path / "ds"), "n_jobs": 1})
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(2)
-    try:
-        generate(config)
-        assert cv2.getNumThreads() == 2
-    finally:
-        cv2.setNumThreads(before)
