@@ -325,9 +325,9 @@ def replay(
     if keys is not None and not isinstance(keys, str):
         keys = str(keys) if isinstance(keys, int) else ",".join(map(str, keys))
     rows = select_rows(manifest, keys)
-    source_root = _replay.source_root(manifest, None if root is None else os.fspath(root))
-    frames_root = _replay.dark_frames_root(manifest, None if dark_frames is None else os.fspath(dark_frames))
-    return list(_replay.replay(rows, source_root, None if to is None else Path(to), frames_root))
+    given = (None if place is None else os.fspath(place) for place in (root, dark_frames))
+    places = _replay.places_of(manifest.parent, *given)
+    return list(_replay.replay(rows, places.root, None if to is None else Path(to), places.dark_frames))
 
 
 def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:

@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make
+from helpers.photographs import fill
 from helpers.promise_report import Figure
 
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.sources.names import decode_name
 
 SHARDS = tuple(f"shards/shard-0000{number}.tar" for number in range(4))
 OTHERS = ("config.yaml", "manifest.csv", *SHARDS)
@@ -97,6 +100,55 @@ def test_manifest_and_shards_are_restored_together(intact: Path, copy: Path, run
     (copy / "other").rename(copy / SHARDS[1])
     (copy / SHARDS[2]).unlink()
     assert_repaired(copy, intact, run_main)
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: flip(path, 5000)], ids=["missing", "flipped"])
+def test_manifest_is_restored_from_the_shards_without_sources(
+    damage: Callable[[Path], None], make: Make, run_main: RunMain, tmp_path: Path
+) -> None:
+    """Rows of patches, noise levels, draws and targets are in the shards."""
+    sources, out = fill(tmp_path / "p", 5), tmp_path / "ds"
+    settings = "noise=sony_a7s2", "noise.levels=[1600,3200]", "noise.draws=2", "source.patch=[random,8,2]"
+    make(sources, out, *settings, "output.pairs_per_shard=2", "output.targets=[linear_rgb]")
+    shutil.rmtree(sources)
+    wanted = contents(out)
+    damage(out / "manifest.csv")
+    done = run_main("verify", out, "--repair")
+    assert (done.code, "manifest.csv: restored from the rows in the shards" in done.out) == (0, True)
+    assert contents(out) == wanted
+
+
+def test_manifest_with_failed_sources_needs_them_or_the_records(
+    sources: Path, make: Make, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run whose rows are provisional keeps its records."""
+    own, out = Path(shutil.copytree(sources, tmp_path / "p")), tmp_path / "ds"
+    monkeypatch.setattr(OutFolder, "remove_work", lambda folder: None)
+    make(own, out)
+    shutil.rmtree(own)
+    wanted = (out / "manifest.csv").read_bytes()
+    (out / "manifest.csv").unlink()
+    done = run_main("verify", out, "--repair")
+    assert (done.code, "manifest.csv: restored from the rows in .work/rows" in done.out) == (0, True)
+    assert (out / "manifest.csv").read_bytes() == wanted
+    (out / "manifest.csv").unlink()
+    shutil.rmtree(out / ".work")
+    before = contents(out)
+    refused = run_main("verify", out, "--repair")
+    assert (refused.code, f"source.root={own}: " in refused.err) == (2, True)
+    assert contents(out) == before
+
+
+def test_only_sources_without_a_stored_row_are_read(
+    intact: Path, copy: Path, sources: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    changed = Path(shutil.copytree(sources, tmp_path / "changed"))
+    for row in read_rows(intact / "manifest.csv"):
+        if row["status"] == "ok":
+            (changed / decode_name(str(row["source"]))).write_bytes(b"\0" * int(row["source_bytes"]))
+    (copy / "manifest.csv").unlink()
+    assert run_main("verify", copy, "--repair", f"source.root={changed}").code == 0
+    assert (copy / "manifest.csv").read_bytes() == (intact / "manifest.csv").read_bytes()
 
 
 def test_lost_dataset_json_is_rewritten_and_reported(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results, report, report_error
-from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
+from unprocess_gen.cli.places import dataset_folder, given_root, recorded_places
 from unprocess_gen.cli.sweep import worst
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 from unprocess_gen.reports.formatting import counted
@@ -73,12 +73,10 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
     """Restore damaged files and report each step; the exit codes of the steps."""
     from unprocess_gen.core.paths import local_path
     from unprocess_gen.pipeline.repair import repair
-    from unprocess_gen.pipeline.replay import source_root
 
     refusal = f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset"
-    manifest, codes = folder / "manifest.csv", []
-    root, dark = source_root(manifest, call.settings.get("source.root")), dark_frames_of(manifest, call)
-    for step in repair(local_path(folder, refusal), root, dark):
+    places, codes = recorded_places(folder, call), []
+    for step in repair(local_path(folder, refusal), places.root, places.dark_frames):
         (report if step.exit_code else print_results)(step.text)
         codes.append(step.exit_code)
     return codes
@@ -86,12 +84,10 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
 
 def _regenerated(folder: AnyPath, call: Call) -> list[ReplayResult]:
     """Regenerate rows that are spread evenly over the dataset, and compare them."""
-    from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay, source_root
+    from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay
 
-    manifest = folder / "manifest.csv"
-    rows = evenly_spaced_rows(manifest, call.regenerate)
-    root = source_root(manifest, call.settings.get("source.root"))
-    return list(replay(rows, root, dark_frames=dark_frames_of(manifest, call)))
+    rows, places = evenly_spaced_rows(folder / "manifest.csv", call.regenerate), recorded_places(folder, call)
+    return list(replay(rows, places.root, dark_frames=places.dark_frames))
 
 
 def _complaint(result: ReplayResult) -> str:
@@ -105,7 +101,7 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     from unprocess_gen.reports.noise_check.checks import check_pairs
     from unprocess_gen.sources.dark_frames import dark_folder
 
-    dark_frames = dark_frames_of(folder / "manifest.csv", call)
+    dark_frames = recorded_places(folder, call).dark_frames
     try:
         access = None if dark_frames is None else dark_folder(dark_frames)
     except ConfigError:  # without the recorded files, the pairs are counted as not checked
@@ -151,14 +147,15 @@ def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
 def replay(call: Call) -> int:
     """Regenerate rows of a manifest, and compare or write their arrays."""
     from unprocess_gen.dataset.selection import select_rows
-    from unprocess_gen.pipeline.replay import replay, source_root
+    from unprocess_gen.pipeline.replay import replay
 
     manifest = dataset_folder(call, files=True)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     failed: list[Row] = []
     rows = _ok_rows(select_rows(manifest, call.keys, failed), failed)
     codes, written, unknown = [], False, 0
-    for result in replay(rows, source_root(manifest, given_root(call)), call.to, dark_frames_of(manifest, call)):
+    places = recorded_places(manifest.parent, call)
+    for result in replay(rows, places.root, call.to, places.dark_frames):
         codes.append(result.exit_code)
         written |= result.written
         unknown += not result.compared

@@ -9,6 +9,7 @@ from unprocess_gen.core.errors import ConfigError, DamageError
 
 if TYPE_CHECKING:
     from unprocess_gen.core.paths import AnyPath
+    from unprocess_gen.pipeline.replay import Places
 
 
 def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
@@ -49,8 +50,8 @@ def given_root(call: Call) -> str | None:
     return root
 
 
-def dark_frames_of(manifest: AnyPath, call: Call) -> str | None:
-    """Folder of the dark frames of a dataset, by the call or by ``dataset.json``; None without one."""
-    from unprocess_gen.pipeline.replay import dark_frames_root
+def recorded_places(folder: AnyPath, call: Call) -> Places:
+    """Places of sources and dark frames of a dataset, by the call or by ``dataset.json``."""
+    from unprocess_gen.pipeline.replay import places_of
 
-    return dark_frames_root(manifest, call.settings.get("noise.dark_frames"))
+    return places_of(folder, given_root(call), call.settings.get("noise.dark_frames"))

@@ -10,7 +10,7 @@ from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.jobs import composed_jobs, option_folders
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.messages import report as report_message
-from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
+from unprocess_gen.cli.places import dataset_folder, given_root, recorded_places
 from unprocess_gen.cli.sweep import swept_keys, worst
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.libraries import require
@@ -73,7 +73,7 @@ def report(call: Call) -> int:
     if isinstance(folder, Path) and is_sweep(folder):
         return _report_sweep(folder, call)
     root = given_root(call)
-    dark = dark_frames_of(folder / "manifest.csv", call)
+    dark = recorded_places(folder, call).dark_frames
     if "noise.dark_frames" in call.settings and dark is not None:
         dark_folder(dark)  # refuses a folder that the user names and that does not exist
     print_results(write_dataset_report(folder, call.to, None if root is None else any_path(root), dark))
@@ -95,14 +95,13 @@ def preview(call: Call) -> int:
     """Draw contact sheets of pairs."""
     from unprocess_gen.core.paths import any_path
     from unprocess_gen.dataset.selection import select_pairs
-    from unprocess_gen.pipeline.replay import source_root
     from unprocess_gen.reports.sheets import write_sheets
 
     folder = dataset_folder(call)
     to, root, keys = call.to, given_root(call), call.keys or ""
     files = code = 0
     failed = select_pairs(folder / "manifest.csv", keys).failed if keys else 0
-    photographs = source_root(folder / "manifest.csv", root)
+    photographs = recorded_places(folder, call).root
     _check_not_among_photographs(to, photographs)
     for sheet in write_sheets(folder, to, keys, None if root is None else any_path(root), call.stages):
         files += len(sheet.files)

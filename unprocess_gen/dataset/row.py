@@ -22,6 +22,7 @@ from unprocess_gen.core.fields import (
     Numbers,
     Text,
 )
+from unprocess_gen.core.records import check_record, parse_record
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Column, Row, Value, flatten, places_of, rebuild
@@ -295,6 +296,13 @@ def row_json(rows: Sequence[Row]) -> bytes:
     if others:
         content[OTHERS] = [{name: row[name] for name in row if row[name] != first[name]} for row in others]
     return json.dumps(content, separators=(",", ":")).encode("ascii") + b"\n"
+
+
+def rows_of_json(content: bytes) -> list[Row]:
+    """Rows of a sample from its JSON; ValueError if it is not that of `row_json`."""
+    first = parse_record(content, dict[str, Any])
+    others = check_record(first.pop(OTHERS, []), list[dict[str, Any]])
+    return [_complete(first | cells) for cells in ({}, *others)]
 
 
 def without_empty(row: Row) -> dict[str, Value]:

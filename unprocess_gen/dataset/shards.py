@@ -18,7 +18,7 @@ import math
 import os
 import tarfile
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -32,6 +32,8 @@ from unprocess_gen.core.files import array_xxh3, little_endian
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.keys import sample_key
+from unprocess_gen.dataset.row import row_json, rows_of_json
 
 RECORD_BYTES = 512
 END = b"\0" * (2 * RECORD_BYTES)
@@ -149,6 +151,12 @@ class ShardWriter:
         header = ArrayFormat(frame.dtype.name, frame.shape).header
         self._member(f"{key}.{member}", len(header) + frame.nbytes, header, little_endian(frame).data)
 
+    def add_pair(self, row: Row, arrays: Mapping[str, Array], is_first: bool) -> None:
+        """Append the frames of a pair by name; clean frame and target only if it is the first one of its sample."""
+        for name, stored in arrays_of(row).items():
+            if is_first or name == "noisy":
+                self.add_frame(sample_key(row), stored.member, arrays[name])
+
     def add_rows(self, key: str, row_json: bytes) -> None:
         """Append the JSON of a sample, after its frames."""
         self._member(f"{key}.{ROW}", len(row_json), row_json)
@@ -219,6 +227,19 @@ def read_index(path: AnyPath) -> dict[str, Member]:
     return index
 
 
+def stored_rows(path: AnyPath) -> Iterator[Row]:
+    """Read the rows of the pairs in a shard, in the order of the manifest; DamageError if they are not there."""
+    index = read_index(path)
+    try:
+        with path.open("rb") as stream:
+            for name in index:
+                if name.endswith(f".{ROW}"):
+                    stream.seek(index[name].offset)
+                    yield from rows_of_json(stream.read(index[name].size))
+    except (OSError, ValueError) as error:
+        raise DamageError(f"{path}: {name} cannot be read ({error})") from error
+
+
 def map_array(path: AnyPath, member: Member, array: ArrayFormat) -> Frame:
     """Array of a shard, mapped copy-on-write: writing to it does not change the file.
 
@@ -259,38 +280,33 @@ def arrays_of(row: Row) -> dict[str, ExpectedFrame]:
     return {name: ExpectedFrame(member_of(name, *place), *array) for name, array in arrays.items()}
 
 
-class ExpectedSample(NamedTuple):
-    """Contents that a shard must have of one sample.
-
-    ``frames`` are in the order of their members; ``json`` is the content of ``KEY.json``.
-    """
-
-    key: str
-    frames: tuple[ExpectedFrame, ...]
-    json: bytes
+def frames_of(sample: Sequence[Row]) -> list[ExpectedFrame]:
+    """Frames and the target of a sample, given its rows, in the order of their members."""
+    first, *others = sample
+    return [*arrays_of(first).values(), *(arrays_of(row)["noisy"] for row in others)]
 
 
 PIECE = 2**20
 
 
-def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tuple[str, str, str]]:
-    """Compare every byte of a shard with what its samples must be.
+def check_members(path: Path, samples: Iterable[Sequence[Row]]) -> Iterator[tuple[str, str, str]]:
+    """Compare every byte of a shard with what its samples must be, given their rows.
 
     Tar headers, npy headers, JSON and padding are compared byte by byte, arrays by digest.
     """
     with path.open("rb") as stream:
         for sample in samples:
-            for member, digest, array in sample.frames:
+            key, json = sample_key(sample[0]), row_json(sample)
+            for member, digest, array in frames_of(sample):
                 head = array.header
                 size = len(head) + array.size
-                problems = [*_check_bytes(stream, _tar_header(f"{sample.key}.{member}", size), "tar header")]
+                problems = [*_check_bytes(stream, _tar_header(f"{key}.{member}", size), "tar header")]
                 problems += _check_bytes(stream, head, "npy header")
                 problems += _check_digest(stream, size - len(head), digest)
                 problems += _check_bytes(stream, b"\0" * _padding(size), "padding")
-                yield from ((sample.key, member, what) for what in problems)
-            content = _tar_header(f"{sample.key}.{ROW}", len(sample.json)) + sample.json
-            content += b"\0" * _padding(len(sample.json))
-            yield from ((sample.key, ROW, what) for what in _check_bytes(stream, content, "member"))
+                yield from ((key, member, what) for what in problems)
+            content = _tar_header(f"{key}.{ROW}", len(json)) + json + b"\0" * _padding(len(json))
+            yield from ((key, ROW, what) for what in _check_bytes(stream, content, "member"))
         rest = stream.read(len(END) + 1)
         if rest != END:
             yield "", "", "the end of the archive is missing" if len(rest) < len(END) else "something follows the end"

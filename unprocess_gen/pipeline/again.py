@@ -18,7 +18,7 @@ from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import check_format
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.row import without_empty
-from unprocess_gen.pipeline.replay import ADVICE, check_root, source_changes, source_root
+from unprocess_gen.pipeline.replay import ADVICE, check_root, places_of
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import source_file
 
@@ -43,9 +43,9 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
             f"again: source.root={root}: {folder} was generated from a source of kind {kind}; expected no root; "
             "leave source.root out"
         )
-    root = None if kind == "synthetic" else source_root(manifest, root)
-    check_root(folder, kind, root, "again: ")
-    config = replaced(config, {**changes, **source_changes(root, folder)})
+    places = places_of(folder, root, frames)
+    check_root(folder, kind, places.root, "again: ")
+    config = replaced(config, {**changes, **places.settings})
     validate_config(config)
     place = config.source.place
     if place is not None and any_path(place).exists() and manifest.exists():

@@ -22,7 +22,7 @@ from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.reader import DatasetRows
 from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
-from unprocess_gen.pipeline.replay import PairRegenerator, dark_frames_root, source_of, source_root
+from unprocess_gen.pipeline.replay import PairRegenerator, places_of, source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.plan import Plan
@@ -94,9 +94,9 @@ class RecordedPairs(DatasetRows, LiveSource):
     def __init__(self, root: str | None, folder: AnyPath, split: str | None = None) -> None:
         super().__init__(folder, split)
         config, _ = read_dataset_yaml(folder / "config.yaml")
-        dark_frames = dark_frames_root(self._manifest)
-        self.settings = PairSettings.read(replaced(config, {"noise.dark_frames": dark_frames}))
-        self._sources = PairRegenerator(source_root(self._manifest, root), dark_frames)
+        places = places_of(folder, root)
+        self.settings = PairSettings.read(replaced(config, {"noise.dark_frames": places.dark_frames}))
+        self._sources = PairRegenerator(places.root, places.dark_frames)
         self._kept: Recent[int, LiveImage] = Recent(KEPT)
 
     def image(self, number: int) -> LiveImage:

@@ -1,7 +1,8 @@
 """Repair a dataset: regenerate its damaged files to the same bytes; nothing of a damaged file is kept.
 
 ``dataset.json`` contains the config and the digests of all other files. A shard is regenerated from its rows in the
-manifest and their sources, the manifest from the config and all sources. Each file is written to a temporary file, and
+manifest and their sources. The manifest is collected from the rows in intact shards; rows that are in none are
+regenerated from the config and their sources. Each file is written to a temporary file, and
 replaces the damaged one if its digest is the recorded one. A damaged ``dataset.json`` is rewritten if the other
 files agree; its facts about the run (time, host, versions) are lost. Repair uses one process: if most of a dataset is
 damaged, ``gen-dataset again`` is faster.
@@ -10,27 +11,26 @@ damaged, ``gen-dataset again`` is faster.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
-from unprocess_gen.core.arrays import Array
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text, fingerprint, read_dataset
-from unprocess_gen.dataset.keys import group_by_sample
-from unprocess_gen.dataset.manifest import read_rows, write_rows
-from unprocess_gen.dataset.row import columns_of, has_frames
-from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name
+from unprocess_gen.dataset.keys import group_by_sample, image_key, key_text, sample_key
+from unprocess_gen.dataset.manifest import header_text, read_rows, rows_text
+from unprocess_gen.dataset.row import columns_of, has_frames, row_json
+from unprocess_gen.dataset.shards import ShardWriter, shard_name, stored_rows
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, check_root, source_changes
-from unprocess_gen.pipeline.run import resolve
-from unprocess_gen.pipeline.tasks import RunContext, ShardResult, Tally, tar_name
-from unprocess_gen.pipeline.verify import CONFIG, DATASET, MANIFEST, expected_samples, shard_rows, verify
+from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, Places, check_root, places_of
+from unprocess_gen.pipeline.run import Run, resolve
+from unprocess_gen.pipeline.tasks import ROWS, RunContext, ShardResult, ShardTask, Tally, read_records, tar_name
+from unprocess_gen.pipeline.verify import CONFIG, DATASET, MANIFEST, shard_rows, verify
 from unprocess_gen.pipeline.worker import make_shard
 
 LEAST_PROOF = 100
@@ -63,11 +63,9 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
         elif CONFIG in damaged:
             place.write(CONFIG, facts["config"].encode())
             yield RepairStep(f"{CONFIG}: restored from {DATASET}")
-        config, kind = _read_config(folder, root)
+        config, kind = _read_config(folder, places_of(folder, root, dark_frames))
         if facts and MANIFEST in damaged:
-            check_root(folder, kind, root)
-            _restore_manifest(place, replaced(config, {"noise.dark_frames": dark_frames}), facts["manifest_sha256"])
-            yield RepairStep(f"{MANIFEST}: regenerated from the settings and the sources")
+            yield _restore_manifest(place, folder, facts, config, kind)
             damaged = {damage.file for damage in verify(folder)}
         regenerator = PairRegenerator(root, dark_frames)
         for number, rows in shard_rows(folder / MANIFEST):
@@ -78,10 +76,11 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
             yield RepairStep(f"{DATASET}: rewritten; host, time and versions of the run are lost")
 
 
-def _read_config(folder: Path, root: str | None) -> tuple[Config, str]:
-    """Read the settings with the place of the sources, and the kind of the sources."""
+def _read_config(folder: Path, places: Places) -> tuple[Config, str]:
+    """Read the settings with the place of the sources, empty if it is unknown, and the kind of the sources."""
     config, kind = read_dataset_yaml(folder / CONFIG)
-    return replaced(config, source_changes(None if kind == "synthetic" else root or "", folder)), kind
+    root = None if kind == "synthetic" else places.root or ""
+    return replaced(config, {**places.settings, "source.root": root}), kind
 
 
 def _check_proof(folder: Path, damaged: set[str]) -> None:
@@ -93,33 +92,67 @@ def _check_proof(folder: Path, damaged: set[str]) -> None:
         agree = fingerprint(*own) in left or all(f'"{digest}"' in left for digest in own)
         if len(left) < LEAST_PROOF:
             text = (folder / CONFIG).read_text(encoding="utf-8")
-            agree = damaged == {DATASET} and dataset_yaml(_read_config(folder, None)[0]) == text
+            agree = damaged == {DATASET} and dataset_yaml(_read_config(folder, places_of(folder))[0]) == text
     except (OSError, ValueError, ConfigError, DamageError):
         agree = False
     if not agree:
         raise DamageError(f"{folder}: {DATASET} and another file are damaged; {AGAIN}")
 
 
-def _restore_manifest(place: OutFolder, config: Config, sha256: str) -> None:
-    """Regenerate every row, and write them as the manifest if they have its digest."""
-    run, part = resolve(config), place.scratch / MANIFEST
-    context = RunContext(run.settings, str(place.scratch), os.getpid())
+def _restore_manifest(place: OutFolder, folder: Path, facts: dict[str, Any], config: Config, kind: str) -> RepairStep:
+    """Collect the rows of all sources, and write them as the manifest if they have its digest.
 
-    def rows() -> Iterator[Row]:
-        for shard in range(run.shards):
-            made = make_shard(context, run.task(shard))
-            if made.path is not None:
-                Path(made.path).unlink()
-            yield from made.rows
-
-    with part.open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, rows(), columns_of(run.config))
-    if file_sha256(part) != sha256:
+    Rows of pairs are in the shards. The records of a run with provisional rows have all rows. What is in neither, such
+    as rows of failed sources, is regenerated.
+    """
+    columns, entries = columns_of(config), facts["shards"]
+    stored = (rows_text(_stored_rows(folder, entry), columns).encode() for entry in entries)
+    recorded = (read[1] for read in read_records(place, range(len(entries))) if read is not None)
+    for name, texts in (("the shards", stored), (ROWS, recorded)):
+        if _is_manifest(place, columns, texts, facts):
+            return RepairStep(f"{MANIFEST}: restored from the rows in {name}")
+    check_root(folder, kind, config.source.root or None)
+    run = resolve(config)
+    made = (
+        rows_text(_made_rows(place, run, number, _stored_rows(folder, entry)), columns).encode()
+        for number, entry in enumerate(entries)
+    )
+    if run.shards != len(entries) or not _is_manifest(place, columns, made, facts):
         raise SourceChangedError(
             f"{place}/{MANIFEST}: the regenerated one has another SHA-256: a source was changed, added or "
             f"deleted; {ADVICE}"
         )
+    return RepairStep(f"{MANIFEST}: regenerated from the settings and the sources")
+
+
+def _is_manifest(place: OutFolder, columns: Sequence[str], texts: Iterable[bytes], facts: dict[str, Any]) -> bool:
+    """Write a manifest, given the lines of each shard, and put it in place if it has the recorded digest."""
+    part = place.scratch / MANIFEST
+    with part.open("wb") as stream:
+        stream.write(header_text(columns).encode())
+        stream.writelines(texts)
+    if file_sha256(part) != facts["manifest_sha256"]:
+        return False
     (place / MANIFEST).commit(part)
+    return True
+
+
+def _stored_rows(folder: Path, entry: dict[str, Any]) -> list[Row]:
+    """Rows in a shard, none unless it has its digest."""
+    path = folder / str(entry["file"])
+    return [*stored_rows(path)] if path.is_file() and file_sha256(path) == entry["sha256"] else []
+
+
+def _made_rows(place: OutFolder, run: Run, number: int, stored: Sequence[Row]) -> list[Row]:
+    """Rows of a shard: those that are stored in it, and those of its other sources, which are regenerated."""
+    known = {image_key(row) for row in stored}
+    sources = tuple(source for source in run.task(number).sources if key_text(source.index) not in known)
+    if not sources:
+        return [*stored]
+    made = make_shard(RunContext(run.settings, str(place.scratch), os.getpid()), ShardTask(number, sources))
+    if made.path is not None:
+        Path(made.path).unlink()
+    return sorted([*stored, *made.rows], key=lambda row: int(image_key(row)))
 
 
 def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regenerator: PairRegenerator) -> RepairStep:
@@ -127,14 +160,10 @@ def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regene
     name, part = tar_name(number), place.scratch / shard_name(number)
     try:
         with ShardWriter(part) as writer:
-            for sample, sample_rows in zip(expected_samples(rows), group_by_sample(rows), strict=True):
-                frames: dict[str, Array] = {}
-                for row in sample_rows:
-                    arrays = regenerator.regenerate_exactly(row)
-                    frames |= {stored.member: arrays[array] for array, stored in arrays_of(row).items()}
-                for frame in sample.frames:
-                    writer.add_frame(sample.key, frame.member, frames[frame.member])
-                writer.add_rows(sample.key, sample.json)
+            for sample in group_by_sample(rows):
+                for row in sample:
+                    writer.add_pair(row, regenerator.regenerate_exactly(row), is_first=row is sample[0])
+                writer.add_rows(sample_key(sample[0]), row_json(sample))
     except UnprocessGenError as error:
         exit_code = error.exit_code if isinstance(error, MachineError) else DamageError.exit_code
         return RepairStep(f"{name}: cannot be regenerated: {error}", exit_code)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -67,25 +67,34 @@ class ReplayResult:
         return SourceChangedError.exit_code if self.source_changed else DamageError.exit_code
 
 
-class _Places(msgspec.Struct, frozen=True):
-    """Places of sources and dark frames that a ``dataset.json`` records."""
+class Places(NamedTuple):
+    """Places of sources, of the file that lists them, and of dark frames; None for what is unknown or not used."""
 
+    root: str | None
+    list: str | None
+    dark_frames: str | None
+
+    @property
+    def settings(self) -> dict[str, str | None]:
+        """Settings that give these places."""
+        sources = {"source.root": self.root, "source.list": self.list if self.root else None}
+        return sources | {"noise.dark_frames": self.dark_frames}
+
+
+class _Recorded(msgspec.Struct, frozen=True):
     source: SourceFacts = SourceFacts("synthetic", None)
     dark_frames: DarkFrameFacts | None = None
 
 
-def _recorded_places(manifest: AnyPath) -> _Places:
-    """Read the places from ``dataset.json``, which may be damaged otherwise; none if they cannot be read."""
+def places_of(folder: AnyPath, root: str | None = None, dark_frames: str | None = None) -> Places:
+    """Places that are given, else those in ``dataset.json``, which may be missing or damaged."""
     try:
-        return parse_record((manifest.parent / "dataset.json").read_bytes(), _Places)
+        recorded = parse_record((folder / "dataset.json").read_bytes(), _Recorded)
     except (OSError, ValueError):
-        return _Places()
-
-
-def source_root(manifest: AnyPath, root: str | None) -> str | None:
-    """Find the place of the sources: the given one, or the one that ``dataset.json`` records."""
-    recorded = _recorded_places(manifest).source
-    return root if root is not None else recorded.root
+        recorded = _Recorded()
+    recorded_frames = recorded.dark_frames or DarkFrameFacts()
+    recorded_root = recorded.source.root if root is None else root
+    return Places(recorded_root, recorded.source.list, dark_frames or recorded_frames.root)
 
 
 def check_root(folder: AnyPath, kind: str, root: str | None, verb: str = "") -> None:
@@ -95,17 +104,6 @@ def check_root(folder: AnyPath, kind: str, root: str | None, verb: str = "") -> 
             f"{verb}source.root is missing: {folder} does not record the folder of its sources; expected that "
             "folder; give source.root=…"
         )
-
-
-def source_changes(root: str | None, folder: AnyPath) -> dict[str, Any]:
-    """Settings that give the place of the sources, and the list that ``dataset.json`` records."""
-    recorded = _recorded_places(folder / "manifest.csv").source.list
-    return {"source.root": root, "source.list": recorded if root else None}
-
-
-def dark_frames_root(manifest: AnyPath, given: str | None = None) -> str | None:
-    """Folder of the dark frames of a dataset: the given one, else the recorded one; None without one."""
-    return given or (_recorded_places(manifest).dark_frames or DarkFrameFacts()).root
 
 
 def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import operator
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,17 +22,11 @@ from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import check_format, read_dataset
-from unprocess_gen.dataset.keys import group_by_sample, sample_key
+from unprocess_gen.dataset.keys import group_by_sample
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
-from unprocess_gen.dataset.row import has_frames, row_json
-from unprocess_gen.dataset.shards import (
-    ExpectedFrame,
-    ExpectedSample,
-    arrays_of,
-    check_members,
-    shard_name,
-)
+from unprocess_gen.dataset.row import has_frames
+from unprocess_gen.dataset.shards import check_members, shard_name
 from unprocess_gen.pipeline.progress import with_bar
 
 CONFIG, MANIFEST, DATASET = "config.yaml", "manifest.csv", "dataset.json"
@@ -176,7 +170,7 @@ def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], expected: 
             damages.append(Damage(f"shards/{path.name}", "is missing"))
             continue
         with any_path(path).local_copy() as file:
-            problems = [] if first is None else list(check_members(file, expected_samples(pairs)))
+            problems = [] if first is None else [*check_members(file, group_by_sample(pairs))]
             entry = listed.get(number)
             if not problems and entry is not None and (digest := file_sha256(file)) != entry["sha256"]:
                 problems = [("", "", f"its SHA-256 is {digest}, dataset.json records {entry['sha256']}")]
@@ -190,19 +184,3 @@ def _merged(listed: Iterable[int], expected: Iterable[ShardRows]) -> Iterator[Sh
     shards = heapq.merge(without_rows, expected, key=operator.itemgetter(0))
     for number, parts in itertools.groupby(shards, key=operator.itemgetter(0)):
         yield number, [row for _, rows in parts for row in rows]
-
-
-def expected_samples(rows: Iterable[Row]) -> list[ExpectedSample]:
-    """List the members that a shard must contain for rows; raise DamageError if a row lacks a value."""
-    return [_expected_sample(sample) for sample in group_by_sample(row for row in rows if row["status"] == "ok")]
-
-
-def _expected_sample(rows: Sequence[Row]) -> ExpectedSample:
-    width, height = rows[0]["width"], rows[0]["height"]
-    if not isinstance(width, int) or not isinstance(height, int):
-        raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
-    frames: dict[str, ExpectedFrame] = {}
-    for row in rows:
-        for frame in arrays_of(row).values():
-            frames.setdefault(frame.member, frame)
-    return ExpectedSample(sample_key(rows[0]), tuple(frames.values()), row_json(rows))

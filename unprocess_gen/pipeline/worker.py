@@ -25,7 +25,7 @@ from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.row import columns_of, failed_row, has_frames, pair_row, row_json
-from unprocess_gen.dataset.shards import ShardWriter, arrays_of, shard_name, targets_cell
+from unprocess_gen.dataset.shards import ShardWriter, shard_name, targets_cell
 from unprocess_gen.pipeline.deaths import counted_attempt
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels, targets_of
@@ -129,10 +129,7 @@ def make_image(
                 clean_xxh3, stored_targets = array_xxh3(pair.clean), targets_cell(targets)
             row = pair_row(row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn)
             row = {**row, "targets": stored_targets}
-            arrays = {"clean": pair.clean, "noisy": pair.noisy, **targets}
-            for name, stored in arrays_of(row).items():
-                if not sample or name == "noisy":
-                    writer.add_frame(key, stored.member, arrays[name])
+            writer.add_pair(row, {"clean": pair.clean, "noisy": pair.noisy, **targets}, is_first=not sample)
             sample.append(row)
         if config.output.frames:
             writer.add_rows(key, row_json(sample))

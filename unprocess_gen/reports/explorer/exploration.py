@@ -28,9 +28,9 @@ from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.dataset.row import pair_row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
-from unprocess_gen.pipeline.replay import dark_frames_root, source_changes, source_root
+from unprocess_gen.pipeline.replay import places_of
 from unprocess_gen.reports.estimate import predicted_levels
-from unprocess_gen.reports.explorer.overrides import override_text, overrides_of
+from unprocess_gen.reports.explorer.overrides import overrides_of
 from unprocess_gen.reports.panels import MosaicArray
 from unprocess_gen.reports.plan_text import noise_lines
 from unprocess_gen.simulation import self_test
@@ -225,17 +225,16 @@ def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices
 
 def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
     """Write the settings of a dataset as overrides that give the pair of the row."""
-    manifest, given = folder / "manifest.csv", dict(start.settings)
+    given = dict(start.settings)
     recorded, kind = read_dataset_yaml(folder / "config.yaml")
     settings = overrides_of(recorded)
     settings.pop("source.limit", None)
-    root = source_root(manifest, given.pop("source.root", None))
-    if kind == "folder" and root is None:
+    places = places_of(folder, given.pop("source.root", None))
+    if kind == "folder" and places.root is None:
         raise ConfigError(f"explore: {folder} does not record the folder of its sources; give source.root=ROOT")
-    places = source_changes(root, folder) | {"noise.dark_frames": dark_frames_root(manifest)}
-    for key, place in places.items():
+    for key, place in places.settings.items():
         if place:
-            settings[key] = _path_text(place) if isinstance(place, str) else override_text(place)
+            settings[key] = _path_text(place)
     state = replace(start, settings=settings | given, part=str(row["key"]).removeprefix(image_key(row)))
     config = state.source_config
     source = next((source for source in listed_sources(config) if source.name == row["source"]), None)
