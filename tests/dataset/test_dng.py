@@ -409,7 +409,7 @@ def test_packed_planes_are_written_as_the_mosaic_that_they_are(make: Make, tmp_p
 def test_frames_that_no_file_can_hold_are_refused(ds: Path, folder: Path, make: Make, tmp_path: Path) -> None:
     for width, height in ((22, 64001), (64000, 64000)):
         with pytest.raises(ConfigError, match=f"is {width} x {height}; a DNG holds 4 GB, and LibRaw opens none"):
-            dng._writable(pair(ds)[2] | {"width": width, "height": height})
+            dng._check_writable(pair(ds)[2] | {"width": width, "height": height})
     make(folder, tmp_path / "ds", "source.limit=1", "output.dtype=float32")
     with pytest.raises(ConfigError, match=r"--keys 00000000: has float32 values, .* needs output\.dtype=uint16"):
         dng.export(tmp_path / "ds", "00000000", dng.FRAMES, tmp_path / "files")

@@ -125,18 +125,15 @@ def _check_not_among_photographs(to: Path, root: str | None) -> None:
 def dng(call: Call) -> int:
     """Write frames as DNG files."""
     from unprocess_gen.dataset.dng import FRAMES, export
-    from unprocess_gen.dataset.selection import select_pairs
 
-    folder = dataset_folder(call)
     frames = [frame for frame in FRAMES if getattr(call, frame)] or FRAMES
-    exported = export(folder, call.keys, frames, call.to)
-    failed = select_pairs(folder / "manifest.csv", call.keys).failed
+    exported = export(dataset_folder(call), call.keys, frames, call.to)
     undescribed = counted(exported.without_profile, "noisy frame")
     counts = (
         (exported.written, f"{counted(exported.written, 'DNG file')} written"),
         (exported.present, f"{exported.present} existed with the same bytes"),
         (exported.without_profile, f"{undescribed} without NoiseProfile, which cannot describe the noise"),
-        (failed, f"{counted(failed, 'failed row')} skipped"),
+        (exported.failed, f"{counted(exported.failed, 'failed row')} skipped"),
     )
     print_results(f"{call.to}: " + "; ".join(text for count, text in counts if count))
     return 0

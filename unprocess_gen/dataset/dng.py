@@ -62,23 +62,14 @@ D65 = 21
 
 
 class DngSummary(NamedTuple):
-    """Numbers of files written, of files that existed with the same bytes, and of noisy ones without NoiseProfile."""
+    """Numbers of files written, of files that existed with the same bytes, of noisy ones without NoiseProfile, and of
+    failed rows that were skipped.
+    """
 
     written: int
     present: int
     without_profile: int
-
-
-class _File(NamedTuple):
-    """Identify one file to write: number of the pair in the dataset, key of the pair, and frame."""
-
-    number: int
-    key: str
-    frame: str
-
-    @property
-    def name(self) -> str:
-        return f"{self.key}.{self.frame}.dng"
+    failed: int
 
 
 def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> DngSummary:
@@ -89,25 +80,25 @@ def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> DngSu
     """
     require("tifffile", "dng: tifffile is missing", "dng")
     check_output_folder(to, f"--to {to}")
-    selected = select_pairs(folder / "manifest.csv", keys).rows
-    numbers = {str(_writable(row)["key"]): number for number, row in selected.items()}
-    files = [_File(number, key, frame) for key, number in numbers.items() for frame in frames]
-    pairs = RawPairs(folder)
-    present = [file for file in files if (to / file.name).exists()]
-    for file in present:
-        if (to / file.name).read_bytes() != _content(pairs, file):
-            raise ConfigError(f"--to {to}: {file.name} exists with other bytes; choose another folder")
-    written = [file for file in files if file not in present]
-    for file in written:
-        _write(to / file.name, _content(pairs, file))
-    without = sum(
-        file.frame == "noisy" and noise_profile(plan_from_row(pairs[file.number].row)) is None for file in files
-    )
-    return DngSummary(len(written), len(present), without)
+    pairs, (rows, failed) = RawPairs(folder), select_pairs(folder / "manifest.csv", keys)
+    for row in rows.values():
+        _check_writable(row)
+    files = {f"{row['key']}.{frame}.dng": (number, frame) for number, row in rows.items() for frame in frames}
+    present = [name for name in files if (to / name).exists()]
+    for name in present:
+        if (to / name).read_bytes() != _content(pairs, *files[name]):
+            raise ConfigError(f"--to {to}: {name} exists with other bytes; choose another folder")
+    written = [name for name in files if name not in present]
+    for name in written:
+        with machine_errors(to / name):
+            to.mkdir(parents=True, exist_ok=True)
+            LocalPath(to / name).write(_content(pairs, *files[name]), str(to))
+    profiles = [noise_profile(plan_from_row(row)) for row in rows.values() if "noisy" in frames]
+    return DngSummary(len(written), len(present), profiles.count(None), failed)
 
 
-def _writable(row: Row) -> Row:
-    """Row if its frames can be DNG files; otherwise ConfigError gives the reason."""
+def _check_writable(row: Row) -> None:
+    """Raise ConfigError with the reason if the frames of a row cannot be DNG files."""
     key, width, height = row["key"], int(row["width"] or 0), int(row["height"] or 0)
     if row["dtype"] != UINT16:
         raise ConfigError(
@@ -126,55 +117,36 @@ def _writable(row: Row) -> Row:
             f"--keys {key}: is {width} x {height}; a DNG holds 4 GB, and LibRaw opens none with a side over "
             f"{GREATEST_SIDE_PX} pixels"
         )
-    return row
 
 
-def _content(pairs: RawPairs, file: _File) -> bytes:
-    sample = pairs[file.number]
-    frame = sample.clean if file.frame == "clean" else sample.noisy
+def _content(pairs: RawPairs, number: int, name: str) -> bytes:
+    sample = pairs[number]
+    frame = sample.clean if name == "clean" else sample.noisy
     dn = mosaic_dn(frame, sample.row)
     if dn.dtype != np.uint16:  # the clean frame of clean_dtype=float32
         dn = quantise(dn.astype(np.float64), 0, 2 ** int(sample.row["bits"]) - 1)
-    content = encode(dn, sample.row, file.frame)
-    if array_xxh3(frame) != sample.row[f"{file.frame}_xxh3"]:
-        raise DamageError(f"{pairs.path}: the {file.frame} frame of {file.key} differs from the digest in its row")
-    return content
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all."""
-    with machine_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        LocalPath(path).write(content, str(path.parent))
+    if array_xxh3(frame) != sample.row[f"{name}_xxh3"]:
+        raise DamageError(f"{pairs.path}: the {name} frame of {sample.row['key']} differs from the digest in its row")
+    return encode(dn, sample.row, name)
 
 
 # --------------------------------------------------------------------------------------------------------- one file
 
 
-class Tag(NamedTuple):
-    """An entry of the TIFF directory: code, type, number of values (0: length of the text) and values."""
-
-    code: int
-    type: int
-    length: int
-    value: str | bytes | int | tuple[int, ...] | tuple[float, ...]
-    once: bool = True
-
+Tag = tuple[int, int, int, str | bytes | int | tuple[int, ...] | tuple[float, ...]]
+"""An entry of the TIFF directory: code, type, number of values (0: length of the text) and values."""
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 10, 12
 """Types of TIFF 6.0, section 2."""
 
 
 def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
-    """DNG file of the frame ``name`` (``clean`` or ``noisy``) of a row's pair.
+    """DNG file of the frame ``name`` (``clean`` or ``noisy``) of a row's pair, a uint16 mosaic [H, W].
 
-    Raises ConfigError if the frame is not a uint16 mosaic [H, W], or a colour value of the row exceeds 2^30.
+    Raises ConfigError if a colour value of the row exceeds 2^30.
     """
     import tifffile
 
-    if frame.dtype != np.uint16 or frame.ndim != 2:
-        actual = f"{frame.dtype} {list(frame.shape)}"
-        raise ConfigError(f"--keys {row['key']}: its {name} frame is {actual}; a DNG is made of uint16 mosaics [H, W]")
     file = io.BytesIO()
     tifffile.imwrite(
         file,
@@ -187,7 +159,7 @@ def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
         metadata=None,
         software=MAKE,
         description=f"{name} frame of {row['key']}",
-        extratags=tags(row, name, (frame.shape[0], frame.shape[1])),
+        extratags=[(*tag, True) for tag in tags(row, name, (frame.shape[0], frame.shape[1]))],
     )
     return file.getvalue()
 
@@ -197,28 +169,28 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
     plan, (height, width) = plan_from_row(row), shape
     profile = noise_profile(plan) if name == "noisy" else None
     return [
-        Tag(271, ASCII, 0, MAKE),  # Make
-        Tag(272, ASCII, 0, plan.camera.camera),  # Model
-        Tag(274, SHORT, 1, 1),  # Orientation: frames are upright
-        Tag(33421, SHORT, 2, (2, 2)),  # CFARepeatPatternDim
-        Tag(33422, BYTE, 4, bytes(CHANNELS.index(letter) for letter in plan.sensor.pattern)),  # CFAPattern
+        (271, ASCII, 0, MAKE),  # Make
+        (272, ASCII, 0, plan.camera.camera),  # Model
+        (274, SHORT, 1, 1),  # Orientation: frames are upright
+        (33421, SHORT, 2, (2, 2)),  # CFARepeatPatternDim
+        (33422, BYTE, 4, bytes(CHANNELS.index(letter) for letter in plan.sensor.pattern)),  # CFAPattern
         *_exposure(row),
-        Tag(50706, BYTE, 4, bytes((1, 4, 0, 0))),  # DNGVersion
-        Tag(50707, BYTE, 4, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-        Tag(50708, ASCII, 0, f"{MAKE} {plan.camera.camera}"),  # UniqueCameraModel
-        Tag(50710, BYTE, 3, bytes((0, 1, 2))),  # CFAPlaneColor: red, green, blue
-        Tag(50711, SHORT, 1, 1),  # CFALayout: rectangular
-        Tag(50713, SHORT, 2, (2, 2)),  # BlackLevelRepeatDim
-        Tag(50714, LONG, 4, (plan.sensor.black_level_dn,) * 4),  # BlackLevel
-        Tag(50717, LONG, 1, plan.sensor.white_level_dn),  # WhiteLevel
-        Tag(50719, LONG, 2, (0, 0)),  # DefaultCropOrigin
-        Tag(50720, LONG, 2, (width, height)),  # DefaultCropSize
-        Tag(50721, SRATIONAL, 9, _rationals(color_matrix(plan))),  # ColorMatrix1
-        Tag(50728, RATIONAL, 3, _rationals(as_shot_neutral(plan))),  # AsShotNeutral
-        Tag(50730, SRATIONAL, 1, rational(baseline_exposure_ev(plan))),  # BaselineExposure
-        Tag(50778, SHORT, 1, D65),  # CalibrationIlluminant1
-        Tag(50829, LONG, 4, (0, 0, height, width)),  # ActiveArea
-        *([Tag(51041, DOUBLE, 6, profile * 3)] if profile else []),  # NoiseProfile: the same for the three planes
+        (50706, BYTE, 4, bytes((1, 4, 0, 0))),  # DNGVersion
+        (50707, BYTE, 4, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
+        (50708, ASCII, 0, f"{MAKE} {plan.camera.camera}"),  # UniqueCameraModel
+        (50710, BYTE, 3, bytes((0, 1, 2))),  # CFAPlaneColor: red, green, blue
+        (50711, SHORT, 1, 1),  # CFALayout: rectangular
+        (50713, SHORT, 2, (2, 2)),  # BlackLevelRepeatDim
+        (50714, LONG, 4, (plan.sensor.black_level_dn,) * 4),  # BlackLevel
+        (50717, LONG, 1, plan.sensor.white_level_dn),  # WhiteLevel
+        (50719, LONG, 2, (0, 0)),  # DefaultCropOrigin
+        (50720, LONG, 2, (width, height)),  # DefaultCropSize
+        (50721, SRATIONAL, 9, _rationals(color_matrix(plan))),  # ColorMatrix1
+        (50728, RATIONAL, 3, _rationals(as_shot_neutral(plan))),  # AsShotNeutral
+        (50730, SRATIONAL, 1, rational(baseline_exposure_ev(plan))),  # BaselineExposure
+        (50778, SHORT, 1, D65),  # CalibrationIlluminant1
+        (50829, LONG, 4, (0, 0, height, width)),  # ActiveArea
+        *([(51041, DOUBLE, 6, profile * 3)] if profile else []),  # NoiseProfile: the same for the three planes
     ]
 
 
@@ -228,8 +200,8 @@ def _exposure(row: Row) -> list[Tag]:
     if not iso or not seconds:
         return []
     short = min(round(iso), 65535)  # the largest of 16 bits refers to ISOSpeed
-    speed = [Tag(34867, LONG, 1, round(iso))] if short == 65535 else []
-    return [Tag(33434, RATIONAL, 1, rational(seconds)), Tag(34855, SHORT, 1, short), *speed]
+    speed = [(34867, LONG, 1, round(iso))] if short == 65535 else []
+    return [(33434, RATIONAL, 1, rational(seconds)), (34855, SHORT, 1, short), *speed]
 
 
 def color_matrix(plan: Plan) -> Matrix:

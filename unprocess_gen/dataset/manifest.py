@@ -10,7 +10,7 @@ import contextlib
 import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
-from typing import BinaryIO, NamedTuple, TextIO
+from typing import BinaryIO, TextIO
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.fields import ALWAYS
@@ -23,27 +23,16 @@ MAX_LINE_BYTES = 2**17
 """Longest line of a manifest that is read. Paths have at most 4096 bytes, three characters each if encoded."""
 
 
-class Manifest(NamedTuple):
-    """Opened file and header of a manifest."""
-
-    stream: BinaryIO
-    header: tuple[str, ...]
-
-
 def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> None:
     r"""Write rows as CSV: ``\n`` line ends, quotes only if needed, empty cells for None."""
     stream.write(header_text(names))
-    _write_lines(stream, rows, names)
-
-
-def _write_lines(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> None:
-    csv.writer(stream, lineterminator="\n").writerows([_cell(row[name]) for name in names] for row in rows)
+    stream.writelines(rows_text([row], names) for row in rows)
 
 
 def rows_text(rows: Iterable[Row], names: Sequence[str]) -> str:
     """Lines that `write_rows` writes for some rows, without the header."""
     stream = io.StringIO()
-    _write_lines(stream, rows, names)
+    csv.writer(stream, lineterminator="\n").writerows([_cell(row[name]) for name in names] for row in rows)
     return stream.getvalue()
 
 
@@ -75,8 +64,8 @@ def rows_with_offsets(path: AnyPath) -> Iterator[tuple[int, Row]]:
 
 def read_columns(path: AnyPath) -> tuple[str, ...]:
     """Columns of a manifest, unknown ones included; DamageError if the file is no manifest."""
-    with _opened(path) as manifest:
-        return manifest.header
+    with _opened(path) as (_, header):
+        return header
 
 
 def read_row(path: AnyPath, offset: int, columns: Sequence[str] = ()) -> Row:
@@ -93,8 +82,8 @@ def read_row(path: AnyPath, offset: int, columns: Sequence[str] = ()) -> Row:
 
 
 @contextlib.contextmanager
-def _opened(path: AnyPath, columns: Sequence[str] = ()) -> Iterator[Manifest]:
-    """Open a manifest after its header; DamageError for everything that goes wrong until it is closed.
+def _opened(path: AnyPath, columns: Sequence[str] = ()) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
+    """Open a manifest, and yield file and header; DamageError for everything that goes wrong until it is closed.
 
     If ``columns`` are given, neither the header nor the format of the dataset is read.
     """
@@ -106,7 +95,7 @@ def _opened(path: AnyPath, columns: Sequence[str] = ()) -> Iterator[Manifest]:
             missing = [column.name for column in COLUMNS if column.needs is ALWAYS and column.name not in header]
             if missing:
                 raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")
-            yield Manifest(stream, header)
+            yield stream, header
     except FileNotFoundError:
         raise DamageError(f"{path}: no such manifest") from None
     except (csv.Error, ValueError) as error:

@@ -23,22 +23,6 @@ _RANGE = re.compile(r"(\d{1,12})-(\d{1,12})")
 _INDEX = re.compile(r"\d{1,12}")
 
 
-class KeySelection(NamedTuple):
-    """Names and ranges in ``--keys``: keys, and source indices, with what the user wrote for each."""
-
-    names: dict[str, str]
-    ranges: dict[str, range]
-
-    def named(self, row: Row) -> set[str]:
-        """Names that select a row: its own key, or the key of its patch or image."""
-        return self.names.keys() & {str(row["key"]), sample_key(row), image_key(row)}
-
-    def in_ranges(self, row: Row) -> set[str]:
-        """Ranges that a row's source index is in."""
-        index = int(image_key(row))
-        return {text for text, indices in self.ranges.items() if index in indices}
-
-
 class SelectedPairs(NamedTuple):
     """Rows of selected pairs by their number in `RawPairs`, and number of failed rows in a range, which are skipped."""
 
@@ -46,8 +30,8 @@ class SelectedPairs(NamedTuple):
     failed: int
 
 
-def parse_keys(text: str) -> KeySelection:
-    """Read ``--keys``: comma-separated source indices, ranges with both ends, and keys: ``3,7-9,00000003-p0007``."""
+def parse_keys(text: str) -> tuple[dict[str, str], dict[str, range]]:
+    """Read ``--keys``, such as ``3,7-9,00000003-p0007``: keys with what the user wrote for each, and ranges by text."""
     names: dict[str, str] = {}
     ranges: dict[str, range] = {}
     for item in map(str.strip, text.split(",")):
@@ -62,7 +46,7 @@ def parse_keys(text: str) -> KeySelection:
             names[item] = item
         else:
             raise ConfigError(f"--keys {text[:60]}: {item[:40]!r} is no key; {KEYS_FORM}")
-    return KeySelection(names, ranges)
+    return names, ranges
 
 
 def select_rows(manifest: AnyPath, keys: str | None = None, skipped: list[Row] | None = None) -> Iterator[Row]:
@@ -74,18 +58,20 @@ def select_rows(manifest: AnyPath, keys: str | None = None, skipped: list[Row] |
     if keys is None:
         yield from read_rows(manifest)
         return
-    selection = parse_keys(keys)
+    names, ranges = parse_keys(keys)
     matches: set[str] = set()
     ends = "", ""
     for row in read_rows(manifest):
-        ends = ends[0] or str(row["key"]), str(row["key"])
-        named, ranges = selection.named(row), selection.in_ranges(row)
-        matches |= named | ranges
-        if named or (ranges and row["status"] == "ok"):
+        key, index = str(row["key"]), int(image_key(row))
+        ends = ends[0] or key, key
+        named = names.keys() & {key, sample_key(row), image_key(row)}
+        around = {text for text, indices in ranges.items() if index in indices}
+        matches |= named | around
+        if named or (around and row["status"] == "ok"):
             yield row
-        elif ranges and skipped is not None and row["status"] == "failed":
+        elif around and skipped is not None and row["status"] == "failed":
             skipped.append(row)
-    for name, written in {**selection.names, **dict.fromkeys(selection.ranges)}.items():
+    for name, written in {**names, **dict.fromkeys(ranges)}.items():
         if name not in matches:
             known = f"it has keys from {ends[0]} to {ends[1]}" if ends[0] else "it has none"
             raise ConfigError(f"--keys {written or name}: {manifest} has no such key; {known}; {KEYS_FORM}")
