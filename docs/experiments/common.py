@@ -128,7 +128,7 @@ class Sensor:
                 known = ["" if value is None else f"{value}" for value in (capture.exposure_s, f"{number}", *stated)]
                 lines.append(",".join((name, capture.kind, f"{capture.iso:g}", *known)))
         (places / "captures.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        found = calibrate(places)
+        found = calibrate(read_captures(places))
         sensor, first = found.captures.sensor, found.isos[0]
         (self.folder / "noise" / "physical.yaml").write_text(measured_yaml(found, "physical"), encoding="utf-8")
         (self.folder / "noise" / "two_numbers.yaml").write_text(

@@ -14,6 +14,7 @@ from helpers.captures import Camera, Numbers, Shot, draw, record, with_levels
 from helpers.commands import RunMain
 
 from unprocess_gen.calibration.calibrate import calibrate
+from unprocess_gen.calibration.captures import read_captures
 from unprocess_gen.reports.formatting import short_number
 
 Estimates = dict[tuple[str, float | None, str | None], dict[str, Any]]
@@ -155,7 +156,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
         shots = [*[Shot(0.0)] * darks, *(Shot(light) for light in (0.05, 0.1, 0.2, 0.3) for _ in range(2))]
         folder = with_levels(draw(tmp_path / f"{darks}", Numbers(), 0, side, shots))
         tracemalloc.start()
-        calibrate(folder)
+        calibrate(read_captures(folder))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < peaks[0] + 4 * 2 * side**2  # four frames of uint16

@@ -12,6 +12,7 @@ import pytest
 from helpers.captures import Camera, record
 
 from unprocess_gen.calibration.calibrate import calibrate
+from unprocess_gen.calibration.captures import read_captures
 from unprocess_gen.calibration.profile import NamedNumber, estimates, site_names
 
 ISOS = {
@@ -47,11 +48,10 @@ def compared(profile: str, seed: int) -> list[Compared]:
     folder = Path(tempfile.mkdtemp()) / "captures"
     cameras = {iso: Camera(profile, iso, seed=seed) for iso in ISOS[profile]}
     # with three flats of each level, the tolerance of the gain is four standard errors
-    found = calibrate(
-        record(folder, *cameras.values(), flats=3, long_s=(1.0, 4.0, 16.0), bright=BRIGHT.get(profile, 0))
-    )
+    record(folder, *cameras.values(), flats=3, long_s=(1.0, 4.0, 16.0), bright=BRIGHT.get(profile, 0))
+    found = calibrate(read_captures(folder))
     shutil.rmtree(folder.parent)
-    truths, sites = {iso: camera.truth for iso, camera in cameras.items()}, site_names(found.sensor)
+    truths, sites = {iso: camera.truth for iso, camera in cameras.items()}, site_names(found.captures.sensor)
     result = []
     for one in estimates(found):
         truth = truths[one.iso or ISOS[profile][0]]

@@ -21,7 +21,7 @@ from helpers.promise_report import Figure
 from numpy.typing import NDArray
 
 from unprocess_gen import RawPairs, make_pair
-from unprocess_gen.calibration.scores import FALSE_ALARM, Score, alarm_limit
+from unprocess_gen.calibration.deviations import FALSE_ALARM, Score, alarm_limit
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError

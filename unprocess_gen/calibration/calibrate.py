@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.calibration.captures import CaptureSet, Sensor, common, read_captures
+from unprocess_gen.calibration.captures import CaptureSet, Sensor, common
 from unprocess_gen.calibration.gain import Estimate, combined, estimate, root_estimate, weighted_mean, weighted_slope
-from unprocess_gen.calibration.measure import IsoResult, Watch, measure_iso
+from unprocess_gen.calibration.iso_results import IsoResult, Watch, measure_iso
 
 LEAST_EXPOSURE_RATIO = 2.0
 """Least ratio of exposures from which dark current is measured."""
@@ -35,21 +34,15 @@ class Calibration:
     isos: list[IsoResult]
     shared: dict[str, Estimate | None]
     celsius: float | None
-    notes: list[str]
-
-    @property
-    def sensor(self) -> Sensor:
-        """Levels and pattern of the sensor."""
-        return self.captures.sensor
 
 
-def calibrate(folder: Path, watch: Watch = lambda frames: frames) -> Calibration:
-    """Measure the captures of a folder; ``watch`` shows progress. ConfigError or MachineError."""
-    return measure_all(read_captures(folder), watch)
+def calibrate(
+    captures: CaptureSet, watch: Watch = lambda frames: frames, gains: Mapping[float, Estimate] | None = None
+) -> Calibration:
+    """Measure each ISO, and what all ISOs show together; ``watch`` shows progress. ConfigError or MachineError.
 
-
-def measure_all(captures: CaptureSet, watch: Watch, gains: Mapping[float, Estimate] | None = None) -> Calibration:
-    """Measure each ISO, and what all ISOs show together; of ISOs whose gain is given, darks alone are measured."""
+    Of ISOs whose gain is given, darks alone are measured.
+    """
     results = [measure_iso(captures, iso, watch, (gains or {}).get(iso)) for iso in captures.isos]
     hot_share, hot_current = _hot(results, captures.sensor)
     shared = {
@@ -61,9 +54,8 @@ def measure_all(captures: CaptureSet, watch: Watch, gains: Mapping[float, Estima
     }
     darks = {capture.path: capture for capture in captures.captures if capture.kind == "dark"}
     advice = "is null: the captures do not show it; the guide on calibration lists the frames that do"
-    notes = [*captures.notes, *(note for result in results for note in result.notes)]
-    notes += [f"{name} {advice}" for name in NULL if shared[name] is None]
-    return Calibration(captures, results, shared, common(darks, "temperature_c"), notes)
+    captures.notes.extend(f"{name} {advice}" for name in NULL if shared[name] is None)
+    return Calibration(captures, results, shared, common(darks, "temperature_c"))
 
 
 def _prnu(results: Sequence[IsoResult]) -> Estimate | None:

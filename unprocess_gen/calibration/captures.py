@@ -11,7 +11,7 @@ import csv
 import hashlib
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -36,6 +36,8 @@ KIND_NAMES = {"dark": ("dark", "bias"), "flat": ("flat",)}
 """Kinds of frames, and the words by which names state them."""
 EMVA_ISO = 100.0
 LEAST_SIDE = 32
+LEAST_FRAMES = 2
+"""Fewest frames of one exposure and level, which show noise."""
 SAME_EXPOSURE = 0.05
 """Relative difference of ISO and exposure from metadata, which cameras round."""
 APART = 0.03
@@ -95,8 +97,15 @@ class Sensor:
         return self.white_dn - self.black_dn
 
 
+def place_of(frames: Sequence[Capture]) -> str:
+    """The name of a measurement for messages: its first frame, ISO and number of frames."""
+    first = frames[0]
+    light = f", level {first.level}" if first.level else ""
+    return f"calibrate: {first.path} ({first.kind}, ISO {first.iso:g}{light}, {len(frames)} frames)"
+
+
 class CaptureSet(NamedTuple):
-    """Frames of a folder, their sensor, digest of all files, and notes for the user."""
+    """Frames of a folder, their sensor, digest of all files, and notes for the user, which measurements add to."""
 
     captures: list[Capture]
     sensor: Sensor
@@ -104,14 +113,21 @@ class CaptureSet(NamedTuple):
     notes: list[str]
 
     def groups(self, kind: str, iso: float) -> Iterator[list[Capture]]:
-        """Yield the frames of each exposure and level of one ISO; levels that are not stated follow from the light."""
+        """Yield the frames of each exposure and level of one ISO; levels that are not stated follow from the light.
+
+        Single frames are left out with a note.
+        """
         groups = defaultdict(list)
         for frame in self.captures:
             if (frame.kind, frame.iso) == (kind, iso):
                 groups[frame.group].append(frame)
         for (_, level), frames in sorted(groups.items()):
             has_level = kind == "dark" or level or len(frames) <= 2
-            yield from [frames] if has_level else _by_light(frames, self.sensor.black_dn)
+            for alike in [frames] if has_level else _by_light(frames, self.sensor.black_dn):
+                if len(alike) >= LEAST_FRAMES:
+                    yield alike
+                else:
+                    self.notes.append(f"{place_of(alike)}: one frame shows no noise, and is left out")
 
     @property
     def isos(self) -> list[float]:

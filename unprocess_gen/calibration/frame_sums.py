@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.calibration.planes import TILE, neighbour_products, planes_of
-from unprocess_gen.calibration.scores import Score
+from unprocess_gen.calibration.deviations import Score
+from unprocess_gen.calibration.planes import NEIGHBOURS, TILE, planes_of
 from unprocess_gen.core.arrays import Float
 
 ROUNDING_DN2 = 1 / 12
@@ -213,15 +213,16 @@ def _fixed_offsets(columns: Float, noise: float, temporal: float) -> tuple[float
 def _correlation(difference: NDArray[np.int32]) -> Score:
     """Score the largest correlation of neighbours in the difference of two frames, without offsets of lines."""
     height, width = difference.shape
-    z = np.zeros((height, width + 2), np.float32)
+    z = np.zeros((height, width + 2), np.float32)  # the last two columns keep sites of other rows out
     for y, x in TILE:
         plane = difference[y::2, x::2].astype(np.float32)
         plane -= plane.mean(axis=1, keepdims=True)
         plane -= plane.mean(axis=0, keepdims=True)
         _, std = robust_std(plane)
         z[y::2, x:width:2] = np.clip(plane / max(std, 0.5), -LARGEST_Z, LARGEST_Z)
-    square = max(float((z * z).sum(dtype=np.float64)), 1.0)
-    largest = max((product for products in neighbour_products(z).values() for product in products), key=abs)
+    square, flat = max(float((z * z).sum(dtype=np.float64)), 1.0), z.ravel()
+    steps = [y * z.shape[1] + x for distances in NEIGHBOURS.values() for y, x in distances]
+    largest = max((float(flat[step:] @ flat[:-step]) for step in steps), key=abs)
     return Score(largest / square, 1.0, 1 / difference.size, step=LARGEST_Z**2 / square)
 
 

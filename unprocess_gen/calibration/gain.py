@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.calibration.scores import NORMAL_95, influence
+from unprocess_gen.calibration.deviations import NORMAL_95, influence
 from unprocess_gen.core.arrays import Float
 
 RANGES = (0.1, 0.3)

@@ -1,10 +1,8 @@
-"""Split mosaics into planes, and sum products of neighbouring sites."""
+"""Split mosaics into planes, and name the distances of neighbouring sites."""
 
 from __future__ import annotations
 
 from typing import Any
-
-import numpy as np
 
 from unprocess_gen.simulation.reference.cfa import MONO
 
@@ -28,13 +26,3 @@ def plane_names(pattern: str) -> list[str]:
 def planes_of(mosaic: Any) -> list[Any]:
     """The planes of a mosaic of even sides, as views."""
     return [mosaic[y::2, x::2] for y, x in TILE]
-
-
-def neighbour_products(z: Any) -> dict[str, list[float]]:
-    """Sums of the products of z at pairs of sites, by distance of `NEIGHBOURS`.
-
-    The last two columns of z [H, W + 2] are zeros, which keep sites of other rows out.
-    """
-    flat = np.ascontiguousarray(z).ravel()
-    places = {name: [y * z.shape[1] + x for y, x in distances] for name, distances in NEIGHBOURS.items()}
-    return {name: [float(flat[n:] @ flat[:-n]) for n in numbers] for name, numbers in places.items()}

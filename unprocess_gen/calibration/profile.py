@@ -19,7 +19,7 @@ import yaml
 from unprocess_gen.calibration.calibrate import NULL, Calibration
 from unprocess_gen.calibration.captures import Sensor
 from unprocess_gen.calibration.gain import SIGNIFICANT, Estimate, combined, estimate
-from unprocess_gen.calibration.measure import IsoResult
+from unprocess_gen.calibration.iso_results import IsoResult
 from unprocess_gen.calibration.planes import plane_names
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 from unprocess_gen.config.limits import NAME
@@ -89,7 +89,7 @@ def site_names(sensor: Sensor) -> list[str]:
 
 def estimates(calibration: Calibration) -> list[NamedNumber]:
     """All estimates: those of all ISOs together, then those of each ISO, of the sensor and then of its sites."""
-    sites = [None, *site_names(calibration.sensor)]
+    sites = [None, *site_names(calibration.captures.sensor)]
     listed = [NamedNumber(name, None, None, number) for name, number in calibration.shared.items()]
     for result in calibration.isos:
         for name, numbers in result.numbers.items():
@@ -139,14 +139,14 @@ def measured_yaml(calibration: Calibration, name: str) -> str:
     """The noise profile of measured frames."""
     isos, digest = [result.iso for result in calibration.isos], calibration.captures.sha256
     places = modes(isos, [result["read_std_dn"] for result in calibration.isos])
-    branches = [_branch([calibration.isos[place] for place in mode], calibration.sensor) for mode in places]
-    profile = profile_head(name, calibration.sensor) | {"branches": branches} | _common_keys(calibration)
+    branches = [_branch([calibration.isos[place] for place in mode], calibration.captures.sensor) for mode in places]
+    profile = profile_head(name, calibration.captures.sensor) | {"branches": branches} | _common_keys(calibration)
     listed = {entry.name for entry in estimates(calibration) if entry.number is not None}
     written = [key for key in (*branches[0], *profile) if key in listed]
     source = f"calibrate, own flats and darks, {len(calibration.captures.captures)} frames, SHA-256 {digest[:16]}"
     profile["provenance"] = [provenance(written, isos, source, f"95 % intervals in {name}.json")]
     frames = f"{len(calibration.captures.captures)} raw frames, ISO {', '.join(f'{iso:g}' for iso in isos)}"
-    return profile_yaml(f"Measured {MARK} on {frames}", digest, calibration.notes, profile)
+    return profile_yaml(f"Measured {MARK} on {frames}", digest, calibration.captures.notes, profile)
 
 
 AGAINST_ISO = {"dn_per_e": "DN per electron", "read_std_dn": "read noise (DN)", "row_std_dn": "row noise (DN)"}
@@ -196,7 +196,7 @@ def _common_keys(calibration: Calibration) -> dict[str, Any]:
 
 def _gains_by_colour(calibration: Calibration) -> list[float] | None:
     """The gains of red, green and blue relative to the sensor's, if they differ by more than their errors."""
-    sites, colours = site_names(calibration.sensor), list[Estimate]()
+    sites, colours = site_names(calibration.captures.sensor), list[Estimate]()
     for colour in "RGB" if sites else "":
         places = [1 + place for place, site in enumerate(sites) if site[0] == colour]
         gains = [(result["dn_per_e"].value, result.numbers["dn_per_e"]) for result in calibration.isos]

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.calibration.deviations import NORMAL_95
 from unprocess_gen.calibration.frame_sums import Measurement
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.planes import planes_of
-from unprocess_gen.calibration.scores import NORMAL_95
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.core.exact_distributions import tukey_std
 

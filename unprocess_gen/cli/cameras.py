@@ -45,6 +45,7 @@ def _state(folder: Path, to: Path) -> Sequence[float]:
 def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:
     """Write the profile of flats and darks, and a page about them; return its ISOs."""
     from unprocess_gen.calibration.calibrate import calibrate
+    from unprocess_gen.calibration.captures import read_captures
     from unprocess_gen.calibration.profile import AGAINST_ISO, estimates, estimates_json, measured_yaml, write_profile
     from unprocess_gen.pipeline.progress import with_bar
 
@@ -52,8 +53,8 @@ def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:
         from unprocess_gen.reports.calibration_page import check_page, write_page
 
         check_page(page)
-    calibration = calibrate(folder, partial(with_bar, unit="frame"))
-    _report_notes(calibration.notes)
+    calibration = calibrate(read_captures(folder), partial(with_bar, unit="frame"))
+    _report_notes(calibration.captures.notes)
     write_profile(to, measured_yaml(calibration, to.stem), estimates_json(estimates(calibration)))
     for result in calibration.isos:
         gain, read, row = (result[name] for name in AGAINST_ISO)

@@ -12,17 +12,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from unprocess_gen.calibration.calibrate import Calibration, measure_all
+from unprocess_gen.calibration.calibrate import Calibration, calibrate
 from unprocess_gen.calibration.captures import Sensor, read_captures
+from unprocess_gen.calibration.deviations import NORMAL_95, Score, alarm_limit
 from unprocess_gen.calibration.gain import Estimate
-from unprocess_gen.calibration.measure import Watch
+from unprocess_gen.calibration.iso_results import Watch
 from unprocess_gen.calibration.profile import (
     NamedNumber,
     dark_variance,
     estimates,
     site_names,
 )
-from unprocess_gen.calibration.scores import NORMAL_95, Score, alarm_limit
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 from unprocess_gen.config.interpretation import is_physical, noise_distributions
 from unprocess_gen.config.noise_validation import check_noise
@@ -93,8 +93,8 @@ def compare_frames(config: Config, frames: Path, watch: Watch = lambda frames: f
     with_flats = {capture.iso for capture in captures.captures if capture.kind == "flat"}
     dark_only = [iso for iso in captures.isos if iso not in with_flats]
     gains = {iso: _profile_numbers(config, iso, None)["dn_per_e"][0] or 1.0 for iso in dark_only}
-    calibration = measure_all(captures, watch, {iso: Estimate(gain, gain, gain) for iso, gain in gains.items()})
-    return Comparisons(list(_compared(calibration, config, dark_only)), calibration.notes)
+    calibration = calibrate(captures, watch, {iso: Estimate(gain, gain, gain) for iso, gain in gains.items()})
+    return Comparisons(list(_compared(calibration, config, dark_only)), captures.notes)
 
 
 def _compared(calibration: Calibration, config: Config, dark_only: list[float]) -> Iterator[Comparison]:
@@ -102,7 +102,7 @@ def _compared(calibration: Calibration, config: Config, dark_only: list[float]) 
     celsius, isos = calibration.celsius, calibration.captures.isos
     variances = [NamedNumber("b_dn2", result.iso, None, dark_variance(result)) for result in calibration.isos]
     listed = [entry for entry in [*estimates(calibration), *variances] if entry.name in EFFECT_OF_NUMBER]
-    limit, sites = alarm_limit(len(listed)), [None, *site_names(calibration.sensor)]
+    limit, sites = alarm_limit(len(listed)), [None, *site_names(calibration.captures.sensor)]
     profile = {iso: _profile_numbers(config, iso, celsius) for iso in isos}
     tukey = {result.iso: result.shape.is_tukey for result in calibration.isos}
     for entry in listed:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unprocess_gen.calibration.calibrate import Calibration
-from unprocess_gen.calibration.measure import IsoResult
+from unprocess_gen.calibration.deviations import NORMAL_95
+from unprocess_gen.calibration.iso_results import IsoResult
 from unprocess_gen.calibration.profile import AGAINST_ISO, ENDS, estimates, site_names
-from unprocess_gen.calibration.scores import NORMAL_95
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import check_output_file
@@ -36,7 +36,7 @@ def check_page(page: Path) -> None:
 
 def write_page(calibration: Calibration, name: str, command: str, page: Path) -> None:
     """Write the page of a calibration."""
-    sites = site_names(calibration.sensor)
+    sites = site_names(calibration.captures.sensor)
     lines = []
     for entry in (entry for entry in estimates(calibration) if entry.site is None):
         ends = (short_number(getattr(entry.number, end, None), 4) for end in ENDS)
@@ -46,7 +46,7 @@ def write_page(calibration: Calibration, name: str, command: str, page: Path) ->
         title=f"Calibration of {name}",
         command=command,
         frames=len(calibration.captures.captures),
-        notes=calibration.notes,
+        notes=calibration.captures.notes,
         figures=[(f"ISO {result.iso:g}", data_uri(_drawn(result, sites))) for result in calibration.isos],
         against_iso=data_uri(_against_iso(calibration)) if len(calibration.isos) > 1 else "",
         table=PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4)),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unprocess_gen.calibration.scores import NORMAL_95, influence
+from unprocess_gen.calibration.deviations import NORMAL_95, influence
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.reports.noise_check.repeat import Noise
 from unprocess_gen.reports.noise_check.scores import Bins, residual_of

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unprocess_gen.calibration.scores import Score, alarm_limit
+from unprocess_gen.calibration.deviations import Score, alarm_limit
 from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.reports.noise_check.repeat import Noise, measure_noise
 from unprocess_gen.reports.noise_check.scores import Residual, Scores, scores_of

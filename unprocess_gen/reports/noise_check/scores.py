@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unprocess_gen.calibration.deviations import Score
 from unprocess_gen.calibration.planes import NEIGHBOURS, TILE, plane_names
-from unprocess_gen.calibration.scores import Score
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.reports.noise_check.repeat import Noise, Single
 

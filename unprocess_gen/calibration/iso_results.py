@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from unprocess_gen.calibration import checks
-from unprocess_gen.calibration.captures import Capture, CaptureSet, Sensor
+from unprocess_gen.calibration.capture_checks import check_dark, check_flat, is_clipped
+from unprocess_gen.calibration.captures import LEAST_FRAMES, Capture, CaptureSet, Sensor, place_of
 from unprocess_gen.calibration.frame_sums import (
     FAR,
     ROUNDING_DN2,
@@ -38,7 +38,6 @@ from unprocess_gen.core.errors import ConfigError
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""
 
-LEAST_FRAMES = 2
 FULL_SHARE = 1e-4
 """Largest share of values at white in a level that is fitted."""
 ROUNDED_STD_DN = 0.7
@@ -99,7 +98,6 @@ class IsoResult:
     shape: ReadShape
     histogram: Histogram
     prnu_square: tuple[float, float] | None
-    notes: list[str]
 
     def __getitem__(self, name: str) -> Estimate:
         """An estimate of the sensor."""
@@ -108,11 +106,9 @@ class IsoResult:
 
 def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate | None = None) -> IsoResult:
     """Measure the captures of one ISO, or darks alone if the ``gain`` is given; ConfigError if a check fails."""
-    sensor, notes = captures.sensor, list[str]()
-    darks = _darks(captures, iso, notes, watch)
+    sensor, darks = captures.sensor, _darks(captures, iso, watch)
     dark = max(darks, key=lambda dark: dark.measured.count)
-    flats = [] if gain else _flats(captures, iso, darks, watch, notes)
-    levels = [] if gain else _levels(iso, flats, sensor)
+    levels = [] if gain else _levels(iso, _flats(captures, iso, darks, watch), sensor)
     histogram = fill_histogram((frame.pixels() for frame in watch(dark.frames)), dark.measured)
     shape = fit_shape(histogram)
     curves = _curves(levels, shape) if levels else []
@@ -127,20 +123,19 @@ def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate |
         shape=shape,
         histogram=histogram,
         prnu_square=_prnu_square(levels, watch) if levels else None,
-        notes=notes,
     )
 
 
-def _darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> list[Dark]:
+def _darks(captures: CaptureSet, iso: float, watch: Watch) -> list[Dark]:
     """Measure the darks of one ISO, in ascending order of exposures; ConfigError if there are none."""
     darks = list[Dark]()
-    for frames in _groups(captures, "dark", iso, notes):
+    for frames in captures.groups("dark", iso):
         sums = _summed(frames, captures.sensor, watch)
         measured = sums.measure()
-        if darks and checks.is_clipped(measured):  # by the dark current of a long exposure
-            notes.append(f"{checks.place(frames)}: black is clipped by the dark current; left out")
+        if darks and is_clipped(measured):  # by the dark current of a long exposure
+            captures.notes.append(f"{place_of(frames)}: black is clipped by the dark current; left out")
             continue
-        checks.check_dark(frames, captures.sensor, measured, notes)
+        check_dark(captures, frames, measured)
         patterns = [high_passed(plane) for plane in planes_of(sums.mean_frame())]
         threshold = FAR * max(*(robust_std(pattern)[1] for pattern in patterns), 0.05)
         hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
@@ -148,15 +143,6 @@ def _darks(captures: CaptureSet, iso: float, notes: list[str], watch: Watch) -> 
     if not darks:
         raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
     return darks
-
-
-def _groups(captures: CaptureSet, kind: str, iso: float, notes: list[str]) -> Iterator[list[Capture]]:
-    """Yield the measurements of a kind; single frames are left out with a note."""
-    for frames in captures.groups(kind, iso):
-        if len(frames) < LEAST_FRAMES:
-            notes.append(f"{checks.place(frames)}: one frame shows no noise, and is left out")
-        else:
-            yield frames
 
 
 def _summed(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSums:
@@ -173,10 +159,10 @@ def _summed(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSum
     return sums
 
 
-def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch, notes: list[str]) -> list[Flat]:
+def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch) -> list[Flat]:
     """Measure the levels that are not saturated, in ascending order."""
     sensor, flats = captures.sensor, []
-    for frames in _groups(captures, "flat", iso, notes):
+    for frames in captures.groups("flat", iso):
         sums = _summed(frames, sensor, watch)
         measured = sums.measure()
         seconds = frames[0].exposure_s or 0.0
@@ -184,9 +170,9 @@ def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch
         signals = measured.mean_dn - dark.measured.mean_dn
         full_share = float(measured.codes[:, int(sensor.white_dn) :].sum() / measured.codes.sum())
         if full_share > FULL_SHARE:
-            notes.append(f"{checks.place(frames)}: {full_share:.2%} of the values are at white; left out of fits")
+            captures.notes.append(f"{place_of(frames)}: {full_share:.2%} of the values are at white; left out of fits")
         else:
-            checks.check_flat(frames, sensor, measured, dark.measured, notes)
+            check_flat(captures, frames, measured, dark.measured)
         flats.append(Flat(frames, measured, dark, full_share > FULL_SHARE, signals))
     return sorted(flats, key=lambda flat: flat.signal_dn)
 

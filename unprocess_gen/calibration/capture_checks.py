@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.calibration.captures import Capture, Sensor
+from unprocess_gen.calibration.captures import Capture, CaptureSet, place_of
+from unprocess_gen.calibration.deviations import UNFORESEEN, Score, alarm_limit
 from unprocess_gen.calibration.frame_sums import ROUNDING_DN2, Measurement
-from unprocess_gen.calibration.scores import UNFORESEEN, Score, alarm_limit
 from unprocess_gen.core.errors import ConfigError
 
 
@@ -70,35 +70,29 @@ LEAST_OF_CODE = 100
 """Mean number of values from which none is hardly by chance."""
 
 
-def place(frames: Sequence[Capture]) -> str:
-    """The name of a measurement for messages: its first frame, ISO and number of frames."""
-    first = frames[0]
-    light = f", level {first.level}" if first.level else ""
-    return f"calibrate: {first.path} ({first.kind}, ISO {first.iso:g}{light}, {len(frames)} frames)"
-
-
 def _exceeds(score: Score, limit: float) -> bool:
     return limit < math.inf and score._replace(low=-limit, high=limit).surprise > ALARM
 
 
-def _check(frames: Sequence[Capture], scores: dict[str, Score], notes: list[str]) -> None:
+def _check(captures: CaptureSet, frames: Sequence[Capture], scores: dict[str, Score]) -> None:
     """Compare statistics with `LIMITS`: raise ConfigError, or add a note."""
     for name, score in scores.items():
         doubtful, refused, meaning, expected = LIMITS[name]
-        text = f"{place(frames)}: {meaning.format(score.total)}"
+        text = f"{place_of(frames)}: {meaning.format(score.total)}"
         if _exceeds(score, refused):
             raise ConfigError(f"{text}; expected {expected}")
         if _exceeds(score, doubtful):
-            notes.append(text)
+            captures.notes.append(text)
 
 
-def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measurement, notes: list[str]) -> None:
+def check_dark(captures: CaptureSet, frames: Sequence[Capture], dark: Measurement) -> None:
     """Refuse darks that are clipped, contain light or differ; warn of doubtful ones."""
+    sensor = captures.sensor
     std_dn = math.sqrt(max(float((dark.variance + dark.dsnu).mean()) - ROUNDING_DN2, 0.0))  # both are dither
     least = LEAST_DARK_STD_8_BITS_DN if sensor.bits <= 8 else LEAST_DARK_STD_DN
     if std_dn < least:
         raise ConfigError(
-            f"{place(frames)}: the noise without light is {std_dn:.3f} DN at {sensor.bits} bits; expected {least:g} "
+            f"{place_of(frames)}: the noise without light is {std_dn:.3f} DN at {sensor.bits} bits; expected {least:g} "
             "DN or more: rounding hides it, and variances are no measure; record with more bits, or at a higher gain"
         )
     variances, mean_variance = dark.frame_variances, float(dark.variance.mean()) / dark.sites
@@ -110,7 +104,7 @@ def check_dark(frames: Sequence[Capture], sensor: Sensor, dark: Measurement, not
         "clipped black": clipped_black(dark),
         "frames differ": ratio,
     }
-    _check(frames, scores | _pixel_scores(dark), notes)
+    _check(captures, frames, scores | _pixel_scores(dark))
 
 
 def is_clipped(dark: Measurement) -> bool:
@@ -148,18 +142,16 @@ def _missing_codes(codes: np.ndarray) -> Score:
     return Score(float(np.mean(inner == 0)), 1.0, UNFORESEEN / len(inner), step=step)
 
 
-def check_flat(
-    frames: Sequence[Capture], sensor: Sensor, flat: Measurement, dark: Measurement, notes: list[str]
-) -> None:
+def check_flat(captures: CaptureSet, frames: Sequence[Capture], flat: Measurement, dark: Measurement) -> None:
     """Refuse flats whose light changes in time or over the frame; warn of doubtful ones."""
     signal = max(float(flat.mean_dn.mean() - dark.mean_dn.mean()), 1.0)
     noise = float(flat.variance.mean()) / flat.sites / signal**2  # of the mean of a plane
     drift = float(dark.frame_means.mean(axis=1).var(ddof=1)) / signal**2
     rows = max(flat.row[0] - dark.row[0], 0.0) / signal**2
-    bands, blocks = math.sqrt(rows), flat.shading - sensor.black_dn
+    bands, blocks = math.sqrt(rows), flat.shading - captures.sensor.black_dn
     scores = {
         "flicker": Score(float(np.ptp(flat.frame_means.mean(axis=1))) / signal, 1.0, 2 * max(drift, noise / 4)),
         "bands": Score(bands, 1.0, (flat.row[1] / signal**2 / 2 / bands) ** 2 if rows else 0.0),
         "vignetting": Score(1 - float(blocks.min() / max(blocks.max(), 1.0)), 1.0, 8 * noise / flat.count),
     }
-    _check(frames, scores | _pixel_scores(flat), notes)
+    _check(captures, frames, scores | _pixel_scores(flat))
