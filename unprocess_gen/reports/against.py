@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from unprocess_gen.calibration.calibrate import Calibration, calibrate
 from unprocess_gen.calibration.captures import Sensor, read_captures
@@ -33,7 +33,6 @@ from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.plan import TwoNumberLevel
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.simulation.effects import profile_keys
-from unprocess_gen.simulation.plan import Physics
 
 EFFECT_OF_NUMBER = {key: effect.name for key, (effect, _) in profile_keys().items()} | {"b_dn2": "heteroscedastic"}
 """Effect of each number that is compared, by its name in the list of estimates."""
@@ -148,24 +147,21 @@ def _profile_numbers(config: Config, iso: float, celsius: float | None) -> dict[
     celsius = config.scene.temperature_c if celsius is None else celsius
     scene = dataclasses.replace(config.scene, iso=iso, exposure_s=1.0, temperature_c=celsius)
     config, middle = dataclasses.replace(config, scene=scene), [0.5] * DRAW_COUNT
-    if is_physical(config.noise):
-        profile = PhysicalNoise(config)
-        physics = profile.physics(profile.draw(middle, 0, 0))
-        return {name: _physical_number(config, name, physics) for name in EFFECT_OF_NUMBER if name != "b_dn2"}
-    a, b = TwoNumberLevel(config).two_numbers(middle)
-    two: dict[str, float | None] = {"dn_per_e": a, "b_dn2": b, "read_std_dn": None, "read_shape": None}
-    return {name: [two.get(name, 0.0)] * 5 for name in EFFECT_OF_NUMBER if name != "full_well_e"}
-
-
-def _physical_number(config: Config, name: str, physics: Physics) -> list[float | None]:
-    if getattr(config.effects, EFFECT_OF_NUMBER[name]) == "off":
-        return [0.0 if name != "full_well_e" else None] * 5
-    if name == "black_error_dn":
-        return [sum(physics.black_error_dn) / 4, *physics.black_error_dn]
-    if name == "read_shape" and physics.read_law == "gaussian":
-        return [NORMAL_SHAPE] * 5
-    value: Any = getattr(physics, name.removesuffix("_per_s"), getattr(config.noise, name, None))
-    if name == "dn_per_e":
-        colours = "GGGG" if config.sensor.pattern == "MONO" else config.sensor.pattern
-        return [value, *(value * physics.gain_by_colour["RGB".index(colour)] for colour in colours)]
-    return [value] * 5
+    numbers: dict[str, list[float | None]]
+    if not is_physical(config.noise):
+        a, b = TwoNumberLevel(config).two_numbers(middle)
+        numbers = {name: [0.0] * 5 for name in EFFECT_OF_NUMBER if name != "full_well_e"}
+        return numbers | {"dn_per_e": [a] * 5, "b_dn2": [b] * 5, "read_std_dn": [None] * 5, "read_shape": [None] * 5}
+    profile = PhysicalNoise(config)
+    physics = profile.physics(profile.draw(middle, 0, 0))
+    names = [name for name in EFFECT_OF_NUMBER if name != "b_dn2"]
+    values = (getattr(physics, name.removesuffix("_per_s"), getattr(config.noise, name, None)) for name in names)
+    numbers = {name: [value] * 5 for name, value in zip(names, values, strict=True)}
+    colours = "GGGG" if config.sensor.pattern == "MONO" else config.sensor.pattern
+    gains = (physics.dn_per_e * physics.gain_by_colour["RGB".index(colour)] for colour in colours)
+    numbers["dn_per_e"] = [physics.dn_per_e, *gains]
+    numbers["black_error_dn"] = [sum(physics.black_error_dn) / 4, *physics.black_error_dn]
+    if physics.read_law == "gaussian":
+        numbers["read_shape"] = [NORMAL_SHAPE] * 5
+    off = [name for name in names if getattr(config.effects, EFFECT_OF_NUMBER[name]) == "off"]
+    return numbers | {name: [None if name == "full_well_e" else 0.0] * 5 for name in off}

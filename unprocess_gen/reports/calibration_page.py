@@ -17,7 +17,7 @@ from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.pictures import figure_png, new_figure
-from unprocess_gen.reports.report_files import require_libraries, write_files
+from unprocess_gen.reports.report_files import require_libraries, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,7 @@ def write_page(calibration: Calibration, name: str, command: str, page: Path) ->
         against_iso=data_uri(_against_iso(calibration)) if len(calibration.isos) > 1 else "",
         table=PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4)),
     )
-    write_files(page.parent, {page.name: text.encode()})
+    write_file(page, text)
 
 
 # ------------------------------------------------------------------------------------------------------------- figures

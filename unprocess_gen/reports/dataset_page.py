@@ -29,7 +29,7 @@ from unprocess_gen.reports.noise_check.checks import Checker
 from unprocess_gen.reports.noise_check.repeat import measure_noise
 from unprocess_gen.reports.photon_transfer import NoiseFit, draw_fits, fit_noise
 from unprocess_gen.reports.pictures import picture_jpeg
-from unprocess_gen.reports.report_files import page_file, write_files
+from unprocess_gen.reports.report_files import page_file, write_file
 from unprocess_gen.reports.sheets import contact_sheet
 from unprocess_gen.sources.dark_frames import dark_folder
 from unprocess_gen.sources.names import encode_name
@@ -48,7 +48,7 @@ def write_dataset_report(
     DamageError if the dataset is not finished or was changed, or MachineError.
     """
     file = page_file(folder, to)
-    write_files(file.parent, {file.name: dataset_page(folder, source, dark_frames).encode()})
+    write_file(file, dataset_page(folder, source, dark_frames))
     return file
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.keys import image_key
+from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.row import COLUMNS
 
 FAILURES_LISTED, VALUES_LISTED = 50, 16
@@ -93,13 +93,13 @@ class ManifestStatistics:
 
 def read_statistics(rows: Iterable[Row]) -> ManifestStatistics:
     """Summarise the rows of a manifest."""
-    statistics, image = ManifestStatistics(), ""
-    for row in rows:
-        statistics.rows += 1
-        statistics.images += image_key(row) != image
-        image = image_key(row)
-        if row["status"] == "ok":
-            statistics.add(row)
-        elif row["status"] == "failed" and len(statistics.failed) < FAILURES_LISTED:
-            statistics.failed.append(row)
+    statistics = ManifestStatistics()
+    for image in group_by_image(rows):
+        statistics.images += 1
+        statistics.rows += len(image)
+        for row in image:
+            if row["status"] == "ok":
+                statistics.add(row)
+            elif row["status"] == "failed" and len(statistics.failed) < FAILURES_LISTED:
+                statistics.failed.append(row)
     return statistics

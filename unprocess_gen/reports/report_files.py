@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
@@ -42,9 +41,8 @@ def page_file(folder: AnyPath, to: Path | None = None) -> Path:
     return folder / REPORT
 
 
-def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
-    """Write files into a folder, replacing the files of an earlier report; MachineError if that fails."""
-    with machine_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            (out / name).write_bytes(content)
+def write_file(file: Path, content: bytes | str) -> None:
+    """Write a file and its folder, replacing the file of an earlier report; MachineError if that fails."""
+    with machine_errors(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content.encode() if isinstance(content, str) else content)

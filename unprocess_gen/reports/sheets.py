@@ -31,7 +31,7 @@ from unprocess_gen.pipeline.replay import PairRegenerator, places_of, source_of
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
-from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.reports.report_files import write_file
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.sources.patches import crop_patch
@@ -104,7 +104,8 @@ def write_sheets(
         drawn = {f"{key}.png": panels.lay_out(heading, _pair_panels(pair, window, panels.PANEL_PX), 3)}
         if with_stages and pair.source is not None:
             drawn[f"{key}.stages.png"] = panels.lay_out(heading, _stage_panels(pair, pair.source, window), 4)
-        write_files(to, {name: picture_png(sheet, **{MARK: mark}) for name, sheet in drawn.items()})
+        for name, sheet in drawn.items():
+            write_file(to / name, picture_png(sheet, **{MARK: mark}))
         yield SheetFiles(key, str(pair.row["source"]), tuple(to / name for name in drawn), pair.missing_source)
 
 

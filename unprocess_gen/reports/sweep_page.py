@@ -21,7 +21,7 @@ from unprocess_gen.reports.dataset_page import write_dataset_report
 from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.panels import STRIP_PX, byte_codes, common_stretch, detail_window
 from unprocess_gen.reports.pictures import picture_jpeg
-from unprocess_gen.reports.report_files import page_file, write_files
+from unprocess_gen.reports.report_files import page_file, write_file
 
 JPEG_QUALITY = 70
 
@@ -47,8 +47,8 @@ def write_sweep_page(
         row[job.get(across, "")] = _sweep_cell(folder / job["folder"], job, file.parent)
     values = list(dict.fromkeys(job.get(across, "") for job in jobs))
     title = f"Sweep {folder.absolute().name}"
-    content = render_page("sweep.html", title=title, down=down, across=across, values=values, rows=rows, jobs=jobs)
-    write_files(file.parent, {file.name: content.encode()})
+    page = render_page("sweep.html", title=title, down=down, across=across, values=values, rows=rows, jobs=jobs)
+    write_file(file, page)
     return file
 
 

@@ -35,7 +35,7 @@ from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports.formatting import counted
 from unprocess_gen.reports.pictures import picture_jpeg
-from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.reports.report_files import write_file
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.render import render_clean
@@ -176,7 +176,7 @@ def _written_pictures(source: SourceConfig, folder: Path) -> SourceConfig:
     """Write synthetic pictures as JPEG, so that runs read files."""
     for picture in list_photographs(source).sources[:RUN_FILES]:
         _, photograph = load_source(replace(source, downscale=1), picture)
-        write_files(folder / "photographs", {f"{picture.name}.jpg": picture_jpeg(photograph.srgb, 95)})
+        write_file(folder / "photographs" / f"{picture.name}.jpg", picture_jpeg(photograph.srgb, 95))
     return replace(source, root=str(folder / "photographs"), include=("*.jpg",), clips=False)
 
 

@@ -16,7 +16,7 @@ from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Measu
 from unprocess_gen.reports.formatting import percentage, short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.pictures import figure_png, new_figure
-from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.reports.report_files import write_file
 from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE
 
 REPORT_FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
@@ -61,8 +61,9 @@ def write_accuracy(report: AccuracyReport, out: Path) -> None:
         table=accuracy_table(report.rows),
         conditions=report.conditions,
     )
-    contents = csv_text(report.rows).encode(), picture, page.encode()
-    write_files(out, dict(zip(REPORT_FILES, contents, strict=True)))
+    contents: tuple[bytes | str, ...] = csv_text(report.rows), picture, page
+    for name, content in zip(REPORT_FILES, contents, strict=True):
+        write_file(out / name, content)
 
 
 def accuracy_table(rows: Sequence[Measurement]) -> PageTable:

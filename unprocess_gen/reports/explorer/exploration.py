@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
@@ -24,9 +25,10 @@ from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.source import NO_CLIP, Source
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import image_key, pair_key, patch_key
+from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.dataset.row import pair_row
-from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.pipeline.replay import places_of
 from unprocess_gen.reports.estimate import predicted_levels
@@ -100,9 +102,12 @@ class Exploration:
     @property
     def source_config(self) -> SourceConfig:
         """The settings of the sources; ConfigError for raw ones."""
-        config, _ = composed_config(self.overrides, self.folders)
+        return self._composed()[0].source
+
+    def _composed(self) -> tuple[Config, dict[str, str | None]]:
+        config, choices = composed_config(self.overrides, self.folders)
         require_photographs(config.source, "explore")
-        return config.source
+        return config, choices
 
     def add(self, overrides: Sequence[str]) -> None:
         """Apply overrides as the command line does."""
@@ -122,8 +127,7 @@ class Exploration:
 
     def shown(self) -> Shown:
         """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
-        config, choices = composed_config(self.overrides, self.folders)
-        require_photographs(config.source, "explore")
+        config, choices = self._composed()
         source, settings = listed_sources(config.source)[self.index], PairSettings.read(config)
         sha256, photograph = _loaded_source(config.source, source, config.output.layout)
         image = plan_pixels(settings, photograph, source, sha256)
@@ -214,13 +218,12 @@ def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Ex
 
 
 def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices:
-    rows = [row for row in select_rows(folder / "manifest.csv", keys) if keys or row["status"] == "ok"]
-    for row in rows:
-        if row["status"] != "ok":
-            raise ConfigError(f"--keys {keys}: {row['key']} has no pair ({row['reason']}); expected a row with a pair")
+    manifest = folder / "manifest.csv"
+    pairs = (row for row in read_rows(manifest) if row["status"] == "ok")
+    rows = list(islice(select_pairs(manifest, keys).rows.values() if keys else pairs, SOURCES_LISTED))
     if not rows:
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
-    return {f"{row['key']} {row['source']}": partial(_open_row, folder, row, start) for row in rows[:SOURCES_LISTED]}
+    return {f"{row['key']} {row['source']}": partial(_open_row, folder, row, start) for row in rows}
 
 
 def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:

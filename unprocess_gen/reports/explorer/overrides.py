@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import operator
+import re
 from collections.abc import Mapping
 from typing import Any
 
-from unprocess_gen.config.composition import compose_node, load_config, typed_config
+from unprocess_gen.config.composition import compose_node, load_config, quoted, typed_config
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import Config
@@ -15,6 +16,8 @@ from unprocess_gen.config.settings import all_settings
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import is_number
 
+WORDS_OF_HYDRA = ("null", "true", "false", "nan", "inf")
+"""Words that are no texts in overrides."""
 NAMED_GROUPS = ("camera", "noise", "scene")
 """Groups whose config contains the name of its option."""
 
@@ -50,5 +53,5 @@ def override_text(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ",".join(map(override_text, value)) + "]"
     text = str(value)
-    simple = text.replace("_", "").isalnum() and not text[0].isdigit() and text not in ("null", "true", "false")
-    return text if simple else "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    is_word = re.fullmatch(r"[A-Za-z_]\w*", text, re.ASCII) and text.lower() not in WORDS_OF_HYDRA
+    return text if is_word else quoted(text)
