@@ -79,7 +79,7 @@ HYDRA_FLAGS = (
 """Flags of Hydra, for the verbs that take settings."""
 
 
-class Place(NamedTuple):
+class Operand(NamedTuple):
     """The file or folder that a verb works on: its name in ``--help``, and what it must be."""
 
     metavar: str
@@ -96,7 +96,7 @@ class Verb(NamedTuple):
     name: str
     summary: str
     run: Callable[[Call], int]
-    place: Place | None = None
+    place: Operand | None = None
     flags: tuple[Flag, ...] = ()
     keys: Mapping[str, str] = MappingProxyType({})
     composes: bool = False
@@ -132,6 +132,14 @@ class Call(argparse.Namespace):
     place: LocalPath | ObjectPath | None
     settings: dict[str, str]
     overrides: list[str]
+
+    @property
+    def local_place(self) -> Path:
+        """The place of a verb that needs a local one; ConfigError for a URL."""
+        from unprocess_gen.core.paths import local_path
+
+        assert self.place is not None
+        return local_path(self.place, f"{self.verb.name}: {self.place} is in an object store; expected a local path")
 
 
 class _Parser(argparse.ArgumentParser):

@@ -16,16 +16,13 @@ from unprocess_gen.reports.formatting import counted, short_number
 def calibrate(call: Call) -> int:
     """Write a noise profile and the list of its estimates, from captures or from what DNG files state."""
     from unprocess_gen.calibration.profile import check_outputs
-    from unprocess_gen.core.paths import local_path
 
-    assert call.place is not None
-    folder = local_path(call.place, f"calibrate: {call.place} is in an object store; expected a local folder")
-    to, page = call.to, call.report
+    folder, to, page = call.local_place, call.to, call.report
     if call.origin and page is not None:
         raise ConfigError(f"calibrate: --report {page}: draws measured frames, not tags; leave it out")
     check_outputs(to)
     isos = _state(folder, to) if call.origin else _measure(folder, to, page)
-    print_results(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with {_usage(to)} scene.iso={isos[0]:g}")
+    print_results(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with scene.iso={isos[0]:g} {_usage(noise=to)}")
     return 0
 
 
@@ -74,36 +71,29 @@ def _report_notes(notes: Iterable[str]) -> None:
         report(f"calibrate: {note.removeprefix('calibrate: ')}")
 
 
-def _usage(to: Path) -> str:
-    """Return the settings with which a run uses the profile."""
-    if to.parent.name != "noise":
-        return f"noise={to.stem}, in a folder noise of --config-dir, and"
-    return f"--config-dir {shlex.quote(str(to.parent.parent))} noise={to.stem}"
+def _usage(**options: Path) -> str:
+    """Settings with which a run uses the option files of groups."""
+    chosen = " ".join(f"{group}={path.stem}" for group, path in options.items())
+    folders = {path.parent.parent if path.parent.name == group else None for group, path in options.items()}
+    if len(folders) > 1 or None in folders:
+        return f"{chosen}, in a folder {' and a folder '.join(options)} of --config-dir"
+    return f"--config-dir {shlex.quote(str(folders.pop()))} {chosen}"
 
 
 def camera(call: Call) -> int:
     """Write the options, and print what was read from which tag."""
     from unprocess_gen.core.files import machine_errors
-    from unprocess_gen.core.paths import LocalPath, local_path
+    from unprocess_gen.core.paths import LocalPath
     from unprocess_gen.sources.raw.options import camera_options, check_options
 
-    assert call.place is not None
-    file = local_path(call.place, f"camera: {call.place} is in an object store; expected a local file")
+    file, to, sensor = call.local_place, call.to, call.sensor
     if not file.is_file():
         raise ConfigError(f"camera {file}: no such file; expected a raw file")
-    to, sensor = call.to, call.sensor
     check_options(to, sensor)
     options, sources = camera_options(file, to.stem)
     paths = {"camera": to} | ({"sensor": sensor} if sensor else {})
     for group, path in paths.items():
         with machine_errors(path):
             LocalPath(path).write(options[group].encode(), str(path.parent))
-    chosen = " ".join(f"{group}={path.stem}" for group, path in paths.items())
-    print_results(*sources)
-    folder = to.parent.parent
-    if all(path.parent == folder / group for group, path in paths.items()):
-        usage = f"--config-dir {shlex.quote(str(folder))} {chosen}"
-    else:
-        usage = f"{chosen}, in a folder {' and a folder '.join(paths)} of --config-dir"
-    print_results(f"{to}: use it with {usage}")
+    print_results(*sources, f"{to}: use it with {_usage(**paths)}")
     return 0

@@ -1,15 +1,15 @@
-"""Compose the configs that a command line describes: one, or those of a sweep, each with what becomes of it."""
+"""Compose the configs that a command line describes, one or those of a sweep, and run them one after the other."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results, report_error
 from unprocess_gen.cli.signals import SIGNALS
-from unprocess_gen.cli.sweep import job_folder, named_overrides
+from unprocess_gen.cli.sweep import job_folder, named_overrides, worst, write_row
 from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.core.errors import ConfigError
 
@@ -19,25 +19,35 @@ if TYPE_CHECKING:
 
 
 class Job:
-    """A config to run; inside the context, an error of a job of a sweep becomes its exit code.
+    """A config to run, and its exit code.
 
-    ``row`` has the first cells of ``sweep.csv``; ``label`` is shown with the progress: ``3/20 camera=sony_a7r``.
+    ``row`` has the cells of ``sweep.csv``; ``label`` is shown with the progress: ``3/20 camera=sony_a7r``.
     """
 
     def __init__(self, config: Config, row: dict[str, str], sweep: Path | None = None) -> None:
         self.config, self.row, self.sweep = config, row, sweep
         self.label, self.code = "", 0
-        self.result: Any = None
 
-    def __enter__(self) -> None:
-        pass
 
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
-        # libraries may fail in their own way when they are interrupted
-        if self.sweep is None or not isinstance(error, Exception) or SIGNALS.received is not None:
-            return False
-        self.code = report_error(error, f"{self.row['folder']}: ")
-        return True
+def run_jobs(jobs: Sequence[Job], work: Callable[[Job], Iterable[object]], has_table: bool = False) -> int:
+    """Print the lines that ``work`` returns of each job; the worst exit code. In a sweep, an error is the job's own.
+
+    With ``has_table``, the row of a job is written before its lines, so that an error of stdout loses no row.
+    """
+    for job in jobs:
+        lines: Iterable[object] = ()
+        try:
+            lines = work(job)
+        except Exception as error:
+            # libraries may fail in their own way when they are interrupted
+            if job.sweep is None or SIGNALS.received is not None:
+                raise
+            job.code = report_error(error, f"{job.row['folder']}: ")
+            job.row["seconds"] = ""
+        if has_table and job.sweep is not None:
+            write_row(job.sweep, {**job.row, "exit": str(job.code)})
+        print_results(*lines)
+    return worst(job.code for job in jobs)
 
 
 def composed_jobs(call: Call) -> list[Job]:

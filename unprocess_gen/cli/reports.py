@@ -7,11 +7,11 @@ import shlex
 from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.jobs import composed_jobs, option_folders
+from unprocess_gen.cli.jobs import Job, composed_jobs, option_folders, run_jobs
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.messages import report as report_message
-from unprocess_gen.cli.places import dataset_folder, given_root, recorded_places
-from unprocess_gen.cli.sweep import swept_keys, worst
+from unprocess_gen.cli.places import dataset_folder, recorded_places
+from unprocess_gen.cli.sweep import swept_keys
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.reports.formatting import counted
@@ -23,16 +23,18 @@ def plan(call: Call) -> int:
     from unprocess_gen.reports.estimate import estimate_run
     from unprocess_gen.reports.plan_text import format_estimate, totals_line
 
-    jobs, text = composed_jobs(call), ""
-    for job in jobs:
-        with job:
-            job.result = estimate_run(job.config, effective_jobs(job.config.n_jobs, 10**6), call.all)
-            text = format_estimate(job.result, call.numbers)
-        if job.result is not None:
-            print_results(*([] if job is jobs[0] else [""]), f"out       {job.config.out}", text)
-    estimates = [job.result for job in jobs if job.sweep is not None and job.result is not None]
-    print_results(*([totals_line(estimates)] if estimates else []))
-    return worst(job.code for job in jobs)
+    jobs, estimates = composed_jobs(call), []
+
+    def explain(job: Job) -> list[str]:
+        estimate = estimate_run(job.config, effective_jobs(job.config.n_jobs, 10**6), call.all)
+        estimates.append(estimate)
+        text = format_estimate(estimate, call.numbers)
+        return [*([] if job is jobs[0] else [""]), f"out       {job.config.out}", text]
+
+    code = run_jobs(jobs, explain)
+    if estimates and jobs[0].sweep is not None:
+        print_results(totals_line(estimates))
+    return code
 
 
 def accuracy(call: Call) -> int:
@@ -47,19 +49,17 @@ def accuracy(call: Call) -> int:
         call.overrides.append("out=accuracy")
         call.words.append("out=accuracy")
     command = shlex.join(["gen-dataset", "accuracy", *call.words])
-    jobs = composed_jobs(call)
-    for job in jobs:
-        texts = []
-        with job:
-            config = job.config
-            require_photographs(config.source, "accuracy")
-            out = local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
-            check_report_folder(out, "accuracy")
-            measured = measure_accuracy(config, command)
-            write_accuracy(measured, out)
-            texts = [report_text(measured), f"{out}: {', '.join(REPORT_FILES)}"]
-        print_results(*texts)
-    return worst(job.code for job in jobs)
+
+    def measure(job: Job) -> list[str]:
+        config = job.config
+        require_photographs(config.source, "accuracy")
+        out = local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
+        check_report_folder(out, "accuracy")
+        measured = measure_accuracy(config, command)
+        write_accuracy(measured, out)
+        return [report_text(measured), f"{out}: {', '.join(REPORT_FILES)}"]
+
+    return run_jobs(composed_jobs(call), measure)
 
 
 def report(call: Call) -> int:
@@ -72,8 +72,8 @@ def report(call: Call) -> int:
     folder = dataset_folder(call, sweeps=True)
     if isinstance(folder, Path) and is_sweep(folder):
         return _report_sweep(folder, call)
-    root = given_root(call)
-    dark = recorded_places(folder, call).dark_frames
+    places = recorded_places(folder, call)
+    root, dark = places.root, places.dark_frames
     if "noise.dark_frames" in call.settings and dark is not None:
         dark_folder(dark)  # refuses a folder that the user names and that does not exist
     print_results(write_dataset_report(folder, call.to, None if root is None else any_path(root), dark))
@@ -98,15 +98,14 @@ def preview(call: Call) -> int:
     from unprocess_gen.reports.sheets import write_sheets
 
     folder = dataset_folder(call)
-    to, root, keys = call.to, given_root(call), call.keys or ""
+    to, root, keys = call.to, recorded_places(folder, call).root, call.keys or ""
     files = code = 0
     failed = select_pairs(folder / "manifest.csv", keys).failed if keys else 0
-    photographs = recorded_places(folder, call).root
-    _check_not_among_photographs(to, photographs)
+    _check_not_among_photographs(to, root)
     for sheet in write_sheets(folder, to, keys, None if root is None else any_path(root), call.stages):
         files += len(sheet.files)
         if sheet.missing_source:
-            code = SourceChangedError.exit_code if photographs is not None else code
+            code = SourceChangedError.exit_code if root is not None else code
             omitted = "the source's panel and the stages are" if call.stages else "the source's panel is"
             report_message(f"{sheet.key} ({sheet.source}): {omitted} omitted: {sheet.missing_source}")
     skipped = f"; {counted(failed, 'failed row')} skipped" if failed else ""

@@ -6,15 +6,16 @@ import itertools
 import os
 import re
 from collections.abc import Mapping
+from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
-from unprocess_gen.cli.jobs import Job, checked_jobs, composed_jobs
+from unprocess_gen.cli.jobs import Job, checked_jobs, composed_jobs, run_jobs
 from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.cli.places import dataset_folder, given_root, recorded_places
-from unprocess_gen.cli.sweep import result_cells, worst, write_row
+from unprocess_gen.cli.sweep import result_cells
 from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.reports.formatting import counted
@@ -22,7 +23,6 @@ from unprocess_gen.reports.formatting import counted
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from unprocess_gen.config.schema import Config
     from unprocess_gen.pipeline.generate import Summary
     from unprocess_gen.reports.builds import Build
 
@@ -36,15 +36,18 @@ DIFFERENCES_LISTED = 20
 
 def generate(call: Call, changes: Mapping[str, Any] | None = None) -> int:
     """Generate a dataset, or one for each combination of a sweep; ``changes`` are settings that differ."""
-    from unprocess_gen.config.schema import replaced
-    from unprocess_gen.pipeline import generate as pipeline
+    return run_jobs(composed_jobs(call), partial(_generate, changes=changes or {}), has_table=True)
 
-    jobs = composed_jobs(call)
-    for job in jobs:
-        with job:
-            job.result = pipeline.generate(replaced(job.config, changes or {}), job.label)
-        finish(job)
-    return worst(job.code for job in jobs)
+
+def _generate(job: Job, changes: Mapping[str, Any]) -> list[str]:
+    """Generate the dataset of a job; the lines to print about it."""
+    from unprocess_gen.config.schema import replaced
+    from unprocess_gen.pipeline.generate import generate
+
+    summary = generate(replaced(job.config, changes), job.label)
+    job.row |= result_cells(summary)
+    job.code, lines = outcome(summary, job.config.source.max_failed)
+    return lines
 
 
 def manifest(call: Call) -> int:
@@ -52,26 +55,12 @@ def manifest(call: Call) -> int:
     return generate(call, {"output.frames": False})
 
 
-def finish(job: Job, has_advice: bool = True) -> None:
-    """Write what became of a job to ``sweep.csv``, then print it, so that an error of stdout loses no row."""
-    lines: list[str] = []
-    if job.result is not None:
-        job.code, lines = outcome(job.config, job.result)
-    if job.sweep is not None:
-        cells = {"seconds": ""} if job.result is None else result_cells(job.result)
-        write_row(job.sweep, {**job.row, **cells, "exit": str(job.code)})
-    print_results(*(lines if has_advice else lines[:1]))
-
-
-def outcome(config: Config, summary: Summary) -> tuple[int, list[str]]:
+def outcome(summary: Summary, max_failed: int) -> tuple[int, list[str]]:
     """Exit code of a generated dataset, and the lines to print about it."""
     from unprocess_gen.sources.listing import unmatched_sentence
 
-    lines = [summary.sentence(config.source.max_failed)]
-    if summary.unmatched:
-        lines.append(unmatched_sentence(summary.unmatched))
-    too_many = sum(summary.failed.values()) > config.source.max_failed
-    return TOO_MANY_FAILED if too_many else DONE, lines
+    lines = [summary.sentence(max_failed), unmatched_sentence(summary.unmatched)]
+    return TOO_MANY_FAILED if sum(summary.failed.values()) > max_failed else DONE, list(filter(None, lines))
 
 
 def part(call: Call) -> int:
@@ -79,18 +68,16 @@ def part(call: Call) -> int:
     from unprocess_gen.pipeline.generate import make_part
 
     number, parts = _part(str(call.place or ""))
-    jobs = composed_jobs(call)
-    for job in jobs:
-        out, texts = job.config.out, []
-        with job:
-            if (made := make_part(job.config, number, parts, job.label)) is None:
-                texts = [f"{out} is complete; nothing to do"]
-            else:
-                shards = counted(made.done + made.shards, "shard")
-                made_now = f"{made.shards} of them ({counted(made.rows, 'row')}) in this run"
-                texts = [f"{out}: part {number} of {parts}: {shards} committed, {made_now}"]
-        print_results(*texts)
-    return worst(job.code for job in jobs)
+
+    def make(job: Job) -> list[str]:
+        out = job.config.out
+        if (made := make_part(job.config, number, parts, job.label)) is None:
+            return [f"{out} is complete; nothing to do"]
+        shards = counted(made.done + made.shards, "shard")
+        made_now = f"{made.shards} of them ({counted(made.rows, 'row')}) in this run"
+        return [f"{out}: part {number} of {parts}: {shards} committed, {made_now}"]
+
+    return run_jobs(composed_jobs(call), make)
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -108,9 +95,9 @@ def merge(call: Call) -> int:
     """Write manifest and ``dataset.json`` of a run whose parts are done."""
     from unprocess_gen.pipeline.generate import merge
 
-    summary, max_failed = merge(str(call.place))
-    print_results(summary.sentence(max_failed))
-    return TOO_MANY_FAILED if sum(summary.failed.values()) > max_failed else DONE
+    code, lines = outcome(*merge(str(call.place)))
+    print_results(*lines)
+    return code
 
 
 def again(call: Call) -> int:
@@ -130,7 +117,7 @@ def again(call: Call) -> int:
     changes = {key: attrgetter(key)(given) for key in {"executor", *call.settings} - places}
     changes["noise.dark_frames"] = recorded_places(folder, call).dark_frames
     config = recorded_config(folder, given_root(call), changes)
-    code, lines = outcome(config, generate(config))
+    code, lines = outcome(generate(config), config.source.max_failed)
     print_results(*lines)
     print_results(compare(folder, any_path(config.out)))
     return code
@@ -167,13 +154,7 @@ def build(call: Call) -> int:
 def make_build(build: Build, folder: Path, n_jobs: str = "-1") -> int:
     """Generate a build; the worst exit code. Folders of a sweep have the names of their swept settings."""
     from unprocess_gen.config.composition import compose_jobs
-    from unprocess_gen.pipeline.generate import generate
 
     settings = [*build.overrides(folder, build.photographs_folder()), f"n_jobs={n_jobs}"]
     composed = compose_jobs(settings, OptionFolders(), multirun=bool(build.recipe.sweep))
-    jobs = checked_jobs(composed, only_swept=True)
-    for job in jobs:
-        with job:
-            job.result = generate(job.config, job.label)
-        finish(job, has_advice=False)
-    return worst(job.code for job in jobs)
+    return run_jobs(checked_jobs(composed, only_swept=True), lambda job: _generate(job, {})[:1], has_table=True)

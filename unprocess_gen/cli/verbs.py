@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from unprocess_gen.cli import cameras, checks, reports, runs
-from unprocess_gen.cli.arguments import Place, Verb, count, flag, local, switch
+from unprocess_gen.cli.arguments import Operand, Verb, count, flag, local, switch
 
-DATASET = Place("DIR", "the folder of a dataset")
-ANY_DATASET = Place("DIR", "the folder of a dataset or of a sweep")
-BEGUN = Place("OUT", "the folder of a run in parts")
+DATASET = Operand("DIR", "the folder of a dataset")
+ANY_DATASET = Operand("DIR", "the folder of a dataset or of a sweep")
+BEGUN = Operand("OUT", "the folder of a run in parts")
 N_JOBS = {"n_jobs=N": "number of worker processes; -1: all cores"}
 SOURCE = {"source.root=ROOT": "folder of the photographs; by default the one recorded in dataset.json"}
 INPUTS = SOURCE | {"noise.dark_frames=FOLDER": "folder of the dark frames, if it is not the recorded one"}
@@ -23,7 +23,7 @@ _VERBS = (
         "part",
         "generate part K (from 0) of N of a dataset, for separate jobs; merge finishes it",
         runs.part,
-        Place("K/N", "part K (from 0) of N; or /N in a job of an array"),
+        Operand("K/N", "part K (from 0) of N; or /N in a job of an array"),
         composes=True,
     ),
     Verb("merge", "write manifest.csv and dataset.json when all parts are finished", runs.merge, BEGUN),
@@ -55,7 +55,7 @@ _VERBS = (
         "replay",
         "regenerate rows and compare them, or write their arrays",
         checks.replay,
-        Place("MANIFEST", "a manifest.csv, or the folder of a dataset"),
+        Operand("MANIFEST", "a manifest.csv, or the folder of a dataset"),
         (KEYS, flag("--to", "FOLDER", "write the arrays to FOLDER", local)),
         INPUTS,
     ),
@@ -71,7 +71,7 @@ _VERBS = (
         "explore",
         "try settings on a photograph or a row, in a page of the browser on this machine",
         reports.explore,
-        Place("PHOTO", "a photograph, a folder of photographs, or a dataset", optional=True),
+        Operand("PHOTO", "a photograph, a folder of photographs, or a dataset", optional=True),
         (
             KEYS,
             flag("--port", "N", "number of the port on 127.0.0.1; default: a free one", count, default=0),
@@ -123,7 +123,7 @@ _VERBS = (
         "build",
         "make a benchmark build and compare every byte with its recorded digests",
         runs.build,
-        Place("NAME", "the name of a build", optional=True),
+        Operand("NAME", "the name of a build", optional=True),
         (flag("--to", "DIR", "write the build to DIR", local), switch("--list", "list all builds")),
         N_JOBS,
     ),
@@ -131,7 +131,7 @@ _VERBS = (
         "calibrate",
         "measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile",
         cameras.calibrate,
-        Place("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
+        Operand("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
         (
             flag("--to", "FILE", "write the profile to FILE.yaml, and estimates to FILE.json", local, required=True),
             flag("--report", "PAGE", "draw curves, histograms and maps in PAGE (HTML)", local),
@@ -142,7 +142,7 @@ _VERBS = (
         "camera",
         "write a camera option, and a sensor option, from one raw file",
         cameras.camera,
-        Place("FILE", "the raw file: a DNG, or another one that LibRaw reads"),
+        Operand("FILE", "the raw file: a DNG, or another one that LibRaw reads"),
         (
             flag("--to", "CAMERA", "write the matrix of the camera to CAMERA.yaml", local, required=True),
             flag("--sensor", "SENSOR", "write pattern, bits and levels to SENSOR.yaml", local),
