@@ -16,8 +16,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from unprocess_gen.reports.accuracy.measure import STAGES, Measurement
-from unprocess_gen.reports.accuracy.report import accuracy_table
+from unprocess_gen.reports.accuracy_page import accuracy_table
+from unprocess_gen.reports.tier_costs import STAGES, Measurement
 
 HERE = Path(__file__).parent
 ERRORS, TIMES = (HERE.parent / "docs" / name for name in ("accuracy.md", "performance.md"))

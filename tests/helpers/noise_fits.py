@@ -7,7 +7,7 @@ from pathlib import Path
 from unprocess_gen import RawPairs
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.reports.noise_check.repeat import measure_noise
+from unprocess_gen.reports.noise_check.repetition import measure_noise
 from unprocess_gen.reports.photon_transfer import NoiseFit, fit_noise
 
 

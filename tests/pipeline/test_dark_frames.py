@@ -23,8 +23,8 @@ from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_pairs
-from unprocess_gen.reports.noise_check.checks import Checker
-from unprocess_gen.reports.noise_check.repeat import measure_noise
+from unprocess_gen.reports.noise_check.alarms import Checker
+from unprocess_gen.reports.noise_check.repetition import measure_noise
 from unprocess_gen.simulation.facts import DarkFrames
 from unprocess_gen.sources.dark_frames import open_dark_frames
 

@@ -19,8 +19,8 @@ from unprocess_gen import RawPairs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.reports.accuracy import measure, report
-from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
+from unprocess_gen.reports import accuracy_page, tier_costs
+from unprocess_gen.reports.tier_costs import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
 from unprocess_gen.simulation.kernels.render import uses_float32
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE, TIERS
@@ -30,7 +30,7 @@ from unprocess_gen.sources.listing import list_photographs
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measure, "ROUNDS", 2)
+    monkeypatch.setattr(tier_costs, "ROUNDS", 2)
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_every_stage_of_every_tier_has_time_and_error(
 ) -> None:
     root = fill(folder.parent / "photos", 3)
     (root / "000.png").write_bytes(b"")  # is ignored
-    measured = measure.measure_accuracy(settings(*overrides, f"source.root={root}"), "gen-dataset accuracy")
+    measured = tier_costs.measure_accuracy(settings(*overrides, f"source.root={root}"), "gen-dataset accuracy")
 
     assert [(row.tier, row.stage) for row in measured.rows] == [(tier, stage) for tier in TIERS for stage in STAGES]
     for tier in TIERS:
@@ -101,12 +101,12 @@ def test_every_stage_of_every_tier_has_time_and_error(
 
 def test_errors_are_those_of_the_frames_in_dn_and_in_standard_deviations(settings: Settings, tmp_path: Path) -> None:
     config = settings("source.limit=1", "sensor=generic_14bit")
-    inputs = measure.select_inputs(config, tmp_path)
-    images = [measure.plan_samples(config, tier, inputs) for tier in (FAST, REFERENCE)]
+    inputs = tier_costs.select_inputs(config, tmp_path)
+    images = [tier_costs.plan_samples(config, tier, inputs) for tier in (FAST, REFERENCE)]
     (pair,), (exact,) = ([next(image.pairs())[2] for image in planned] for planned in images)
     plan = images[1][0].plans[0]
     std = np.sqrt(noise_variance(exact.clean.astype(float), plan) + 1 / 12)
-    errors = measure.deviations([pair], [exact], [plan])
+    errors = tier_costs.deviations([pair], [exact], [plan])
     for stage, ours, theirs in (("clean", pair.clean, exact.clean), ("run", pair.noisy, exact.noisy)):
         error, apart = errors[stage], ours.astype(float) - theirs
         in_std = apart / std
@@ -119,18 +119,18 @@ def test_runs_have_the_bytes_of_generate(
     folder: Path, photos: Path, settings: Settings, make: Make, tree_hash: TreeHash, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[str] = []
-    true = measure.generate
+    true = tier_costs.generate
 
     def generate(config: Config) -> Any:
         summary = true(config)
         made.append(tree_hash(Path(config.out)))
         return summary
 
-    monkeypatch.setattr(measure, "generate", generate)
-    monkeypatch.setattr(measure, "RUN_FILES", 2)
+    monkeypatch.setattr(tier_costs, "generate", generate)
+    monkeypatch.setattr(tier_costs, "RUN_FILES", 2)
     config = settings(f"source.root={photos}", "noise.levels=2")
-    inputs = measure.select_inputs(config, folder)
-    times = measure.time_run(config, inputs, FAST, folder / "dataset")
+    inputs = tier_costs.select_inputs(config, folder)
+    times = tier_costs.time_run(config, inputs, FAST, folder / "dataset")
     make(photos, folder / "ds", "accuracy=fast", "noise.levels=2", f"source.limit={inputs.source.limit}")
 
     assert inputs.count == 2
@@ -142,25 +142,25 @@ def test_runs_have_the_bytes_of_generate(
 
 
 def test_ended_measurement_leaves_nothing(folder: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    level = measure.LOGGER.level
+    level = tier_costs.LOGGER.level
 
     def generate(config: Config) -> Any:
         Path(config.out).mkdir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(measure, "generate", generate)
+    monkeypatch.setattr(tier_costs, "generate", generate)
     with pytest.raises(KeyboardInterrupt):
-        measure.measure_accuracy(settings("source.limit=1"))
+        tier_costs.measure_accuracy(settings("source.limit=1"))
 
     assert list(folder.iterdir()) == []
-    assert measure.LOGGER.level == level
+    assert tier_costs.LOGGER.level == level
     folder.rmdir()
     with pytest.raises(MachineError, match=r"set TMPDIR to a folder with space"):
-        measure.measure_accuracy(settings())
+        tier_costs.measure_accuracy(settings())
 
 
 def test_built_in_scenes_are_read_from_files(settings: Settings, tmp_path: Path) -> None:
-    inputs = measure.select_inputs(settings("source.limit=2", "source.downscale=2"), tmp_path)
+    inputs = tier_costs.select_inputs(settings("source.limit=2", "source.downscale=2"), tmp_path)
     assert [source.path[-4:] for source in list_photographs(inputs.source).sources] == [".jpg"] * 2
 
 
@@ -176,22 +176,22 @@ def test_photographs_end_with_enough_pixels(
         (10**6, (), 8),
         (6 * (13 * 17 + 14 * 18), ("noise.levels=3", "noise.draws=2"), 2),
     ):
-        monkeypatch.setattr(measure, "RUN_PIXELS", pixels)
-        inputs = measure.select_inputs(settings(f"source.root={root}", *overrides), tmp_path)
+        monkeypatch.setattr(tier_costs, "RUN_PIXELS", pixels)
+        inputs = tier_costs.select_inputs(settings(f"source.root={root}", *overrides), tmp_path)
         assert (inputs.count, inputs.source.limit) == (count, count + 1)
     with pytest.raises(ConfigError, match=r"none of 1 photographs can be read"):
-        measure.select_inputs(settings(f"source.root={root}", "source.limit=1"), tmp_path)
+        tier_costs.select_inputs(settings(f"source.root={root}", "source.limit=1"), tmp_path)
 
 
 @pytest.mark.parametrize(("pixels", "runs"), [(24_000_000, 1), (24_000_001, 0)])
 def test_reference_runs_once_on_few_pixels_and_stages_count_with_their_shortest_time(
     pixels: int, runs: int, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(measure, "time_run", lambda *_: RunTimes(1.0, 4.0, 4.0))
+    monkeypatch.setattr(tier_costs, "time_run", lambda *_: RunTimes(1.0, 4.0, 4.0))
     config = settings()
-    times = measure.measure_runs(config, Inputs(config.source, 1, pixels, ()), Path())
+    times = tier_costs.measure_runs(config, Inputs(config.source, 1, pixels, ()), Path())
     assert {tier: len(of_tier) for tier, of_tier in times.items()} == {REFERENCE: runs, EXACT: 2, FAST: 2}
-    stages = measure.stages_ns([*times[EXACT], RunTimes(2.0, 2.0, 1.0)], clean_share=0.25)
+    stages = tier_costs.stages_ns([*times[EXACT], RunTimes(2.0, 2.0, 1.0)], clean_share=0.25)
     assert stages == {"decode": 1, "clean": 0.5, "noise": 1.5, "write": 1, "run": 4}
 
 
@@ -220,11 +220,11 @@ MOVES = "moves 2 % of the noisy DN by at most 2 DN or 0.3 standard deviations of
     ],
 )  # fmt: skip
 def test_conclusion_is_true_for_any_result(given: AccuracyReport, fast: str, reference: str) -> None:
-    assert report.conclude(given) == (
+    assert accuracy_page.conclude(given) == (
         "In a complete run of 2 photographs (5.2 megapixels) with noise=imx385_iso3200, "
         f"fast takes {fast} and {MOVES}; reference {reference} and changes no DN."
     )
-    picture = cv2.imdecode(np.frombuffer(report.accuracy_figure(given.rows), np.uint8), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(np.frombuffer(accuracy_page.accuracy_figure(given.rows), np.uint8), cv2.IMREAD_COLOR)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
 
 
@@ -235,7 +235,7 @@ def test_accuracy_writes_three_files_and_prints_the_table(run_main: RunMain, tmp
     done = run_main("accuracy", f"source.root={fill(tmp_path / 'photos', 2)}", "out=new/report")
 
     assert done.code == 0
-    assert sorted(path.name for path in written.iterdir()) == sorted(report.REPORT_FILES)
+    assert sorted(path.name for path in written.iterdir()) == sorted(accuracy_page.REPORT_FILES)
     lines = list(csv.DictReader((written / "accuracy.csv").read_text().splitlines()))
     assert list(lines[0]) == [
         *("tier", "stage", "ns_per_pixel", "ratio_to_exact", "changed_share", "max_dn", "rms_dn", "max_std", "rms_std")

@@ -29,7 +29,7 @@ from unprocess_gen import RawPairs
 from unprocess_gen.dataset.dataset_json import read_dataset
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import verify
-from unprocess_gen.reports import formatting, html_pages
+from unprocess_gen.reports import formatting, pages
 from unprocess_gen.reports.dataset_page import dataset_page
 
 HOSTILE = "<img src=x onerror=alert('&amp;')>\".png"
@@ -76,7 +76,7 @@ def cells(folder: Path, column: str) -> list[str]:
 
 @pytest.mark.parametrize("sign", ["\x1b", "\u202e", "\udcff"])
 def test_invisible_characters_are_shown_as_escapes(sign: str) -> None:
-    page = html_pages.render_page("base.html", title=f"a{sign}b")
+    page = pages.render_page("base.html", title=f"a{sign}b")
     assert sign not in page
     assert f"<h1>a{sign.encode('unicode_escape').decode()}b</h1>" in page
 
@@ -161,7 +161,7 @@ def test_noise_that_differs_from_the_manifest_is_reported(
     scenes: Path, scenes_page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "All agree with the manifest." in scenes_page
-    monkeypatch.setattr("unprocess_gen.reports.noise_check.checks.alarm_limit", lambda scores: 0.0)
+    monkeypatch.setattr("unprocess_gen.reports.noise_check.alarms.alarm_limit", lambda scores: 0.0)
     assert "The noise of 2 of them differs from the manifest: noise of 00000000: " in dataset_page(scenes)
 
 

@@ -27,8 +27,8 @@ from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.row import plan_from_row
-from unprocess_gen.reports.noise_check import repeat
-from unprocess_gen.reports.noise_check.checks import (
+from unprocess_gen.reports.noise_check import repetition
+from unprocess_gen.reports.noise_check.alarms import (
     LEAST_SITES,
     PAIRS_LISTED,
     TESTS,
@@ -38,7 +38,7 @@ from unprocess_gen.reports.noise_check.checks import (
     check_pairs,
     failed_checks,
 )
-from unprocess_gen.reports.noise_check.scores import Scores, scores_of
+from unprocess_gen.reports.noise_check.pair_scores import Scores, scores_of
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources import synthetic
 
@@ -91,7 +91,7 @@ def untouched(pair: NoisyPair) -> Frame:
 
 def scores_of_pair(clean: Frame, noisy: Frame, row: Row) -> Scores:
     """Scores of a pair that has enough sites."""
-    noise = repeat.measure_noise(clean, noisy, row)
+    noise = repetition.measure_noise(clean, noisy, row)
     return scores_of(noise)[0] if noise is not None and np.count_nonzero(noise.weight) >= LEAST_SITES else {}
 
 
@@ -277,7 +277,7 @@ def test_planted_faults_are_found_in_95_percent_of_runs(
     name: str, settings: Settings, figure: Figure, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs, count, side = 20, 12, 512
-    monkeypatch.setattr(repeat, "_repetition", kept(repeat._repetition))
+    monkeypatch.setattr(repetition, "_repetition", kept(repetition._repetition))
     in_runs: Counter[str] = Counter()
     faults = {"default": SITE_FAULTS, LONG: SITE_FAULTS | NO_HOT_PIXELS}.get(name, FAULTS)
     for run in range(runs):
@@ -321,7 +321,7 @@ def repetitions(pairs: Iterable[Any], **numbers: int) -> list[Alarm]:
     checker = Checker(len(pairs))
     for n, (clean, noisy, row) in enumerate(pairs):
         renumbered = {**row, **{name: first + n for name, first in numbers.items()}}
-        checker.add(repeat.measure_noise(clean, noisy, renumbered))
+        checker.add(repetition.measure_noise(clean, noisy, renumbered))
     return [alarm for alarm in checker.alarms if alarm.check == "repetition"]
 
 

@@ -24,7 +24,7 @@ from unprocess_gen.calibration.planes import plane_names
 from unprocess_gen.calibration.shape import NORMAL_SHAPE
 from unprocess_gen.config.limits import NAME
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import machine_errors
+from unprocess_gen.core.files import write_file
 from unprocess_gen.core.libraries import require
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.simulation.reference.cfa import MONO
@@ -60,9 +60,8 @@ def check_outputs(to: Path) -> None:
 
 def write_profile(to: Path, profile: str, listed: str) -> None:
     """Write the text of a profile, and of a list of estimates next to it."""
-    for path, text in {to: profile, to.with_suffix(".json"): listed}.items():
-        with machine_errors(path):
-            path.write_text(text, encoding="utf-8")
+    write_file(to, profile)
+    write_file(to.with_suffix(".json"), listed)
 
 
 # ----------------------------------------------------------------------------------------------------------- estimates

@@ -98,7 +98,7 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; what does not fit."""
     from unprocess_gen.dataset.reader import RawPairs
     from unprocess_gen.pipeline.progress import with_bar
-    from unprocess_gen.reports.noise_check.checks import check_pairs
+    from unprocess_gen.reports.noise_check.alarms import check_pairs
     from unprocess_gen.sources.dark_frames import dark_folder
 
     dark_frames = recorded_places(folder, call).dark_frames

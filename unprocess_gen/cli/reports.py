@@ -41,9 +41,9 @@ def accuracy(call: Call) -> int:
     """Measure error and time of every tier, stage by stage, and write a report, never into a dataset."""
     from unprocess_gen.config.raw_validation import require_photographs
     from unprocess_gen.core.paths import local_path
-    from unprocess_gen.reports.accuracy.measure import measure_accuracy
-    from unprocess_gen.reports.accuracy.report import REPORT_FILES, report_text, write_accuracy
-    from unprocess_gen.reports.report_files import check_report_folder
+    from unprocess_gen.reports.accuracy_page import REPORT_FILES, report_text, write_accuracy
+    from unprocess_gen.reports.pages import check_report_folder
+    from unprocess_gen.reports.tier_costs import measure_accuracy
 
     if not any(override.startswith("out=") for override in call.overrides):
         call.overrides.append("out=accuracy")

@@ -67,6 +67,13 @@ def machine_errors(path: Path | ObjectPath, advice: str = "") -> Iterator[None]:
         raise machine_error(error, path, advice) from error
 
 
+def write_file(file: Path, content: bytes | str) -> None:
+    """Write a file and its folder, or replace it; MachineError if that fails."""
+    with machine_errors(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def free_bytes(path: Path) -> int:
     """Bytes that are free for an unprivileged user on the disk of a path, or of its nearest parent that exists."""
     path = Path(os.path.abspath(path))

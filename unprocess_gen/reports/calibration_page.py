@@ -13,11 +13,11 @@ from unprocess_gen.calibration.iso_results import IsoResult
 from unprocess_gen.calibration.profile import AGAINST_ISO, ENDS, estimates, site_names
 from unprocess_gen.calibration.shape import probabilities
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import write_file
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.reports.formatting import short_number
-from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
+from unprocess_gen.reports.pages import PageTable, data_uri, render_page, require_libraries
 from unprocess_gen.reports.pictures import figure_png, new_figure
-from unprocess_gen.reports.report_files import require_libraries, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,6 +12,7 @@ from typing import Any
 
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
+from unprocess_gen.core.files import write_file
 from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.dataset.columns import Row
@@ -23,13 +24,12 @@ from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.verify import check_files
 from unprocess_gen.reports.formatting import byte_size, short_number
-from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.manifest_statistics import MEANINGS, SITE_COLUMNS, read_statistics, values_text
-from unprocess_gen.reports.noise_check.checks import Checker
-from unprocess_gen.reports.noise_check.repeat import measure_noise
+from unprocess_gen.reports.noise_check.alarms import Checker
+from unprocess_gen.reports.noise_check.repetition import measure_noise
+from unprocess_gen.reports.pages import data_uri, page_file, render_page
 from unprocess_gen.reports.photon_transfer import NoiseFit, draw_fits, fit_noise
 from unprocess_gen.reports.pictures import picture_jpeg
-from unprocess_gen.reports.report_files import page_file, write_file
 from unprocess_gen.reports.sheets import contact_sheet
 from unprocess_gen.sources.dark_frames import dark_folder
 from unprocess_gen.sources.names import encode_name

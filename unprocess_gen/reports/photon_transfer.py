@@ -8,8 +8,8 @@ import numpy as np
 
 from unprocess_gen.calibration.deviations import NORMAL_95, influence
 from unprocess_gen.core.arrays import Float
-from unprocess_gen.reports.noise_check.repeat import Noise
-from unprocess_gen.reports.noise_check.scores import Bins, residual_of
+from unprocess_gen.reports.noise_check.pair_scores import Bins, residual_of
+from unprocess_gen.reports.noise_check.repetition import Noise
 from unprocess_gen.reports.pictures import figure_png, new_figure
 
 LEAST_SITES_OF_POINT = 16

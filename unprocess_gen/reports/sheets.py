@@ -18,7 +18,7 @@ import numpy as np
 
 from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError
-from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.files import file_sha256, write_file
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
@@ -31,7 +31,6 @@ from unprocess_gen.pipeline.replay import PairRegenerator, places_of, source_of
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
-from unprocess_gen.reports.report_files import write_file
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.sources.patches import crop_patch

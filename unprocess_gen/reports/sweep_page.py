@@ -14,14 +14,14 @@ from urllib.parse import quote
 import numpy as np
 
 from unprocess_gen.core.errors import UnprocessGenError
+from unprocess_gen.core.files import write_file
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.dataset_page import write_dataset_report
-from unprocess_gen.reports.html_pages import data_uri, render_page
+from unprocess_gen.reports.pages import data_uri, page_file, render_page
 from unprocess_gen.reports.panels import STRIP_PX, byte_codes, common_stretch, detail_window
 from unprocess_gen.reports.pictures import picture_jpeg
-from unprocess_gen.reports.report_files import page_file, write_file
 
 JPEG_QUALITY = 70
 

@@ -32,8 +32,8 @@ from unprocess_gen.core.fields import Choice
 from unprocess_gen.reports.explorer import views
 from unprocess_gen.reports.explorer.exploration import Choices, Shown
 from unprocess_gen.reports.explorer.overrides import override_text
-from unprocess_gen.reports.html_pages import page_template, render_macro, render_page
 from unprocess_gen.reports.manifest_statistics import MEANINGS, SITE_COLUMNS
+from unprocess_gen.reports.pages import page_template, render_macro, render_page
 from unprocess_gen.reports.photon_transfer import NoiseFit
 from unprocess_gen.simulation.effects import EFFECTS
 from unprocess_gen.simulation.plan import Plan

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.arrays import PACKED, Float
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.explorer.exploration import Shown
-from unprocess_gen.reports.noise_check.repeat import measure_noise
+from unprocess_gen.reports.noise_check.repetition import measure_noise
 from unprocess_gen.reports.photon_transfer import NoiseFit, fit_noise
 from unprocess_gen.simulation.reference import unprocess
 

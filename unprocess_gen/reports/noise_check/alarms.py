@@ -16,8 +16,8 @@ import numpy as np
 
 from unprocess_gen.calibration.deviations import Score, alarm_limit
 from unprocess_gen.dataset.reader import Sample
-from unprocess_gen.reports.noise_check.repeat import Noise, measure_noise
-from unprocess_gen.reports.noise_check.scores import Residual, Scores, scores_of
+from unprocess_gen.reports.noise_check.pair_scores import Residual, Scores, scores_of
+from unprocess_gen.reports.noise_check.repetition import Noise, measure_noise
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.plan import Plan
 

@@ -1,4 +1,4 @@
-"""Render the HTML pages of reports from the Jinja2 templates in ``templates/``.
+"""Render the HTML pages of reports from the Jinja2 templates in ``templates/``, and check where they are written.
 
 A page is one file without scripts that opens offline. Autoescaping is on, so a file name cannot become markup, and
 characters that are invisible or reverse the text around them are shown as escapes.
@@ -7,10 +7,18 @@ characters that are invisible or reverse the text around them are shown as escap
 from __future__ import annotations
 
 import base64
+import os
 import re
 from collections.abc import Collection, Sequence
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.libraries import require
+from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_file, check_output_folder
+from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.pipeline.folder import REPORT
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
@@ -70,3 +78,34 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+
+
+# --------------------------------------------------------------------------------------------------------------- files
+
+
+def require_libraries(verb: str) -> None:
+    """Raise ConfigError if an optional library of a verb that writes a page is missing; it names the extra."""
+    for name in ("matplotlib", "jinja2"):
+        require(name, f"{verb}: pages need {name}", "figures")
+
+
+def check_report_folder(out: Path, verb: str) -> None:
+    """Check, before any work, that a report can be written to a folder, which need not exist, outside of datasets."""
+    require_libraries(verb)
+    if name := next((name for name in DATASET_ENTRIES if (out / name).exists()), None):
+        raise ConfigError(f"out={out}: contains a dataset ({name}); expected a folder without one; choose another out")
+    check_output_folder(out, f"out={out}")
+
+
+def page_file(folder: AnyPath, to: Path | None = None) -> Path:
+    """The file for a page: ``report.html`` in the folder, or ``to``; ConfigError if it cannot be written."""
+    require_libraries("report")
+    if to is not None:
+        if not (isinstance(folder, Path) and to.resolve() == (folder / REPORT).resolve()):
+            check_output_file(to, f"--to {to}", "an HTML page", b"<!doctype html", b"<html")
+        return to
+    if not isinstance(folder, Path):
+        raise ConfigError(f"report: {folder} is in an object store; expected a local file; give --to FILE")
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"report: {folder} is read-only; expected a file that can be written; give --to FILE")
+    return folder / REPORT

@@ -14,7 +14,7 @@ import numpy as np
 from unprocess_gen.calibration.deviations import Score
 from unprocess_gen.calibration.planes import NEIGHBOURS, TILE, plane_names
 from unprocess_gen.core.arrays import Float
-from unprocess_gen.reports.noise_check.repeat import Noise, Single
+from unprocess_gen.reports.noise_check.repetition import Noise, Single
 
 SHARED_ROUNDING = 0.15
 """Fraction of the rounding error that all clean values of a frame share."""

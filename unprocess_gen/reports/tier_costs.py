@@ -28,14 +28,13 @@ from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.core.arrays import MOSAIC, Float
 from unprocess_gen.core.errors import ConfigError, SourceError
-from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.files import machine_error, write_file
 from unprocess_gen.core.source import Source
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports.formatting import counted
 from unprocess_gen.reports.pictures import picture_jpeg
-from unprocess_gen.reports.report_files import write_file
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.render import render_clean

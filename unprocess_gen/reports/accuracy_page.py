@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from unprocess_gen.reports.accuracy.measure import STAGES, AccuracyReport, Measurement
+from unprocess_gen.core.files import write_file
 from unprocess_gen.reports.formatting import percentage, short_number
-from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
+from unprocess_gen.reports.pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.pictures import figure_png, new_figure
-from unprocess_gen.reports.report_files import write_file
+from unprocess_gen.reports.tier_costs import STAGES, AccuracyReport, Measurement
 from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE
 
 REPORT_FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")

@@ -1,1 +1,0 @@
-"""Measure what accuracy costs in time."""
