@@ -20,7 +20,7 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports import accuracy_page, tier_costs
-from unprocess_gen.reports.tier_costs import STAGES, AccuracyReport, Inputs, Measurement, RunTimes
+from unprocess_gen.reports.tier_costs import STAGES, AccuracyReport, Measurement
 from unprocess_gen.simulation.kernels.render import uses_float32
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.plan import EXACT, FAST, REFERENCE, TIERS
@@ -181,18 +181,6 @@ def test_photographs_end_with_enough_pixels(
         assert (inputs.count, inputs.source.limit) == (count, count + 1)
     with pytest.raises(ConfigError, match=r"none of 1 photographs can be read"):
         tier_costs.select_inputs(settings(f"source.root={root}", "source.limit=1"), tmp_path)
-
-
-@pytest.mark.parametrize(("pixels", "runs"), [(24_000_000, 1), (24_000_001, 0)])
-def test_reference_runs_once_on_few_pixels_and_stages_count_with_their_shortest_time(
-    pixels: int, runs: int, settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tier_costs, "time_run", lambda *_: RunTimes(1.0, 4.0, 4.0))
-    config = settings()
-    times = tier_costs.measure_runs(config, Inputs(config.source, 1, pixels, ()), Path())
-    assert {tier: len(of_tier) for tier, of_tier in times.items()} == {REFERENCE: runs, EXACT: 2, FAST: 2}
-    stages = tier_costs.stages_ns([*times[EXACT], RunTimes(2.0, 2.0, 1.0)], clean_share=0.25)
-    assert stages == {"decode": 1, "clean": 0.5, "noise": 1.5, "write": 1, "run": 4}
 
 
 # The report -----------------------------------------------------------------------------------------------------------

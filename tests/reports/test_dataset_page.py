@@ -5,10 +5,9 @@ If Chromium is installed, the report is opened in it at the widths of a desktop 
 
 from __future__ import annotations
 
-import csv
 import gc
 import html
-import json
+import io
 import os
 import re
 import shutil
@@ -18,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.browser import open_page
 from helpers.commands import RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
@@ -69,9 +67,8 @@ def scenes_page(scenes: Path) -> str:
     return dataset_page(scenes)
 
 
-def cells(folder: Path, column: str) -> list[str]:
-    with (folder / "manifest.csv").open(newline="", encoding="utf-8") as stream:
-        return [row[column] for row in csv.DictReader(stream) if row["status"] == "ok"]
+def cells(folder: Path, column: str) -> list[Any]:
+    return [row[column] for row in read_rows(folder / "manifest.csv") if row["status"] == "ok"]
 
 
 @pytest.mark.parametrize("sign", ["\x1b", "\u202e", "\udcff"])
@@ -123,13 +120,13 @@ def test_failures_are_listed_with_reason_and_detail(made: Path, text: str) -> No
 
 def test_numbers_agree_with_the_manifest(made: Path, text: str) -> None:
     for column in ("red_gain", "inverse_rgb_gain", "a_dn", "b_dn2"):
-        values = [float(cell) for cell in cells(made, column)]
+        values = cells(made, column)
         (row,) = re.findall(rf"<tr><td>{column}</td>(.*?)</tr>", text, re.DOTALL)
         shown = (formatting.short_number(number, 6) for number in (min(values), sum(values) / len(values), max(values)))
         assert re.findall(r'class="n">([^<]*)<', row) == list(shown)
-    sites = sum(int(w) * int(h) for w, h in zip(cells(made, "width"), cells(made, "height"), strict=True))
+    sites = sum(w * h for w, h in zip(cells(made, "width"), cells(made, "height"), strict=True))
     for column in ("saturated", "noisy_clipped_high"):
-        count = sum(map(int, cells(made, column)))
+        count = sum(cells(made, column))
         assert f'<td>{column}</td><td class="n">{count:,}</td>\n<td class="n">{count / sites:.3%}</td>' in text
 
 
@@ -275,38 +272,15 @@ def test_changed_dataset_is_damage(name: str, content: bytes | None, copy: Path,
 
 # In a browser ---------------------------------------------------------------------------------------------------------
 
-MEASURE = """<script>addEventListener("load", () => {
-  const box = (one) => { const {x, y, width, height} = one.getBoundingClientRect(); return [x, y, width, height]; };
-  const all = (what) => [...document.querySelectorAll(what)];
-  parent.postMessage(JSON.stringify({
-    wide: [document.documentElement.scrollWidth, innerWidth], high: document.documentElement.scrollHeight,
-    pictures: all("img").map((one) => [one.complete, one.naturalWidth, box(one)]),
-    cut: all("body *").filter((one) => one.clientWidth && one.scrollWidth > one.clientWidth + 1
-      && getComputedStyle(one).overflowX === "visible").map((one) => one.outerHTML.slice(0, 80)),
-  }), "*");
-});</script>"""
-FRAME = """<!doctype html><body style="margin: 0"><script>
-  addEventListener("message", (message) => { document.body.dataset.measured = message.data; });
-</script><iframe src="%s" style="border: 0; display: block; width: %dpx; height: %dpx"></iframe></body>"""
-"""The report is shown in a frame, because the window of headless Chromium is at least 500 pixels wide."""
-
-
-def browse(content: str, width: int, folder: Path) -> tuple[dict[str, Any], np.ndarray]:
-    """Return the sizes of the elements of a page in Chromium, and a screenshot, uint8 ``[H, W, 3]``."""
-
-    def called(page_name: str, height: int, *flags: str) -> str:
-        frame = folder / f"frame_of_{page_name}"
-        frame.write_text(FRAME % (page_name, width, height), encoding="utf-8")
-        return open_page(frame, (max(width, 500), height), folder / "profile", *flags)
-
-    (folder / "page.html").write_text(content, encoding="utf-8")
-    (folder / "measured.html").write_text(content.replace("</body>", MEASURE + "</body>"), encoding="utf-8")
-    dom = called("measured.html", 1000, "--virtual-time-budget=10000", "--dump-dom")
-    (found,) = re.findall(r'data-measured="([^"]*)"', dom)
-    measured: dict[str, Any] = json.loads(html.unescape(found))
-    shot = folder / "shot.png"
-    called("page.html", measured["high"], f"--screenshot={shot}")
-    return measured, np.asarray(Image.open(shot).convert("RGB"))[:, :width]
+MEASURE = """
+const box = (one) => { const {x, y, width, height} = one.getBoundingClientRect(); return [x, y, width, height]; };
+const all = (what) => [...document.querySelectorAll(what)];
+return {
+  wide: [document.documentElement.scrollWidth, innerWidth], high: document.documentElement.scrollHeight,
+  pictures: all("img").map((one) => [one.complete, one.naturalWidth, box(one)]),
+  cut: all("body *").filter((one) => one.clientWidth && one.scrollWidth > one.clientWidth + 1
+    && getComputedStyle(one).overflowX === "visible").map((one) => one.outerHTML.slice(0, 80)),
+};"""
 
 
 def colours_in(picture: np.ndarray, box: list[float]) -> int:
@@ -319,9 +293,15 @@ def colours_in(picture: np.ndarray, box: list[float]) -> int:
 
 @pytest.mark.parametrize("width", [1200, 360])
 def test_browser_shows_every_picture_without_overflow(
-    width: int, scenes_page: str, tmp_path: Path, figure: Figure
+    width: int, scenes_page: str, browser: Any, tmp_path: Path, figure: Figure
 ) -> None:
-    measured, shot = browse(scenes_page, width, tmp_path)
+    (tmp_path / "page.html").write_text(scenes_page, encoding="utf-8")
+    size = {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    browser.get((tmp_path / "page.html").as_uri())
+    measured = browser.execute_script(MEASURE)
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size | {"height": measured["high"]})
+    shot = np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
     assert measured["wide"] == [width, width]
     assert shot.shape[:2] == (measured["high"], width)
     assert measured["cut"] == []

@@ -11,7 +11,6 @@ from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 
-from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.reports.estimate import SAMPLE, estimate_run
 from unprocess_gen.reports.plan_text import format_estimate
@@ -49,21 +48,6 @@ def test_time_has_start_up_and_pairs_by_the_workers_with_a_shard(settings: Setti
     assert estimate.free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.1)
 
 
-def test_each_source_is_read_once(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    import unprocess_gen.reports.estimate as module
-
-    read: list[str] = []
-    true = module.load_source
-    monkeypatch.setattr(module, "load_source", lambda *given: (read.append(given[1].name), true(*given))[1])
-    estimate_run(settings("source.limit=2"), 1, read_all=False)
-    assert len(read) == len(set(read)) == 2
-
-
-def test_empty_folder_is_refused(settings: Settings, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no file matches source.include="):
-        estimate_run(settings(f"source.root={tmp_path}"), 1, read_all=False)
-
-
 @pytest.mark.parametrize("compiled", [False, True])
 def test_compiling_kernels_is_announced_unless_they_are_compiled(
     settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, compiled: bool
@@ -90,11 +74,6 @@ def test_estimate_fits_on_one_screen(overrides: str, run_main: RunMain, tmp_path
     lines = done.out.splitlines()
     assert len(lines) <= 32
     assert max(map(len, lines)) <= 140
-
-
-def test_columns_of_the_table_of_effects_are_apart(settings: Settings, tmp_path: Path) -> None:
-    text = estimate_text(settings, tmp_path, "source.clips=true", "body=imx385", "scene=video_night")
-    assert re.search(r"^black_error .* DN  clip's plane \S+ DN  2 of 2 +visible$", text, re.MULTILINE)
 
 
 def test_every_effect_has_size_noise_and_reason(settings: Settings, tmp_path: Path) -> None:

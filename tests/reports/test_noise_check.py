@@ -204,11 +204,6 @@ def test_two_thousand_untouched_pairs_raise_no_alarm(settings: Settings, figure:
     assert len(everything) >= 2000
 
 
-@pytest.mark.parametrize("overrides", [("noise=none",), ("noise=heteroscedastic", "noise.a=0.0002", "noise.b=0.01")])
-def test_noise_below_rounding_is_not_checked(overrides: tuple[str, ...], settings: Settings) -> None:
-    assert checked(settings, overrides, 1)[0][1] == {}
-
-
 def test_strong_row_noise_raises_no_alarm(settings: Settings) -> None:
     """Row offsets are as strong as the read noise."""
     numbers = {"row_std_dn": 15.0, "row_correlation": 0.9}
@@ -382,16 +377,6 @@ def test_many_wrong_pairs_are_counted(make: Make, run_main: RunMain, tmp_path: P
 def test_surprise_is_that_of_a_normal_distribution_for_small_steps() -> None:
     assert Score(7.0, 1.0, 1.0, step=1e-9).surprise == pytest.approx(24.5)
     assert Score(7.0, 1.0, 1.0, step=3.0).surprise < 13
-
-
-def test_scores_of_pairs_with_the_same_curve_add_their_standard_deviations(settings: Settings) -> None:
-    plan, other = (checked(settings, (), seed, 32)[0][0] for seed in (0, 1))
-    same, different = Pool(), Pool()
-    for second, pool in ((plan, same), (other, different)):
-        for of_pair in (plan, second):
-            pool.add({("mean", ""): Score(1.0, 1.0, 9.0)}, of_pair)
-    assert same.scores()["mean", ""] == Score(2.0, 2.0, 36.0)
-    assert different.scores()["mean", ""] == Score(2.0, 2.0, 18.0)
 
 
 def test_threshold_keeps_the_probability_of_a_false_alarm(settings: Settings) -> None:

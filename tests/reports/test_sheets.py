@@ -12,8 +12,6 @@ from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.photographs import PHOTOS, pixels
 from helpers.promise_report import Figure
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
@@ -140,36 +138,6 @@ def test_planes_average_sites_of_one_colour(pattern: str, reduction: int, panel_
 
     block = shown.shape[0] // 4
     np.testing.assert_allclose(shown, colours.repeat(block, axis=0).repeat(block, axis=1), rtol=1e-6)
-
-
-DEFECTS = st.tuples(st.integers(0, 99), st.integers(0, 149), st.sampled_from([0.0, 4095.0]))
-
-
-@given(defects=st.lists(DEFECTS, max_size=7), level=st.integers(50, 3000))
-def test_few_defective_sites_do_not_hide_the_others(defects: list[tuple[int, int, float]], level: int) -> None:
-    raw = np.random.default_rng(1).normal(level, 10, (100, 150))
-    defective = raw.copy()
-    for y, x, dn in defects:
-        defective[y, x] = dn
-
-    before, after = panels.stretch(raw), panels.stretch(defective)
-
-    assert after[raw == defective].std() > 0.8 * before[raw == defective].std() > 0.1
-
-
-@given(height=st.integers(1, 9000), width=st.integers(1, 9000))
-def test_detail_begins_at_a_tile_and_fits_its_panel(height: int, width: int) -> None:
-    window = panels.detail_window((height, width))
-
-    for part, length, most in zip(window, (height, width), panels.PANEL_PX, strict=True):
-        assert part.start % 2 == 0
-        assert 0 <= part.start < part.stop <= length
-        assert part.stop - part.start == min(length, most)
-
-
-def test_widest_character_of_the_font_fits() -> None:
-    widths = [cv2.getTextSize(20 * chr(code), panels.FONT, panels.FONT_SCALE, 1)[0][0] for code in range(32, 127)]
-    assert max(widths) <= 20 * panels.CHARACTER_PX + 1
 
 
 # The overview ---------------------------------------------------------------------------------------------------------
