@@ -88,7 +88,7 @@ def test_run_begun_one_way_is_finished_the_other(
 ) -> None:  # fmt: skip
     executors = {"local": ("n_jobs=1",), "dask": cluster.overrides}
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "_count", interrupt)
+        patch.setattr(runner.Made, "add", interrupt)
         assert run_main(ROOT, ONE, "out=ds", *executors.pop(first)).code == 130
     before = committed(tmp_path / "ds")
     assert before

@@ -72,7 +72,7 @@ def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.Mo
 
     def commits(folder: OutFolder, made: Any, columns: Any) -> ShardReport:
         report = commit(folder, made, columns)
-        done.append(made.shard)
+        done.append(report.shard)
         if len(done) == number:
             action()
         return report

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -41,7 +42,7 @@ from unprocess_gen.pipeline.run import (
     resolve_part,
 )
 from unprocess_gen.pipeline.sizes import check_free_space
-from unprocess_gen.pipeline.tasks import FAILURES_SHOWN, Made, ShardReport, StageTimes, Tally, done_shards, read_records
+from unprocess_gen.pipeline.tasks import Made, StageTimes, count_facts, done_shards, read_records
 from unprocess_gen.sources.raw.decode import decoder_versions
 
 PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
@@ -243,24 +244,10 @@ def _make(folder: OutFolder, run: Run, part: tuple[int, int] | None, label: str)
         for warning in run.warnings():
             progress.warn(warning)
         for report in make_shards(folder, run.settings, todo, progress, made) if todo else ():
-            _count(report, made, progress)
+            for warning in made.add(report):
+                progress.warn(warning)
+            progress.advance(report.images, report.failed)
     return known, made
-
-
-def _count(report: ShardReport, made: Made, progress: Progress) -> None:
-    """Add a committed shard to what was made; show its progress, and its warnings unless enough were shown."""
-    for killer in report.killers:
-        progress.warn(f"{killer}: its worker died four times; run the same command again to retry it")
-    if report.self_test and not made.self_test:
-        progress.warn(f"the self-test failed: {report.self_test}; continuing because of self_test=go_on")
-    for text in report.warnings[: FAILURES_SHOWN - made.failures_shown]:
-        progress.warn(text)
-    made.self_test = made.self_test or report.self_test
-    made.failures_shown = min(FAILURES_SHOWN, made.failures_shown + len(report.warnings))
-    made.rows += report.rows
-    made.shards += 1
-    made.times.add(report.times)
-    progress.advance(report.images, report.failed)
 
 
 def _finish(
@@ -270,7 +257,7 @@ def _finish(
 
     If a row is provisional, ``.work`` is kept, so that the next run retries it. MachineError if shards are missing.
     """
-    entries, missing, tally = list[dict[str, Any]](), list[int](), Tally()
+    entries, missing, counts = list[dict[str, Any]](), list[int](), Counter[str]()
     with machine_errors(folder.path, RESUME):
         manifest, digest = folder.scratch / "manifest.csv", hashlib.sha256()
         with manifest.open("wb", buffering=2**20) as stream:
@@ -286,7 +273,7 @@ def _finish(
                     continue
                 record, csv = read
                 entries.append(record.entry)
-                tally.add(record.tally)
+                counts.update(record.counts)
                 add(csv)
         if missing:
             raise _missing_error(folder, run, missing)
@@ -294,7 +281,7 @@ def _finish(
         decoders = decoder_versions() if run.source.kind == "raw" else {}
         versions = {package: version(package) for package in PACKAGES} | decoders
         machine = {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
-        facts = tally.facts() | sources | {"run": process | machine, "versions": versions}
+        facts = count_facts(counts) | sources | {"run": process | machine, "versions": versions}
         dataset = dataset_facts(run.config, digest.hexdigest(), entries, facts)
         folder.write("dataset.json", dataset_text(dataset).encode())
         if not any(entry.get("provisional") for entry in entries):

@@ -29,7 +29,17 @@ from unprocess_gen.dataset.shards import ShardWriter, shard_name, stored_rows
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, Places, check_root, places_of
 from unprocess_gen.pipeline.run import Run, resolve
-from unprocess_gen.pipeline.tasks import ROWS, RunContext, ShardResult, ShardTask, Tally, read_records, tar_name
+from unprocess_gen.pipeline.tasks import (
+    ROWS,
+    RunContext,
+    ShardReport,
+    ShardResult,
+    ShardTask,
+    count_facts,
+    count_rows,
+    read_records,
+    tar_name,
+)
 from unprocess_gen.pipeline.verify import CONFIG, DATASET, MANIFEST, shard_rows, verify
 from unprocess_gen.pipeline.worker import make_shard
 
@@ -177,11 +187,11 @@ def _dataset_json(folder: Path, source: dict[str, Any]) -> str:
     manifest, entries = folder / MANIFEST, []
     for number, rows in shard_rows(manifest):
         path = folder / tar_name(number)
-        result = ShardResult(number, rows=rows)
+        result = ShardResult(ShardReport(number), rows=rows)
         if path.is_file():
             result.path, result.bytes, result.sha256 = str(path), path.stat().st_size, file_sha256(path)
         entries.append(result.entry())
     lost = dict.fromkeys(("not_matched", "skipped_links", "run", "versions"))
-    facts = Tally.of(read_rows(manifest)).facts() | lost | {"source": source}
+    facts = count_facts(count_rows(read_rows(manifest))) | lost | {"source": source}
     text = (folder / CONFIG).read_bytes().decode()
     return dataset_text(dataset_facts(text, file_sha256(manifest), entries, facts))

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,71 +102,49 @@ class ShardTask:
 
 
 @dataclass(slots=True)
-class ShardResult:
-    """A shard while it is made, and when it is finished.
+class ShardReport:
+    """A shard as the coordinator reports it: numbers of its sources, of those that failed, and of its rows.
 
-    Attributes
-    ----------
-    path : str or None
-        Temporary file; None without pairs, because such a shard has no file.
-    bytes, sha256
-        Size and hex digest of the file; 0 and None without one.
-    rows : list of Row
-        Manifest rows, in source order.
-    killers : list of Source
-        Sources at which workers died; their rows are provisional.
-    self_test : dict of str to None
-        Failures of the self-test, each once, if ``self_test=go_on`` accepts them.
-    notes : list of str
-        Warnings about sources.
+    ``killers`` are names of sources at which workers died. ``self_test`` are failures that ``self_test=go_on`` accepts,
+    each once. ``warnings`` are about sources.
     """
 
     shard: int
+    images: int = 0
+    failed: int = 0
+    rows: int = 0
+    times: StageTimes = field(default_factory=StageTimes)
+    self_test: dict[str, None] = field(default_factory=dict)
+    killers: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class ShardResult:
+    """A shard while it is made, and when it is finished.
+
+    ``path`` is its temporary file, None without pairs; ``bytes`` and ``sha256`` are those of the file. ``rows`` are
+    those of the manifest, in source order.
+    """
+
+    report: ShardReport
     path: str | None = None
     bytes: int = 0
     sha256: str | None = None
     rows: list[Row] = field(default_factory=list)
-    killers: list[Source] = field(default_factory=list)
-    self_test: dict[str, None] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    times: StageTimes = field(default_factory=StageTimes)
 
     def entry(self) -> dict[str, Any]:
         """Entry of the shard in ``dataset.json``."""
+        statuses = Counter(row["status"] for row in self.rows)
         return {
             **({"provisional": True} if any(row["reason"] == "worker_died" for row in self.rows) else {}),
-            **({"self_test": "; ".join(self.self_test)} if self.self_test else {}),
-            "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
-            "pairs": sum(row["status"] == "ok" for row in self.rows),
-            "failed": sum(row["status"] == "failed" for row in self.rows),
+            **({"self_test": "; ".join(self.report.self_test)} if self.report.self_test else {}),
+            "file": None if self.path is None else tar_name(self.report.shard),
+            "pairs": statuses["ok"],
+            "failed": statuses["failed"],
             "bytes": self.bytes,
             "sha256": self.sha256,
         }
-
-    def report(self) -> ShardReport:
-        """Describe the shard for the coordinator."""
-        images = [rows[0] for rows in group_by_image(self.rows)]
-        failed = [row for row in images if row["status"] == "failed"]
-        shown = [row for row in failed if row["reason"] != "worker_died"][:FAILURES_SHOWN]
-        warnings = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in shown]
-        return ShardReport(
-            self.shard, len(images), len(failed), len(self.rows), self.times, "; ".join(self.self_test),
-            tuple(source.name for source in self.killers), (*warnings, *self.notes[:FAILURES_SHOWN]),
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class ShardReport:
-    """A committed shard: numbers of its sources, of those that failed, and of its rows; and warnings for the user."""
-
-    shard: int
-    images: int
-    failed: int
-    rows: int
-    times: StageTimes = field(default_factory=StageTimes)
-    self_test: str = ""
-    killers: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -181,55 +160,46 @@ class Made:
     times: StageTimes = field(default_factory=StageTimes)
     n_jobs: int = 1
     failures_shown: int = 0
-    self_test: str = ""
+    self_test: dict[str, None] = field(default_factory=dict)
+
+    def add(self, report: ShardReport) -> list[str]:
+        """Add a committed shard; return what the user should read about it, unless enough was shown before."""
+        warnings = [
+            f"{name}: its worker died four times; run the same command again to retry it" for name in report.killers
+        ]
+        if report.self_test and not self.self_test:
+            failures = "; ".join(report.self_test)
+            warnings.append(f"the self-test failed: {failures}; continuing because of self_test=go_on")
+        shown = report.warnings[: FAILURES_SHOWN - self.failures_shown]
+        self.failures_shown += len(shown)
+        self.self_test |= report.self_test
+        self.rows += report.rows
+        self.shards += 1
+        self.times.add(report.times)
+        return warnings + shown
 
 
 COUNTS = Counts.__struct_fields__
 """Columns of the manifest that count sites."""
 
 
-@dataclass(slots=True)
-class Tally:
-    """Counts of rows, as ``dataset.json`` has them.
+def count_rows(rows: Iterable[Row]) -> Counter[str]:
+    """Count pairs and filtered images, failures by reason, and over all pairs sites and what `COUNTS` count."""
+    counts = Counter[str]()
+    for row in rows:
+        counts[f"failed.{row['reason']}" if row["status"] == "failed" else str(row["status"])] += 1
+        if has_frames(row):
+            counts["sites.all"] += int(row["width"] or 0) * int(row["height"] or 0)
+            counts.update({f"sites.{name}": int(row[name] or 0) for name in COUNTS})
+    return counts
 
-    ``sites`` are the sums over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
-    """
 
-    pairs: int = 0
-    failed: dict[str, int] = field(default_factory=dict)
-    sites: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", *COUNTS), 0))
-    filtered: int = 0
-
-    @classmethod
-    def of(cls, rows: Iterable[Row]) -> Tally:
-        """Count rows."""
-        tally = cls()
-        for row in rows:
-            if row["status"] == "filtered":
-                tally.filtered += 1
-            elif row["status"] == "failed":
-                tally.failed[str(row["reason"])] = tally.failed.get(str(row["reason"]), 0) + 1
-            else:
-                tally.pairs += 1
-                if has_frames(row):
-                    tally.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
-                    for name in COUNTS:
-                        tally.sites[name] += int(row[name] or 0)
-        return tally
-
-    def add(self, other: Tally) -> None:
-        """Add the counts of other rows."""
-        self.pairs += other.pairs
-        self.filtered += other.filtered
-        for mine, others in ((self.failed, other.failed), (self.sites, other.sites)):
-            for name, count in others.items():
-                mine[name] = mine.get(name, 0) + count
-
-    def facts(self) -> dict[str, Any]:
-        """Counts as ``dataset.json`` holds them."""
-        filtered = {"filtered": self.filtered} if self.filtered else {}
-        failed = dict(sorted(self.failed.items()))
-        return {"pairs": self.pairs, "failed": failed, **filtered, "sites": dict(self.sites)}
+def count_facts(counts: Counter[str]) -> dict[str, Any]:
+    """Counts of `count_rows` as ``dataset.json`` has them."""
+    failed = {name.removeprefix("failed."): counts[name] for name in sorted(counts) if name.startswith("failed.")}
+    filtered = {"filtered": counts["filtered"]} if counts["filtered"] else {}
+    sites = {name: counts[f"sites.{name}"] for name in ("all", *COUNTS)}
+    return {"pairs": counts["ok"], "failed": failed, **filtered, "sites": sites}
 
 
 ROWS = f"{WORK}/rows"
@@ -239,7 +209,7 @@ class ShardRecord(msgspec.Struct, frozen=True):
     """First line of a shard's record: its entry in ``dataset.json``, counts of its rows, size of the lines below."""
 
     entry: dict[str, Any]
-    tally: Tally
+    counts: dict[str, Count]
     csv_bytes: Count
 
 
@@ -249,12 +219,18 @@ RecordAndLines = tuple[ShardRecord, bytes]
 
 def commit_shard(folder: OutFolder, result: ShardResult, columns: Sequence[str]) -> ShardReport:
     """Put a finished shard in place, then its record; raise OSError if the storage fails."""
+    report = result.report
     if result.path is not None:
-        (folder / tar_name(result.shard)).commit(Path(result.path))
+        (folder / tar_name(report.shard)).commit(Path(result.path))
     csv = rows_text(result.rows, columns).encode()
-    facts = {"entry": result.entry(), "tally": Tally.of(result.rows).facts(), "csv_bytes": len(csv)}
-    folder.write(_file(result.shard), json.dumps(facts, separators=(",", ":")).encode() + b"\n" + csv)
-    return result.report()
+    facts = {"entry": result.entry(), "counts": count_rows(result.rows), "csv_bytes": len(csv)}
+    folder.write(_file(report.shard), json.dumps(facts, separators=(",", ":")).encode() + b"\n" + csv)
+    images = [rows[0] for rows in group_by_image(result.rows)]
+    failed = [row for row in images if row["status"] == "failed"]
+    shown = [row for row in failed if row["reason"] != "worker_died"][:FAILURES_SHOWN]
+    warnings = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in shown]
+    warnings += report.warnings[:FAILURES_SHOWN]
+    return replace(report, images=len(images), failed=len(failed), rows=len(result.rows), warnings=warnings)
 
 
 def done_shards(folder: OutFolder, shards: range) -> set[int]:

@@ -61,7 +61,8 @@ def make_shard(
     ``deadly`` sources are not read: they get the row ``worker_died``. ``mark`` is called with each other one before.
     """
     _prepare_process(context.coordinator_pid)
-    made, busy, source = ShardResult(task.shard, killers=list(deadly)), context.busy_path(task.shard), task.sources[0]
+    made = ShardResult(ShardReport(task.shard, killers=[source.name for source in deadly]))
+    busy, source = context.busy_path(task.shard), task.sources[0]
     path = Path(context.scratch) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     try:
         with (
@@ -98,14 +99,14 @@ def make_image(
     context: RunContext, made: ShardResult, source: Source, writer: ShardWriter, read: ReadFile = read_bytes
 ) -> list[Row]:
     """Append the samples of one image to a shard, and return its rows; notes and times go to ``made``."""
-    config, shard, timed = context.config, made.shard, made.times.timed
+    config, shard, timed = context.config, made.report.shard, made.report.times.timed
     try:
         with timed("decode_s"):
             sha256, photograph = load_source(config.source, source, config.output.layout, read)
     except SourceError as error:
         _check_not_deleted(config, source, error)
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text, error.status)]
-    made.notes += [f"{source.name} {photograph.note}"] if photograph.note else []
+    made.report.warnings += [f"{source.name} {photograph.note}"] if photograph.note else []
     with timed("simulate_s"):
         image = plan_pixels(context.settings, photograph, source, sha256)
         noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
@@ -147,8 +148,8 @@ def _test_kernels(context: RunContext, image: PlannedImage, made: ShardResult) -
     for kernels in self_test.kernels(*used):
         if not self_test.are_compiled(kernels):
             context.compiling_path.touch()
-        made.self_test.update(dict.fromkeys(self_test.failures(kernels)))
-    if made.self_test and config.self_test == "stop":
+        made.report.self_test |= dict.fromkeys(self_test.failures(kernels))
+    if made.report.self_test and config.self_test == "stop":
         self_test.check(*used, ", or set self_test=go_on")
 
 
