@@ -17,15 +17,14 @@ from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config import distributions
 from unprocess_gen.config.distributions import Distribution
-from unprocess_gen.config.distributions import draw_parameter as draw
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
-from unprocess_gen.planning import noise_profile
+from unprocess_gen.planning import noise_profile, parameters
 from unprocess_gen.planning import plan as planning
 from unprocess_gen.planning.draws import DRAW_COUNT, Draw
+from unprocess_gen.planning.parameters import draw_parameter as draw
 from unprocess_gen.planning.plan import TwoNumberLevel, plan_camera, plan_image, plan_pairs
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.plan import NUMBERS, Plan
@@ -338,7 +337,7 @@ def test_plans_have_the_digits_of_decimal(
 ) -> None:
     config, facts = settings(*overrides), Facts(128, 128, 256, 3, 250)
     plans = [plan_pairs(config, f"{image:064x}", facts=facts) for image in range(count)]
-    monkeypatch.setattr(distributions, "FIXED_POINT", {})
+    monkeypatch.setattr(parameters, "FIXED_POINT", {})
     for name in ("nearest_log_linear", "nearest_log_between", "nearest_between"):
         monkeypatch.setattr(fixed_point, name, lambda *numbers: None)
     forget_plans()

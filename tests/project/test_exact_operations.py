@@ -24,7 +24,7 @@ ALLOWED_IN_OPENCV = {"imdecode", "error", "getNumThreads", "setNumThreads", "uti
 OUTSIDE_OUTPUT = {
     *("core/exact_distributions.py", "simulation/lookup_tables.py", "simulation/tone_curves.py"),
     *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
-    "config/noise_validation.py",  # a logarithm decides only whether a config is refused
+    "config/iso_forms.py",  # a logarithm decides only whether a config is refused
     *("dataset/dng.py", "reports", "calibration", "statistics", "torch.py", "camera_noise.py"),
 }
 """Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables

@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from unprocess_gen.config import interpretation
-from unprocess_gen.config.distributions import draw_parameter
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.arrays import FLOAT32
@@ -25,6 +24,7 @@ from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import NOT_ROUNDED, BodySelection, EffectRules, Prediction, Selection
 from unprocess_gen.planning.frame_model import SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
+from unprocess_gen.planning.parameters import draw_parameter
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
 from unprocess_gen.simulation import plan as records
 from unprocess_gen.simulation.facts import DarkFrames, Facts
