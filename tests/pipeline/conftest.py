@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.dark_frames import save_frames
 from helpers.datasets import Make, TreeHash
+from helpers.kinds import KINDS, SOURCES, Kind
 from helpers.photographs import fill
 from helpers.processes import COUNT, ONE, assert_complete
+from PIL import Image
 
+import unprocess_gen as ug
 from unprocess_gen.pipeline.generate import Summary
 
 
@@ -49,3 +56,36 @@ def resume(twelve: Path, make: Make, assert_undisturbed: Callable[[Path], None])
         return summary
 
     return resumed
+
+
+@pytest.fixture(scope="session")
+def kind_settings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[str, ...]]:
+    """Return a function that returns the settings of a kind of dataset, its sources and dark frames included."""
+    folder = tmp_path_factory.mktemp("kinds")
+    fill(folder / "photos", 3)
+    for clip, number in itertools.product("ab", range(3)):
+        for name, dtype, top, shape in (("clips", np.uint8, 256, (40, 50, 3)), ("raw", np.uint16, 15000, (48, 64))):
+            (folder / name / clip).mkdir(parents=True, exist_ok=True)
+            frame = np.random.default_rng(ord(clip) + number).integers(top // 30, top, shape).astype(dtype)
+            Image.fromarray(frame).save(folder / name / clip / f"{number:04}.png")
+    save_frames(folder / "darks", 3)
+
+    def settings(kind: str) -> tuple[str, ...]:
+        source = SOURCES.get(kind, "photos")
+        darks = (f"noise.dark_frames={folder / 'darks'}",) if kind == "dark frames" else ()
+        return (*KINDS[kind], *darks, f"source.root={folder / source}" if source else "source.root=null", ONE)
+
+    return settings
+
+
+@pytest.fixture(scope="session")
+def made_kind(kind_settings: Callable[[str], tuple[str, ...]], tmp_path_factory: pytest.TempPathFactory) -> Kind:
+    """Return a function that makes a dataset of a kind once."""
+
+    @functools.cache
+    def made(kind: str) -> Path:
+        out = tmp_path_factory.mktemp("kind") / "ds"
+        ug.generate(ug.load_config([*kind_settings(kind), f"out={out}", "n_jobs=1"]))
+        return out
+
+    return made

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make, TreeHash, text_rows
+from helpers.datasets import Make, text_rows
 from helpers.photographs import fill, pixels
 from PIL import Image
 
@@ -47,6 +47,8 @@ def test_small_images_are_filtered_and_are_no_failures(photos: Path, run_main: R
         "0 failed, 3 filtered (source.min_side); nothing to do\n"
     )
     assert len(ug.RawPairs("ds")) == 2
+    for keys in ((), ("--keys", "0-4")):
+        assert run_main("replay", "ds", *keys).out == "2 pairs are the same, bit for bit; 0 are not\n"
 
 
 def test_pairs_are_those_without_the_filter(photos: Path, make: Make, tmp_path: Path) -> None:
@@ -67,29 +69,6 @@ def test_side_is_that_after_downscaling_and_before_patches(tmp_path: Path, make:
         ("filtered", "too_small"), ("failed", "too_small"), ("filtered", "too_small")
     ]  # fmt: skip
     assert (made.rows, made.pairs, made.failed, made.filtered) == (3, 0, {"too_small": 1}, 2)
-
-
-def test_filtered_rows_are_verified_replayed_regenerated_and_repaired(
-    photos: Path, run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path
-) -> None:
-    make(photos, tmp_path / "ds", "source.min_side=20", "output.pairs_per_shard=2")
-    assert run_main("verify", "ds").out == "ds is intact\n"
-    assert run_main("replay", "ds").out == "2 pairs are the same, bit for bit; 0 are not\n"
-    assert run_main("replay", "ds", "--keys", "0-4").out == "2 pairs are the same, bit for bit; 0 are not\n"
-    assert run_main("again", "ds", "out=again", "n_jobs=1").code == 0
-    assert tree_hash(tmp_path / "again") == tree_hash(tmp_path / "ds")
-    (tmp_path / "again/manifest.csv").unlink()
-    (tmp_path / "again/shards/shard-00000.tar").unlink()
-    assert run_main("verify", "again", "--repair").code == 0
-    assert tree_hash(tmp_path / "again") == tree_hash(tmp_path / "ds")
-
-
-def test_run_in_parts_counts_filtered_images(photos: Path, run_main: RunMain) -> None:
-    for part in ("0/2", "1/2"):
-        assert run_main("part", part, f"source.root={photos}", *ARGUMENTS, "out=ds").code == 0
-    merged = run_main("merge", "ds")
-    assert merged.code == 0
-    assert "0 failed, 3 filtered (source.min_side)" in merged.out
 
 
 def test_plan_report_and_sweep_show_filtered_images(photos: Path, run_main: RunMain) -> None:

@@ -13,63 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.dark_frames import save_frames
-from helpers.datasets import Make
-from helpers.photographs import fill
-from PIL import Image
+from helpers.kinds import KINDS, Kind
 
 import unprocess_gen as ug
 from unprocess_gen.core.files import array_xxh3
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
-KINDS = {
-    "two numbers": ("noise=imx385_iso3200",),
-    "poisson law": ("noise=heteroscedastic", "noise.a=3", "noise.b=20", "noise.law=poisson"),
-    "random levels": ("noise=brooks2019", "camera=choice"),
-    "night": ("noise=sony_a7s2", "scene=night"),
-    "every effect": ("noise=nikon_d850", "scene=low_light", "effects.all=on", "noise.full_well_e=60000"),
-    "patches, levels and draws": ("noise=sony_a7s2", "noise.levels=[1600,3200]", "noise.draws=2", "source.patch=8"),
-    "random patches, packed": ("noise=imx385_iso3200", "output.layout=packed", "source.patch=[random,8,3]"),
-    "float32": ("noise=sony_a7s2", "scene=daylight", "output.dtype=float32"),
-    "float clean": ("noise=imx385_iso3200", "output.clean_dtype=float32"),
-    "fixed patterns in clean": ("noise=sony_a7s2", "effects.prnu=on", "clean.includes_fixed_pattern=true"),
-    "reference": ("noise=imx385_iso3200", "accuracy=reference"),
-    "fast": ("noise=imx385_iso3200", "accuracy=fast"),
-    "gray mean, no noise": ("noise=none", "gains.highlight=gray_mean", "isp=srgb"),
-    "downscaled, dithered": ("noise=imx385_iso3200", "source.downscale=2", "source.dequantize=dither"),
-    "targets": ("noise=sony_a7s2", "output.targets=[linear_rgb]"),
-    "split": ("noise=imx385_iso3200", "split={train: 0.5, test: 0.5}"),
-}
 Items = list[tuple[str, str, dict[str, Any], dict[str, str]]]
-
-
-@pytest.fixture(scope="module")
-def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A dataset of each kind of three photographs; also of clips, of synthetic pictures and of dark frames."""
-    folder = tmp_path_factory.mktemp("kinds")
-    fill(folder / "photos", 3)
-    for clip, number in itertools.product(("a", "b"), range(2)):
-        (folder / "clips" / clip).mkdir(parents=True, exist_ok=True)
-        pixels = np.random.default_rng(number).integers(0, 256, (40, 50, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / "clips" / clip / f"{number}.png")
-    save_frames(folder / "darks", 3)
-    sources = dict.fromkeys(KINDS, folder / "photos") | {"clips": folder / "clips", "scenes": None, "dark frames": None}
-    kinds = KINDS | {
-        "clips": ("noise=sony_a7s2", "scene=night", "source.clips=true"),
-        "scenes": ("noise=imx385_iso3200", "source.limit=2"),
-        "dark frames": DARK_FRAMES,
-    }
-    sources["dark frames"] = folder / "photos"
-    datasets = {}
-    for name, overrides in kinds.items():
-        more = [f"noise.dark_frames={folder / 'darks'}"] if name == "dark frames" else []
-        make(sources[name], folder / "ds" / name, *overrides, *more, "n_jobs=1")
-        datasets[name] = folder / "ds" / name
-    return datasets
-
-
-DARK_FRAMES = ("noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit")
 
 
 def contents(sample: Any) -> tuple[str, str, dict[str, Any], dict[str, str]]:
@@ -82,26 +33,25 @@ def items_of(pairs: Any) -> Items:
     return [contents(pairs[number]) for number in range(len(pairs))]
 
 
-def test_epoch_0_is_the_stored_dataset(made: dict[str, Path], tmp_path: Path) -> None:
-    for name, folder in made.items():
-        stored = ug.RawPairs(folder)
-        names = list(stored[0].targets)
-        for redraw in ("noise", "all", "none"):
-            live = ug.LivePairs(folder, redraw=redraw, cache=tmp_path / "cache", targets=names)
-            assert items_of(live) == items_of(stored), (name, redraw)
-    for split in ("train", "test"):
-        folder = made["split"]
-        if split in {sample.row["split"] for sample in ug.RawPairs(folder)}:
-            assert items_of(ug.LivePairs(folder, split=split)) == items_of(ug.RawPairs(folder, split=split))
+@pytest.mark.parametrize("kind", KINDS)
+def test_epoch_0_is_the_stored_dataset(kind: str, made_kind: Kind, tmp_path: Path) -> None:
+    stored = ug.RawPairs(made_kind(kind))
+    names = list(stored[0].targets)
+    for redraw in ("noise", "all", "none"):
+        live = ug.LivePairs(made_kind(kind), redraw=redraw, cache=tmp_path / "cache", targets=names)
+        assert items_of(live) == items_of(stored), redraw
+    for split in {str(sample.row["split"]) for sample in stored} if kind == "split" else ():
+        live = ug.LivePairs(made_kind(kind), split=split)
+        assert items_of(live) == items_of(ug.RawPairs(made_kind(kind), split=split))
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes:UserWarning")
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.parametrize("workers", [0, 1, 2, 4])
-def test_loaders_give_the_same_items(workers: int, method: str, made: dict[str, Path], tmp_path: Path) -> None:
+def test_loaders_give_the_same_items(workers: int, method: str, made_kind: Kind, tmp_path: Path) -> None:
     """Persistent workers and two ranks read two epochs in random order; epoch 0 is the stored dataset."""
     data = pytest.importorskip("torch.utils.data", reason="PyTorch is not installed")
-    folders = [made[name] for name in ("two numbers", "night", "dark frames", "split", "clips")]
+    folders = [made_kind(name) for name in ("two numbers", "night", "dark frames", "split", "clips")]
     live = ug.LivePairs(folders, cache=tmp_path / "cache")
     expected = {(0, number): contents(sample) for number, sample in enumerate(ug.RawPairs(folders))}
     expected |= {(1, number): contents(live[1, number]) for number in range(len(live))}
@@ -121,9 +71,9 @@ def test_loaders_give_the_same_items(workers: int, method: str, made: dict[str, 
     assert seen == set(expected)
 
 
-def test_default_batches_have_frames_rows_and_targets(made: dict[str, Path]) -> None:
+def test_default_batches_have_frames_rows_and_targets(made_kind: Kind) -> None:
     data = pytest.importorskip("torch.utils.data", reason="PyTorch is not installed")
-    folders = [made[name] for name in ("two numbers", "night", "gray mean, no noise", "split")]
+    folders = [made_kind(name) for name in ("two numbers", "night", "gray mean, no noise", "split")]
     live = ug.LivePairs(folders, patch=8, targets=["noise_std", "linear_rgb"])
     (clean, noisy, row, targets) = next(iter(data.DataLoader(live, batch_size=len(live), num_workers=1)))
     for number in range(len(live)):
@@ -139,8 +89,8 @@ def test_default_batches_have_frames_rows_and_targets(made: dict[str, Path]) -> 
 
 
 @pytest.mark.parametrize("kind", ["two numbers", "night"])
-def test_10_000_items_differ(kind: str, made: dict[str, Path]) -> None:
-    live = ug.LivePairs(made[kind], cache="memory")
+def test_10_000_items_differ(kind: str, made_kind: Kind) -> None:
+    live = ug.LivePairs(made_kind(kind), cache="memory")
     epochs = -(-10_000 // len(live))
     digests = {array_xxh3(live[item].noisy) for item in itertools.product(range(epochs), range(len(live)))}
     assert len(digests) == epochs * len(live) >= 10_000
@@ -159,8 +109,8 @@ while sampler.state[0] < 40:
 """
 
 
-def test_a_killed_training_goes_on_with_the_same_stream(made: dict[str, Path]) -> None:
-    folder, rng, lines = made["patches, levels and draws"], np.random.default_rng(0), list[str]()
+def test_a_killed_training_goes_on_with_the_same_stream(made_kind: Kind) -> None:
+    folder, rng, lines = made_kind("patches, levels and draws"), np.random.default_rng(0), list[str]()
     length = len(ug.LivePairs(folder))
     expected = training(folder, (0, 0))
     assert len(set(expected)) == 40 * length

@@ -94,8 +94,6 @@ def test_stored_target_is_that_of_live_pairs_and_read_by_webdataset(stored: Path
 def test_damaged_target_is_found_and_repaired(stored: Path, run_main: RunMain) -> None:
     shard = stored / "shards/shard-00000.tar"
     intact = shard.read_bytes()
-    assert ug.verify(stored) == []
-    assert not any(result.complaint for result in ug.replay(stored))
     damaged = bytearray(intact)
     damaged[intact.index(b"00000000-p0001.linear_rgb.npy") + 2048] ^= 1
     shard.write_bytes(damaged)
