@@ -1,4 +1,4 @@
-"""Every kind of dataset can be made in parts, verified, replayed, made again and repaired, to the same bytes."""
+"""Every kind of dataset is made in parts, verified, replayed, regenerated and repaired to the same bytes."""
 
 from __future__ import annotations
 
