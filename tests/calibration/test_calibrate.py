@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -10,23 +9,16 @@ from typing import Any
 
 import pytest
 import yaml
-from helpers.captures import Camera, Numbers, Shot, draw, record, with_levels
+from helpers.captures import Camera, Numbers, Shot, draw, estimates, record, with_levels
 from helpers.commands import RunMain
 
 from unprocess_gen.calibration.calibrate import calibrate
 from unprocess_gen.calibration.captures import read_captures
 from unprocess_gen.reports.formatting import short_number
 
-Estimates = dict[tuple[str, float | None, str | None], dict[str, Any]]
-
 EMVA = next(
     (folder for parent in Path(__file__).parents if (folder := parent / "shared/data/emva1288_ccd").is_dir()), None
 )
-
-
-def estimates(profile: Path) -> Estimates:
-    rows = json.loads(profile.with_suffix(".json").read_text())
-    return {(row["name"], row["iso"], row["site"]): row for row in rows}
 
 
 @pytest.fixture

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.captures import Camera
+from helpers.captures import Camera, estimates
 from helpers.commands import RunMain
 
 import unprocess_gen as ug
@@ -43,10 +42,6 @@ def profile_of(tmp_path: Path) -> Path:
     return path
 
 
-def listed(profile: Path) -> dict[tuple[str, float | None, str | None], dict[str, Any]]:
-    return {(row["name"], row["iso"], row["site"]): row for row in json.loads(profile.with_suffix(".json").read_text())}
-
-
 def numbers_at(profile: Path, *isos: float) -> list[tuple[float, float]]:
     """Return gain and read noise at some ISOs, in DN of the profile."""
     config = ug.load_config(["noise=mine", f"scene.iso={isos[0]}", "sensor=generic_14bit"], profile.parents[1])
@@ -74,7 +69,7 @@ def test_tags_of_own_files_give_back_their_numbers(run_main: RunMain, tmp_path: 
     for (gain, read), (iso, (a, b)) in zip(numbers_at(profile, *ISOS), expected.items(), strict=True):
         assert gain == pytest.approx(a, rel=FLOAT32)
         assert read**2 == pytest.approx(b, rel=FLOAT32)
-        assert listed(profile)["b_dn2", iso, None]["value"] == pytest.approx(b, rel=FLOAT32)
+        assert estimates(profile)["b_dn2", iso, None]["value"] == pytest.approx(b, rel=FLOAT32)
     settings = ["--config-dir", profile.parents[1], "noise=mine"]
     done = run_main("plan", "--numbers", *settings, "scene.iso=100", "source.limit=1")
     assert "calibrate --from noise_profile" in done.out
@@ -99,7 +94,7 @@ def test_tags_of_published_numbers_give_published_noise(run_main: RunMain, tmp_p
     folder, profile = stated(tmp_path / "dng", {100: (2.649e-5, 8.906e-9)}, 512, 16383), profile_of(tmp_path)
     done = run_main("calibrate", folder, "--from", "noise_profile", "--to", profile)
     assert done.code == 0, done.err
-    found = listed(profile)
+    found = estimates(profile)
     assert found["dn_per_e", 100, None]["value"] == pytest.approx(0.420, abs=5e-4)
     assert found["b_dn2", 100, None]["value"] == pytest.approx(2.24, abs=5e-3)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,14 +14,14 @@ import pytest
 from unprocess_gen.core.locks import LockFile
 
 HOLDS = """
-import sys, time
+import sys
 from pathlib import Path
 from unprocess_gen.core.locks import LockFile
 
 lock = LockFile(Path(sys.argv[1]))
 lock.acquire(wait=False)
 print("held", flush=True)
-time.sleep(600)
+sys.stdin.read()
 """
 
 
@@ -46,14 +45,12 @@ def test_lock_has_one_owner_and_is_free_after_release(path: Path) -> None:
 
 @pytest.mark.linux_only("kills a process by a signal")
 def test_lock_of_a_killed_process_is_free_at_once(path: Path) -> None:
-    owner = subprocess.Popen([sys.executable, "-c", HOLDS, str(path)], stdout=subprocess.PIPE, text=True)
-    assert owner.stdout is not None and owner.stdout.readline() == "held\n"
-    with pytest.raises(BlockingIOError):
-        LockFile(path).acquire(wait=False)
-    owner.send_signal(signal.SIGKILL)
-    owner.wait()
-    owner.stdout.close()
-    lock = LockFile(path)
+    pipe, lock = subprocess.PIPE, LockFile(path)
+    with subprocess.Popen([sys.executable, "-c", HOLDS, str(path)], stdin=pipe, stdout=pipe) as owner:
+        assert owner.stdout is not None and owner.stdout.readline() == b"held\n"
+        with pytest.raises(BlockingIOError):
+            lock.acquire(wait=False)
+        owner.kill()
     assert lock.acquire(wait=False)
     lock.release()
     assert os.listdir(path.parent) == []

@@ -8,6 +8,7 @@ import os
 import pickle
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -66,14 +67,8 @@ def test_reader_seeks_like_a_file(bucket: ObjectPath, tmp_path: Path) -> None:
     (bucket / "data").write_bytes(CONTENT)
     (tmp_path / "data").write_bytes(CONTENT)
     with (bucket / "data").open() as remote, (tmp_path / "data").open("rb") as local:
-        for seek, size in (
-            ((0,), 10),
-            ((70000,), 3),
-            ((-5, 2), 99),
-            ((-20, 1), 4),
-            ((len(CONTENT) + 9,), 5),
-            ((1,), -1),
-        ):
+        places = (0,), (70000,), (-5, 2), (-20, 1), (len(CONTENT) + 9,), (1,)
+        for seek, size in zip(places, (10, 3, 99, 4, 5, -1), strict=True):
             assert (remote.seek(*seek), remote.read(size)) == (local.seek(*seek), local.read(size))
         assert (remote.seek(250), remote.readline()) == (local.seek(250), local.readline())
 
@@ -88,13 +83,10 @@ def test_pieces_of_large_objects_are_joined(bucket: ObjectPath, tmp_path: Path) 
     assert not copy.exists()
 
 
-def test_missing_object_is_a_missing_file(bucket: ObjectPath) -> None:
-    for action in ((bucket / "none").read_bytes, (bucket / "none").open, (bucket / "none").entry):
+def test_missing_object_is_a_missing_file_and_a_missing_bucket_is_named(bucket: ObjectPath) -> None:
+    for read in ((bucket / "none").read_bytes, (bucket / "none").open, (bucket / "none").entry):
         with pytest.raises(FileNotFoundError, match=f"s3://{bucket.bucket}/none"):
-            action()
-
-
-def test_missing_bucket_is_named_in_one_line(s3: str) -> None:
+            read()
     missing = ObjectPath("s3://no-such-bucket/photos")
     for action in (lambda: list(missing.walk_entries()), lambda: missing.write_bytes(b"1"), missing.exists):
         with pytest.raises(
@@ -118,21 +110,17 @@ def use_azure(endpoint: str, _: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AZURE_STORAGE_ENDPOINT", endpoint)
 
 
-@pytest.mark.parametrize(
-    ("scheme", "use", "create_only"),
-    [
-        ("gs", use_google, ("HTTP_X_GOOG_IF_GENERATION_MATCH", "0")),
-        ("az", use_azure, ("HTTP_IF_NONE_MATCH", "*")),
-    ],
-)
+STORES: dict[str, tuple[Callable[[str, Path, pytest.MonkeyPatch], None], tuple[str, str]]] = {
+    "gs": (use_google, ("HTTP_X_GOOG_IF_GENERATION_MATCH", "0")), "az": (use_azure, ("HTTP_IF_NONE_MATCH", "*")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scheme", STORES)
 def test_google_and_azure_get_the_conditions_of_requests(
-    scheme: str,
-    use: Callable[[str, Path, pytest.MonkeyPatch], None],
-    create_only: tuple[str, str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The variables are those of the guide; servers of these stores are simulated by one that accepts everything."""
+    use, create_only = STORES[scheme]
     object_store._store.cache_clear()
     with servers.one_object_server(CONTENT) as (endpoint, requests):
         use(endpoint, tmp_path, monkeypatch)
@@ -157,21 +145,16 @@ def test_refused_credentials_are_named_in_one_line(slow_proxy: Proxy, bucket: Ob
 
 
 def test_one_of_many_creators_wins(bucket: ObjectPath) -> None:
-    outcomes: list[tuple[int, bool]] = []
     start = threading.Barrier(8)
 
-    def create(number: int) -> None:
+    def create(number: int) -> bool:
         start.wait()
-        outcomes.append((number, (bucket / "raced").create(str(number).encode())))
+        return (bucket / "raced").create(str(number).encode())
 
-    threads = [threading.Thread(target=create, args=(number,)) for number in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    winners = [number for number, won in outcomes if won]
-    assert len(outcomes) == 8 and len(winners) == 1
-    assert (bucket / "raced").read_bytes() == str(winners[0]).encode()
+    with ThreadPoolExecutor(8) as pool:
+        outcomes = list(pool.map(create, range(8)))
+    assert sum(outcomes) == 1
+    assert (bucket / "raced").read_bytes() == str(outcomes.index(True)).encode()
 
 
 def test_changed_etag_is_reported(bucket: ObjectPath) -> None:

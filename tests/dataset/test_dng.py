@@ -28,7 +28,6 @@ from unprocess_gen.dataset import dng
 from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.colour import CAMERAS
 from unprocess_gen.simulation.reference.isp import apply_gains
 from unprocess_gen.simulation.reference.unprocess import camera_light, linear_light
 from unprocess_gen.sources import synthetic
@@ -124,13 +123,6 @@ def test_matrix_and_neutral_give_d65(ds: Path) -> None:
     xyz = np.linalg.solve(numbers(tags["ColorMatrix1"]).reshape(3, 3), numbers(tags["AsShotNeutral"]))
     assert xyz[:2] / xyz.sum() == pytest.approx(D65_XY, abs=5e-5)  # D65 is given to four digits
     assert xyz == pytest.approx(RGB2XYZ.sum(axis=1), abs=1e-7)  # which is white of the photographs' space
-
-
-def test_matrix_is_the_cameras_own_up_to_row_scale(folder: Path, make: Make, tmp_path: Path) -> None:
-    make(folder, tmp_path / "ds", "camera=sony_a7r", "source.limit=1")
-    found = numbers(tags_of(pair(tmp_path / "ds")[2])["ColorMatrix1"]).reshape(3, 3)
-    own = np.array(CAMERAS["sony_a7r"]).reshape(3, 3)
-    assert found / found.sum(axis=1, keepdims=True) == pytest.approx(own / own.sum(axis=1, keepdims=True), abs=1e-7)
 
 
 def test_libraw_finds_the_white_balance_and_the_matrix(ds: Path) -> None:
@@ -339,17 +331,6 @@ def test_exiftool_finds_nothing_wrong(ds: Path, tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------------- the command
 
 
-@pytest.mark.parametrize(("flags", "frames"), [([], ["clean", "noisy"]), (["--noisy"], ["noisy"])])
-def test_the_command_writes_the_frames_asked_for(
-    flags: list[str], frames: list[str], ds: Path, run_main: RunMain, tmp_path: Path
-) -> None:
-    done = run_main("dng", ds, "--keys", "00000002", *flags, "--to", "deep/to")
-    assert (done.code, done.err) == (0, "")
-    assert done.out == f"deep/to: {len(frames)} DNG file{'s' * (len(frames) > 1)} written\n"
-    names = [f"00000002.{frame}.dng" for frame in frames]
-    assert sorted(path.name for path in (tmp_path / "deep" / "to").iterdir()) == names
-
-
 def test_keys_name_all_pairs_of_an_image(folder: Path, make: Make, run_main: RunMain, tmp_path: Path) -> None:
     make(folder, tmp_path / "ds", "noise.draws=2", "source.patch=22", "source.limit=1")
     done = run_main("dng", "ds", "--keys=00000000-p0001,00000000-p0003-l00d01", "--noisy", "--to=to")
@@ -361,17 +342,19 @@ def test_keys_name_all_pairs_of_an_image(folder: Path, make: Make, run_main: Run
         np.testing.assert_array_equal(read(tmp_path / "to" / f"{name}.noisy.dng")[0], frames[name])
 
 
-def test_an_existing_file_is_kept(ds: Path, run_main: RunMain, tmp_path: Path) -> None:
-    run_main("dng", ds, "--keys", "00000000", "--noisy", "--to", "to")
-    path = tmp_path / "to" / "00000000.noisy.dng"
+def test_frames_asked_for_are_written_and_existing_files_kept(ds: Path, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("dng", ds, "--keys", "00000000", "--noisy", "--to", "deep/to")
+    assert (done.code, done.out, done.err) == (0, "deep/to: 1 DNG file written\n", "")
+    path = tmp_path / "deep/to/00000000.noisy.dng"
     before = path.stat()
-    done = run_main("dng", ds, "--keys", "00000000", "--to", "to")
-    assert done.out == "to: 1 DNG file written; 1 existed with the same bytes\n"
+    done = run_main("dng", ds, "--keys", "00000000", "--to", "deep/to")
+    assert done.out == "deep/to: 1 DNG file written; 1 existed with the same bytes\n"
+    assert sorted(file.name for file in path.parent.iterdir()) == ["00000000.clean.dng", path.name]
     assert (path.stat().st_ino, path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
     path.write_bytes(b"mine")
-    done = run_main("dng", ds, "--keys", "00000000,00000002", "--to", "to")
+    done = run_main("dng", ds, "--keys", "00000000,00000002", "--to", "deep/to")
     assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("gen-dataset: --to to: 00000000.noisy.dng exists with other bytes")
+    assert done.err.startswith("gen-dataset: --to deep/to: 00000000.noisy.dng exists with other bytes")
     assert path.read_bytes() == b"mine" and len(list(path.parent.iterdir())) == 2
 
 

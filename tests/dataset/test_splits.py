@@ -137,6 +137,8 @@ def test_several_datasets_are_read_as_one(made: Path, dataset: Path) -> None:
     assert pairs[0].dataset == str(made)
     assert {pair.row["split"] for pair in ug.RawPairs([made, dataset], split="val")} == {"val"}
     assert repr(ug.RawPairs([made])) == f"RawPairs([{str(made)!r}], length=24)"
+    with pytest.raises(ConfigError, match=r"RawPairs\(\[\]\): no dataset"):
+        ug.RawPairs([])
 
 
 @pytest.mark.parametrize("override", ["output.dtype=float32", "output.clean_dtype=float32", "output.layout=packed"])
@@ -147,8 +149,3 @@ def test_frames_that_cannot_be_stacked_are_refused(override: str, made: Path, ma
     ):
         ug.RawPairs([made, tmp_path / "other"], arrays_only=True)
     assert len(ug.RawPairs([made, tmp_path / "other"])) == 25
-
-
-def test_empty_list_of_datasets_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"RawPairs\(\[\]\): no dataset"):
-        ug.RawPairs([])

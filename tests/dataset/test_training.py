@@ -42,6 +42,8 @@ def test_noise_map_is_the_std_of_simulated_noise() -> None:
 
 def test_noise_map_is_zero_where_a_fitted_variance_is_negative() -> None:
     assert ug.noise_std([240, 250], ROW | {"dark_variance_dn2": -30.0}).tolist() == pytest.approx([0, np.sqrt(20)])
+    with pytest.raises(ValueError, match="dark_variance_dn2 is missing from the row; expected a row of a pair"):
+        ug.noise_std([240], {"black_level_dn": 240, "white_level_dn": 4095})
 
 
 def test_crops_begin_at_even_sites_and_reach_both_ends() -> None:

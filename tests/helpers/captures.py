@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -82,6 +83,15 @@ def draw(folder: Path, numbers: Numbers, seed: int, side: int = 128, shots: Sequ
         lines.append(f"{place}.npy,{kind},{shot.celsius}")
     (folder / "captures.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
+
+
+Estimates = dict[tuple[str, float | None, str | None], dict[str, Any]]
+
+
+def estimates(profile: Path) -> Estimates:
+    """Return the estimates next to a profile by name, ISO and site."""
+    rows = json.loads(profile.with_suffix(".json").read_text())
+    return {(row["name"], row["iso"], row["site"]): row for row in rows}
 
 
 def with_levels(folder: Path) -> Path:
