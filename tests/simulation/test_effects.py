@@ -136,10 +136,19 @@ def assert_normal_offsets(offsets: np.ndarray, std: float) -> None:
     assert bounds_off(offsets**2, variance, 2 * variance**2, reach**2) <= 1
 
 
-def test_row_has_one_offset_of_given_standard_deviation() -> None:
-    deviation = noisy_dn(plan_with("row", row_std_dn=300.0), 0, OFFSETS, 5)
-    assert (deviation == deviation[:, :1]).all()
-    assert_normal_offsets(deviation[:, 0], 300.0)
+@pytest.mark.parametrize(
+    ("effect", "shape", "is_fixed"),
+    [("row", (OFFSETS, 5), False), ("column", (5, OFFSETS), True), ("column_temporal", (5, OFFSETS), False)],
+)
+def test_lines_have_one_offset_of_given_standard_deviation(effect: str, shape: tuple[int, int], is_fixed: bool) -> None:
+    plan = plan_with(effect, **{f"{effect}_std_dn": 300.0})
+    one, later = (noisy_dn(plan.replace(frame=frame), 0, *shape) for frame in (1, 2))
+    assert (one == (one[:, :1] if shape[0] == OFFSETS else one[:1])).all()
+    offsets, others = (frame.ravel("F" if shape[0] == OFFSETS else "C")[:OFFSETS] for frame in (one, later))
+    assert_normal_offsets(offsets, 300.0)
+    assert (one == later).all() == is_fixed
+    if not is_fixed:
+        assert_normal_offsets((offsets - others) / math.sqrt(2), 300.0)
 
 
 @pytest.mark.parametrize("correlation", [0.9, 0.5, -0.7])
@@ -155,35 +164,12 @@ def test_correlated_rows_are_an_autoregressive_process(correlation: float) -> No
     assert abs(float((rows**2).mean()) - 300.0**2) <= bound
 
 
-def test_temporal_column_offsets_are_new_in_every_frame() -> None:
-    one, other = (
-        noisy_dn(plan_with("column_temporal", column_temporal_std_dn=300.0, frame=frame), 0, 3, OFFSETS)
-        for frame in (1, 2)
-    )
-    assert (one == one[:1]).all()
-    assert_normal_offsets(one[0], 300.0)
-    assert_normal_offsets((one - other)[0] / math.sqrt(2), 300.0)
-
-
-def test_column_has_one_offset_of_given_standard_deviation() -> None:
-    deviation = noisy_dn(plan_with("column", column_std_dn=300.0), 0, 5, OFFSETS)
-    assert (deviation == deviation[:1]).all()
-    assert_normal_offsets(deviation[0], 300.0)
-
-
 def test_dsnu_is_a_fixed_offset_of_each_pixel_of_a_body() -> None:
     plan = plan_with("dsnu", dsnu_std_e=40.0)  # 8 DN per electron
     one, later, other = (noisy_dn(one) for one in (plan, plan.replace(stream_key=2), with_physics(plan, body_key=9)))
     assert (one == later).all()
     assert_normal_offsets(one.ravel()[:OFFSETS], 320.0)
     assert_normal_offsets((one - other).ravel()[:OFFSETS] / math.sqrt(2), 320.0)
-
-
-def test_clean_frames_can_contain_dsnu() -> None:
-    """The noisy frame contains the same offsets, so that the pair has no difference without other noise."""
-    pair = make_pair(flat(30000, 64, 96), plan_with("dsnu", dsnu_std_e=40.0, fixed_pattern_in_clean=True))
-    assert len(np.unique(pair.clean)) > 100
-    np.testing.assert_array_equal(pair.clean, pair.noisy)
 
 
 # Gain by colour and lens shading -------------------------------------------------------------------------------------
@@ -403,6 +389,3 @@ def test_mean_of_frames_does_not_exceed_full_well() -> None:
     assert overfull.any()
     assert (noisy[:, overfull] == full[overfull]).all()
     assert (clean[overfull] == full[overfull]).all()
-
-
-# Sensor units ---------------------------------------------------------------------------------------------------------

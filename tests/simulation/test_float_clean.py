@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make, Settings, samples_json
+from helpers.datasets import Make, Settings
 
 import unprocess_gen as ug
 from unprocess_gen import RawPairs
@@ -48,20 +48,6 @@ def test_clean_frames_are_float32_and_noisy_frames_do_not_change(mixed: Path, ro
         dn = clean.astype(np.float64) * span_dn + row["black_level_dn"]
         assert np.abs(dn - levels).max() <= 0.5 + 1e-3
         assert 0 <= clean.min() <= clean.max() <= 1
-
-
-def test_clean_frames_are_those_of_a_float32_dataset_in_every_tier(mixed: Path, photos: Path, make: Make) -> None:
-    floats, fast = mixed.parent / "floats", mixed.parent / "fast"
-    make(photos, floats, *NIGHT, "output.dtype=float32")
-    make(photos, fast, *FLOAT_CLEAN, "accuracy=fast")
-    for expected, ours, of_fast in zip(RawPairs(floats), RawPairs(mixed), RawPairs(fast), strict=True):
-        assert ours.clean.tobytes() == expected.clean.tobytes()
-        assert of_fast.clean.tobytes() == expected.clean.tobytes()
-
-
-def test_json_names_the_dtype_of_the_clean_frame(mixed: Path, rounded: Path) -> None:
-    assert {sample["clean_dtype"] for sample in samples_json(mixed).values()} == {"float32"}
-    assert not any("clean_dtype" in sample for sample in samples_json(rounded).values())
 
 
 def test_every_byte_is_verified_and_every_pair_regenerated(mixed: Path, photos: Path) -> None:

@@ -17,7 +17,6 @@ from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.clean import FLOAT32_CHANGED_SHARE, FLOAT32_CLEAN_DN, is_steep
 from unprocess_gen.simulation.kernels.normal import COARSE_ERROR
-from unprocess_gen.simulation.kernels.render import pass_key
 from unprocess_gen.simulation.pair import FRAMES_PER_PASS, make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.plan import FAST, Plan
 from unprocess_gen.simulation.reference import colour
@@ -129,30 +128,6 @@ def test_levels_of_one_clean_frame_equal_separate_pairs(
     assert_equal_separate_pairs(scene, levels_of(plan, **options))
 
 
-UNITS = (
-    {}, {"dn_per_e": 0.5, "row_std_dn": 9.0}, {"read_law": "gaussian", "dark_e": 0.0}, {"read_std_dn": 0.0},
-    {"dark_offset": "kept", "black_error_dn": (9.0, 0.0, -3.0, 0.5)}, {"column_std_dn": 0.0}, {"dark_e": 1e7},
-    {"body_key": 7}, {"body_key": 7, "dn_per_e": 0.25}, {"body_key": 7, "prnu_std": 0.1}, {"prnu_std": 0.0},
-    {"hot_pixel_share": 0.5}, {"hot_pixel_e": 1e7}, {"dead_pixel_share": 0.5}, {},
-)  # fmt: skip
-"""Changes of `GOLDEN_PHYSICS`: more plans of one body than a pass has, then other bodies."""
-
-
-@pytest.mark.parametrize("dtype", ["uint16", "float32"])
-@pytest.mark.parametrize("layout", ["mosaic", "packed"])
-def test_levels_of_several_bodies_equal_separate_pairs(scene: np.ndarray, plan: Plan, dtype: str, layout: str) -> None:
-    on = tuple(effect for effect in EFFECTS if effect != "full_well")
-    plan = plan.replace(dtype=dtype, layout=layout, physics=GOLDEN_PHYSICS)
-    plans = [
-        plan.replace(level=n, effects=on, physics=GOLDEN_PHYSICS.replace(**changes))  # type: ignore[arg-type]
-        for n, changes in enumerate(UNITS)
-    ]
-    assert len({pass_key(one) for one in plans}) > 2
-    assert len({pass_key(one) for one in plans[: FRAMES_PER_PASS + 1]}) == 1
-
-    assert_equal_separate_pairs(scene[:58, :296], plans)
-
-
 def assert_equal_separate_pairs(srgb: np.ndarray, plans: list[Plan]) -> None:
     pairs = list(make_pairs(srgb, plans, origin=(3, 130)))
     assert len(pairs) == len(plans) > FRAMES_PER_PASS
@@ -206,17 +181,6 @@ def assert_within(differing: int, worst: int, sites: int) -> None:
 
     assert worst <= FLOAT32_CLEAN_DN
     assert differing <= FLOAT32_CHANGED_SHARE * sites
-
-
-@pytest.mark.parametrize("highlight", HIGHLIGHTS)
-@pytest.mark.parametrize("camera", colour.CAMERAS)
-def test_float32_is_within_its_error_on_sampled_colours(plan: Plan, camera: str, highlight: str) -> None:
-    codes = np.random.Generator(np.random.Philox(key=4)).integers(0, 256, (512, 1024, 3)).astype(np.uint8)
-    made = with_sensor(plan, 14).replace(rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]), highlight=highlight)
-
-    apart = np.abs(in_float32(codes, made).clean.astype(int) - make_pair(codes, made).clean)
-
-    assert_within(int((apart > 0).sum()), int(apart.max()), apart.size)
 
 
 @pytest.mark.slow

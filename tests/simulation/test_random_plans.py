@@ -17,8 +17,7 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 import pytest
-from helpers.cases import slow_except
-from helpers.flats import IDENTITY, SILENT, plan_with
+from helpers.flats import IDENTITY, SILENT
 from helpers.promise_report import Figure
 
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16, Srgb
@@ -32,7 +31,6 @@ from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.plan import REFERENCE, DarkFramePlan, Physics, Plan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
-from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN
 from unprocess_gen.sources import synthetic
 
@@ -409,79 +407,9 @@ def test_levels_of_random_plans_equal_separate_pairs(kinds: Sequence[str], dtype
     assert failed == {}
 
 
-# Counts of few electrons ----------------------------------------------------------------------------------------------
-
-
-def sweep(low_e: float, high_e: float, read_std_dn: float, height: int) -> Case:
-    """Return a ramp of rates from ``low_e`` to ``high_e``; one electron is one DN, and read noise is small."""
-    codes = np.linspace(low_e / high_e * 65535, 65535, 8192).astype(np.uint16)
-    srgb = np.ascontiguousarray(np.broadcast_to(codes[None, :, None], (height, codes.size, 3)))
-    plan = plan_with("shot", "read", dn_per_e=1.0, read_std_dn=read_std_dn)
-    return Case(srgb, plan.replace(black_level_dn=0, white_level_dn=65535, exposure_ratio=65535 / high_e), (0, 0))
-
-
-RATES_E = [(0, 0.3), (0, 6), (5.9, 9), (9, 66), (60, 65535)]
-"""Ranges of rates with and between the limits of the methods for counts."""
-
-
-@functools.lru_cache(maxsize=1)
-def words_of_counts(key: int, height: int, width: int) -> np.ndarray:
-    return words(key, STREAMS["shot"], (height, width))
-
-
-@pytest.mark.parametrize("height", [256, pytest.param(1024, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("read_std_dn", [0.0, 2**-6], ids=["shot", "shot and read"])
-@pytest.mark.parametrize(("low_e", "high_e"), RATES_E)
-def test_counts_in_the_tails_equal_the_reference(low_e: float, high_e: float, read_std_dn: float, height: int) -> None:
-    """Of millions of sites, those with a deviate beyond 2.5 are compared, where approximations are worst."""
-    ramp = sweep(low_e, high_e, read_std_dn, height)
-    drawn = words_of_counts(ramp.plan.stream_key, *ramp.srgb.shape[:2])
-    is_tail = (drawn & np.uint32(2**31 - 1)) < np.uint32(0.0124 * 2**31)
-    rates_e = (ramp.srgb[..., 0][is_tail] / 65535 * ramp.plan.scene.exposure) * 65535
-    counts = poisson(drawn[is_tail], rates_e)
-    assert counts.size > 20_000
-    np.testing.assert_array_equal(simulate(ramp).noisy[is_tail], np.minimum(counts, 65535))
-
-
-# Rare words -----------------------------------------------------------------------------------------------------------
+# Limits of shares -----------------------------------------------------------------------------------------------------
 
 KEY = 0x0123456789ABCDEF
-RARE = {
-    "heteroscedastic": ((0, 49837, 17997), (1, 18026, 63500), (0, 53401, 16385), (1, 26937, 13841)),
-    "prnu": ((0, 22632, 14441), (0, 48838, 51041), (0, 16288, 12010), (0, 72673, 7802)),
-    "shot": ((0, 675, 38241), (0, 51258, 14216), (0, 20065, 61296), (0, 18466, 32516)),
-    "dark_current": ((0, 2032, 52597), (0, 18752, 17133), (0, 51615, 15391), (0, 43635, 26859)),
-    "hot_pixels": ((0, 45917, 45079), (0, 13961, 27783), (1, 39153, 35967), (0, 64749, 18531)),
-    "read": ((0, 8015, 56090), (0, 6307, 63778), (0, 17818, 31596), (0, 52392, 15060)),
-}
-"""Frame, row and column of sites whose word of a stream of `KEY` is rare: the farthest and the nearest positive
-deviate, the nearest and the farthest negative one. They were found by search; random plans hardly have such words."""
-WORDS = (0, 2**31 - 1, 2**31, 2**32 - 1)
-SITES = [(stream, word, at) for stream, places in RARE.items() for word, at in zip(WORDS, places, strict=True)]
-
-
-@pytest.mark.parametrize(("stream", "word", "at"), SITES)
-def test_rare_words_are_where_they_were_found(stream: str, word: int, at: tuple[int, int, int]) -> None:
-    frame, y, x = at
-    assert words(KEY, STREAMS[stream], (1, 1), origin=(y, x), frame=frame).item() == word
-
-
-@pytest.mark.parametrize("dtype", slow_except((UINT16,), (UINT16, FLOAT32, FLOAT_CLEAN)))
-@pytest.mark.parametrize(("stream", "word", "at"), SITES)
-def test_pairs_at_rare_words_equal_the_reference(stream: str, word: int, at: tuple[int, int, int], dtype: str) -> None:
-    kinds = KINDS[:2] if stream == "heteroscedastic" else KINDS[2:4] if stream in ("shot", "read") else KINDS[3:]
-    kinds = (*kinds, "poisson") if stream == "shot" else kinds
-    frame, y, x = at
-    failed = {}
-    for kind, number in itertools.product(kinds, range(12)):
-        plan = case(kind, number, dtype).plan.replace(layout=MOSAIC, stream_key=KEY, frame=frame, level=0, draw=0)
-        if plan.physics is not None:
-            plan = plan.replace(body_key=KEY)
-        code = np.full((1, 1, 3), (0, 1, 9, 40, 90, 128, 180, 220, 243, 252, 254, 255)[number], dtype=np.uint8)
-        one = Case(code, plan, (y, x))
-        if text := differences(simulate(one), simulate_reference(one)):
-            failed[f"case({kind!r}, {number}, {dtype!r})"] = text
-    assert failed == {}
 
 
 @pytest.mark.parametrize("effect", ["hot_pixels", "dead_pixels"])

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from helpers.configs import with_branch
 from helpers.datasets import Settings
-from helpers.flats import ISOS, bounds_off, noisy_dn, picture, plan_with, planned, signal_dn
+from helpers.flats import bounds_off, noisy_dn, picture, plan_with, planned, signal_dn
 from helpers.moments import REACH
 from helpers.published import CRVD
 
-from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.planning.effect_selection import facts_of
@@ -135,16 +134,6 @@ def test_imx385_read_noise_has_variance_of_crvd(settings: Settings, iso: int) ->
     assert plan.physics.dn_per_e == CRVD[iso][0]
     assert plan.physics.read_std_dn**2 == pytest.approx(CRVD[iso][1], rel=1e-12)
     assert plan.noise.b_dn2 == plan.physics.read_std_dn**2
-
-
-@pytest.mark.parametrize("noise", ISOS)
-def test_plan_has_gain_and_read_variance_of_profile(settings: Settings, noise: str) -> None:
-    plan = planned(settings, picture(), f"noise={noise}", f"noise.iso={ISOS[noise]}")
-    assert plan.physics is not None
-    assert branch_of(settings(f"noise={noise}").noise, ISOS[noise]) is not None
-    assert (plan.noise.a_dn, plan.noise.b_dn2) == (plan.physics.dn_per_e, plan.physics.read_std_dn**2)
-    assert plan.physics.dn_per_e > 0
-    assert plan.physics.read_std_dn > 0
 
 
 def test_scatter_about_line_is_normal_in_logarithm(settings: Settings) -> None:

@@ -52,19 +52,13 @@ def test_kernels_are_compiled_once_they_were_tested(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("name", selftest.GOLDEN)
-def test_earlier_pairs_change_no_byte(name: str) -> None:
+def test_golden_pairs_equal_the_reference_after_other_pairs(name: str) -> None:
+    """Only ``float32`` states errors; a larger picture before leaves other numbers in the scratch memory."""
     plan = selftest.GOLDEN_PLANS[name]
     make_pair(np.full((3, 700, 3), 255, dtype=np.uint8), plan)
-    pair = make_pair(selftest.golden_image(), plan, (1, 57))
-    assert (array_xxh3(pair.clean), array_xxh3(pair.noisy)) == selftest.GOLDEN[name]
-
-
-@pytest.mark.parametrize("name", sorted(set(selftest.GOLDEN) - {"float32"}))
-def test_the_golden_pair_equals_the_reference(name: str) -> None:
-    plan = selftest.GOLDEN_PLANS[name]
-    pair = reference_pair(selftest.golden_image(), plan, (1, 57))
-
-    assert (array_xxh3(pair.clean), array_xxh3(pair.noisy)) == selftest.GOLDEN[name]
+    for make in (make_pair, reference_pair) if name != "float32" else (make_pair,):
+        pair = make(selftest.golden_image(), plan, (1, 57))
+        assert (array_xxh3(pair.clean), array_xxh3(pair.noisy)) == selftest.GOLDEN[name]
 
 
 def test_the_float32_golden_pair_differs_from_float64() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, Float, Frame, Normalised, Srgb
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Counts, Pair
-from unprocess_gen.simulation.kernels.render import CODES, CropRenderer, pass_key, render_clean, render_pairs
+from unprocess_gen.simulation.kernels.render import CODES, Renderer, pass_key, render_clean, render_pairs
 from unprocess_gen.simulation.plan import EXACT, REFERENCE, Plan
 from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
@@ -120,10 +120,8 @@ def crop_maker(
 
         return make
     is_dithered = plan.source.dequantize != "off" and codes == CODES[0]
-    render = CropRenderer(plan, shape, frame, (corner[0] % 2, corner[1] % 2), CODES[1] if is_dithered else codes)
-    if not is_dithered:
-        return render
-    return lambda srgb, origin, epoch: render(_dequantise(srgb, plan, origin), origin, epoch)
+    renderer = Renderer((plan,), shape, (corner[0] % 2, corner[1] % 2), CODES[1] if is_dithered else codes)
+    return lambda srgb, origin, epoch: renderer.crop(_dequantise(srgb, plan, origin), origin, epoch, frame)
 
 
 def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:

@@ -7,7 +7,7 @@ parameter is a new field.
 """
 
 import functools
-from typing import Annotated, Any, NamedTuple, Self, get_args, get_type_hints
+from typing import Annotated, Any, Self, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -477,38 +477,6 @@ class OutputPlan(PlanRecord, frozen=True):
         return (self.clean_dtype or self.dtype) == FLOAT32
 
 
-class CleanPlan(NamedTuple):
-    """All that decides a clean frame; pairs with equal ones share it.
-
-    Attributes
-    ----------
-    stream_key, source, scene, camera, isp, output
-        Parts of the plan.
-    sensor : (str, int, int, int)
-        Pattern, bits and levels.
-    accuracy : str
-        `Plan.clean_accuracy`.
-    brightest : float
-        Light at which the frame saturates.
-    lens : tuple or None
-        Coefficients and frame size of the lens shading.
-    patterns : tuple or None
-        Numbers, effects and clipping of the noise if the frame contains its fixed patterns.
-    """
-
-    stream_key: int
-    source: SourcePlan
-    scene: ScenePlan
-    camera: CameraPlan
-    isp: IspPlan
-    sensor: tuple[str, int, int, int]
-    accuracy: str
-    output: OutputPlan
-    brightest: float
-    lens: tuple[tuple[float, float, float], tuple[int, int]] | None
-    patterns: tuple[Physics | None, tuple[str, ...], str] | None
-
-
 class Plan(PlanRecord, frozen=True, kw_only=True):
     """All parameters of a pair; with the pixels it determines the pair completely.
 
@@ -562,17 +530,17 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         return self.physics is not None and self.physics.fixed_pattern_in_clean
 
     @property
-    def clean(self) -> CleanPlan:
-        """All that decides the clean frame."""
+    def clean(self) -> tuple[object, ...]:
+        """All that decides the clean frame; pairs with equal ones share it."""
         physics, effects, sensor = self.physics, self.noise.effects, self.sensor
         has_shading = physics is not None and "lens_shading" in effects
-        return CleanPlan(
-            self.stream_key, self.source, self.scene, self.camera, self.isp,
-            (sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn),
-            self.clean_accuracy, self.output, self.brightest,
+        return (
+            *(self.stream_key, self.source, self.scene, self.camera, self.isp, self.output),
+            *(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn),
+            *(self.clean_accuracy, self.brightest),
             (self.numbers.lens_shading, self.numbers.frame_size) if has_shading else None,
             (physics, effects, sensor.sensor_clip) if self.averaged else None,
-        )  # fmt: skip
+        )
 
     @property
     def clean_accuracy(self) -> str:

@@ -65,15 +65,3 @@ def test_correlated_rows_use_the_machine_code_of_other_noise(everything: Plan) -
         make_pair(picture(), with_physics(everything, row_correlation=correlation))
     electrons = [noise for _, _, noise, *_ in cast(Any, _render).signatures if noise.instance_class is Electrons]
     assert len({str(noise) for noise in electrons}) == 1
-
-
-# Each effect ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("effect", [None, *EFFECTS])
-def test_pairs_equal_reference_with_and_without_every_effect(everything: Plan, effect: str | None) -> None:
-    plan = everything.replace(level=3, draw=2, frame=1)
-    for on in ([one for one in EFFECTS if one != effect], [effect] if effect else []):
-        for saturated, clip in itertools.product(["noisy", "white"], ["sensor", "black"]):
-            one = plan.replace(effects=tuple(on), saturated_as=saturated, sensor_clip=clip)
-            assert_same(picture(), one, (3, 7))

@@ -11,24 +11,17 @@ import mpmath
 import numpy as np
 import pytest
 from helpers.cases import slow_except
-from helpers.kernels import approximate_counts, counts_of_one_rate, exact_counts, values_by_lines
+from helpers.kernels import approximate_counts, counts_of_one_rate, exact_counts
 from helpers.kernels import counts as fast
 from helpers.promise_report import Figure
 
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.simulation.kernels import poisson as kernels
-from unprocess_gen.simulation.kernels.normal import normal_quantiles
 from unprocess_gen.simulation.kernels.poisson import (
-    EXPANSION_ERRORS,
     FLOAT32_RATE,
-    LOW_RATE,
     MAX_THRESHOLD_RATE,
-    NORMAL_REACH2,
-    TRUNCATION_ERRORS,
     count_thresholds,
 )
 from unprocess_gen.simulation.reference import poisson as poissons
-from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.reference.poisson import LIMIT, poisson, poisson_tables
 
 WORDS = 2**32
@@ -187,51 +180,6 @@ def test_kernels_equal_the_reference_where_counts_change() -> None:
     for step in (-2, -1, 0, 1):
         words = word(np.clip(edges + step, 0, WORDS - 1))
         assert (fast(words, rates) == poisson(words, rates)).all()
-
-
-def first_terms(words: np.ndarray, rate: float) -> np.ndarray:
-    """Return x by the first terms as compiled: approximate normals, float32, without the integer part of the rate."""
-    z, near, f = values_by_lines(words, normal_quantiles()), np.float32(rate), np.float32
-    c, reciprocal = kernels._TERMS, f(1) / near
-    s = z * (np.sqrt(near) * reciprocal)
-    s2 = s * s
-    terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
-    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * np.float32(kernels._RECIPROCAL_TERM))
-    assert rest.dtype == np.float32
-    return np.asarray(np.float64(near) + rest.astype(np.float64))
-
-
-def real_quantile(rate: float, w: float) -> float:
-    """Return the x with Gamma(x, rate) / Gamma(x) = Phi(w), computed by mpmath."""
-    with mpmath.workdps(20):
-        share = mpmath.ncdf(w)
-        near = float(poissons.expansion(np.array([rate]), np.array([w]))[0])
-        return float(
-            mpmath.findroot(
-                lambda x: mpmath.gammainc(x, rate, mpmath.inf, regularized=True) - share, (near, near + 1e-4)
-            )
-        )
-
-
-RATES = (LOW_RATE, 5.6, 6.3, 7.1, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9)
-
-
-@pytest.mark.parametrize("rate", slow_except((8.3, *RATES[12:]), RATES))
-def test_the_first_terms_are_within_their_error(rate: float) -> None:
-    """What remains of the bound is for the words between those that are tested."""
-    reach = min(math.sqrt(NORMAL_REACH2[0] + NORMAL_REACH2[1] * math.sqrt(rate)), 6.3)
-    w = np.linspace(-reach, reach, 201 if rate < LIMIT else 4001)
-    index = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in w]
-    words = np.array([min(int(i), SIGN - 1) | SIGN * (v < 0) for i, v in zip(index, w, strict=True)], dtype=np.uint32)
-    z = normals(words)  # to 1.5e-7
-    exact = [real_quantile(rate, v) for v in z] if rate < LIMIT else poissons.expansion(np.full(z.shape, rate), z)
-    constant, of_rate, of_reciprocal = EXPANSION_ERRORS
-    claimed = constant + of_rate * rate + of_reciprocal / rate
-    assert np.abs(first_terms(words, rate) - exact).max() <= claimed - FLOAT32_RATE * rate
-    bounds = [kernels._bounds_by_first_terms.py_func(rate, float(v)) for v in z]
-    assert all(least <= math.floor(x) <= most for (least, most), x in zip(bounds, exact, strict=True))
-    error = TRUNCATION_ERRORS[0] * (3 + math.sqrt(rate)) + TRUNCATION_ERRORS[1] / rate
-    assert max(most - least for least, most in bounds[1:-1]) <= 1 + 2 * error
 
 
 # Approximate counts ---------------------------------------------------------------------------------------------------

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from helpers.flats import dead, hot_pixel_means, plan_with, response
+from helpers.flats import plan_with
 
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.simulation.kernels import site_patterns
-from unprocess_gen.simulation.kernels.site_patterns import SitePatterns, forget_patterns, patterns_at
+from unprocess_gen.simulation.kernels.site_patterns import forget_patterns, patterns_at
 from unprocess_gen.simulation.kernels.strips import SiteMap
 from unprocess_gen.simulation.plan import Physics
 from unprocess_gen.simulation.plan_slots import slots_of
@@ -38,46 +38,6 @@ def patterns_of(*on: str, **numbers: float) -> tuple[Patterns, Physics]:
     plan = plan_with(*on, **NUMBERS | numbers)
     assert plan.physics is not None
     return slots_of(plan).patterns, plan.physics
-
-
-def means_of(found: SitePatterns, shape: tuple[int, int], first: int) -> np.ndarray:
-    """Return the mean excess of each pixel: -1 if it is dead, 0 if it has no defect."""
-    pitch, column = found.defects.steps
-    if not column:  # no pixel has a defect
-        return np.zeros(shape)
-    return found.means_e[found.defects.values.reshape(-1, pitch)[:, first : first + shape[1]]]
-
-
-def assert_defects(on: tuple[str, ...], shape: tuple[int, int], origin: tuple[int, int], **shares: float) -> None:
-    patterns, physics = patterns_of(*on, **shares)
-    expected = hot_pixel_means(physics, shape, origin) if "hot_pixels" in on else np.zeros(shape)
-    if "dead_pixels" in on:
-        expected = np.where(dead(physics, shape, origin), -1.0, expected)
-    found = means_of(patterns_at(patterns, shape, origin), shape, origin[1] % BLOCK)
-    np.testing.assert_array_equal(found, expected)
-
-
-@pytest.mark.parametrize(("shape", "origin"), CROPS)
-def test_defects_of_a_crop_equal_the_reference(shape: tuple[int, int], origin: tuple[int, int]) -> None:
-    for on in (DEFECTS, DEFECTS[:1], DEFECTS[1:]):
-        for hot_share, dead_share in ((0.05, 0.03), (1.0, 0.3), (0.3, 1.0)):
-            assert_defects(on, shape, origin, hot_pixel_share=hot_share, dead_pixel_share=dead_share)
-
-
-@pytest.mark.parametrize(("shape", "origin"), CROPS)
-@pytest.mark.parametrize("prnu_std", [0.002, 0.5])
-def test_response_of_a_crop_equals_the_reference(
-    shape: tuple[int, int], origin: tuple[int, int], prnu_std: float
-) -> None:
-    """The large standard deviation gives pixels without any response."""
-    patterns, physics = patterns_of("prnu", prnu_std=prnu_std)
-    found, first = patterns_at(patterns, shape, origin), origin[1] % BLOCK
-    pitch = found.response.steps[0]
-    assert found.response.steps == (pitch, 1)
-    assert pitch % BLOCK == 0
-    ours = found.response.values.reshape(-1, pitch)[:, first : first + shape[1]]
-    assert ours.dtype == np.float32
-    np.testing.assert_array_equal(ours.astype(np.float64), response(physics, shape, origin))
 
 
 def test_patterns_are_computed_once_for_all_frames_of_a_body() -> None:

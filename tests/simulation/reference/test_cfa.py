@@ -45,10 +45,6 @@ def test_an_origin_shifts_the_tile(origin: tuple[int, int], expected: tuple[tupl
     assert tile("RGGB", origin) == expected
 
 
-def test_there_are_four_patterns() -> None:
-    assert set(PATTERNS) == set(TILES)
-
-
 @pytest.mark.parametrize("pattern", ["RGBG", "rggb", "", "XTRANS"])
 def test_an_unknown_pattern_is_refused_with_the_known_ones(pattern: str) -> None:
     with pytest.raises(ValueError, match=rf"pattern={pattern}: .*expected one of RGGB, BGGR, GRBG, GBRG"):

@@ -105,32 +105,6 @@ def test_a_mixture_is_the_exactly_normalised_product(mix: tuple[float, ...]) -> 
     hold_near_exact(mixed, fractions(mixed), 0)
 
 
-@given(weights())
-def test_the_grid_moves_entries_by_at_most_three_units(mix: tuple[float, ...]) -> None:
-    """Units are 2**-52 of the largest entry. Two entries are rounded to the grid; the largest is the rest to 1."""
-    product = colour.multiply(colour.mix(tuple(CAMERAS.values()), mix), RGB2XYZ)
-    for plain, found in zip(rows(product), rows(colour.normalise_rows(product)), strict=True):
-        total = sum(Fraction(entry) for entry in plain)
-        largest = max(abs(entry) for entry in found)
-        for entry, unit in zip(plain, found, strict=True):
-            assert abs(Fraction(unit) - Fraction(entry) / total) <= 3 * Fraction(1, 2**52) * Fraction(largest)
-
-
-def test_a_product_by_hand() -> None:
-    left, right = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0), (1.0, 0.0, 2.0, 0.0, 1.0, 0.0, 3.0, 0.0, 1.0)
-    assert colour.multiply(left, right) == (10.0, 2.0, 5.0, 22.0, 5.0, 14.0, 37.0, 8.0, 24.0)
-
-
-def test_a_mix_needs_a_weight_for_every_matrix() -> None:
-    with pytest.raises(ValueError, match="argument"):
-        colour.mix((IDENTITY, IDENTITY), (1.0,))
-
-
-def test_a_matrix_has_nine_numbers() -> None:
-    with pytest.raises(ValueError, match="nine numbers, got 8"):
-        colour.matrix([1.0] * 8)
-
-
 # Inverse --------------------------------------------------------------------------------------------------------------
 
 
@@ -201,11 +175,6 @@ def test_the_determinant_accepts_only_invertible_matrices(numbers: list[float], 
     own = colour.matrix([number * 10.0**power for number in numbers])
     if colour._is_well_conditioned(own):
         assert colour.condition(own) <= 2e9
-
-
-def test_a_condition_number_by_hand() -> None:
-    """Largest row sums 7 and 3 (of (1, 2; 3, 4)⁻¹ = (-2, 1; 1.5, -0.5)): 21."""
-    assert colour.condition((1.0, 2.0, 0.0, 3.0, 4.0, 0.0, 0.0, 0.0, 1.0)) == 21.0
 
 
 def test_a_row_that_sums_to_zero_is_refused() -> None:

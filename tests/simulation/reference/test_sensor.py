@@ -29,46 +29,34 @@ def hold_close(found: float, exact: Fraction, operations: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("black", "white"), [(240, 4095), (64, 1023), (256, 4095), (1024, 16383), (4096, 65535), (0, 1)]
+    ("black", "white"), [(240, 4095), (64, 1023), (256, 4095), (1024, 16383), (4096, 65535), (0, 1), (100, 4196)]
 )
-def test_black_and_white_are_exactly_the_sensors_levels(black: int, white: int) -> None:
-    assert to_dn(np.array([[0.0, 1.0]]), black, white).tolist() == [[black, white]]
-
-
-def test_light_outside_0_and_1_is_clipped() -> None:
-    light = np.array([[-0.5, -1e-300, 1 + 2**-52, 9.0, math.inf]])
-    assert to_dn(light, 240, 4095).tolist() == [[240, 240, 4095, 4095, 4095]]
-
-
-def test_light_between_black_and_white_is_linear_and_unrounded() -> None:
-    assert to_dn(np.array([[0.25, 0.5, 2.0**-12]]), 100, 4196).tolist() == [[1124, 2148, 101]]
-    assert to_dn(np.array([[2.0**-13]]), 100, 4196).tolist() == [[100.5]]
+def test_light_is_clipped_and_linear_between_the_levels(black: int, white: int) -> None:
+    light = np.array([-0.5, -1e-300, 0.0, 2.0**-13, 0.25, 1.0, 1 + 2**-52, 9.0, math.inf])
+    span = white - black
+    expected = [*[black] * 3, black + span * 2.0**-13, black + span * 0.25, *[white] * 4]
+    assert to_dn(light, black, white).tolist() == expected
 
 
 # Quantising -----------------------------------------------------------------------------------------------------------
 
 
-def test_halves_are_rounded_to_even() -> None:
-    assert quantise(np.array([0.5, 1.5, 2.5, 3.5, 4094.5]), 0, 4095).tolist() == [0, 2, 2, 4, 4094]
-
-
-def test_other_values_are_rounded_to_the_nearest() -> None:
-    below, above = math.nextafter(2.5, 0), math.nextafter(2.5, 9)
-    assert quantise(np.array([0.49, 0.51, below, above, 7.0]), 0, 4095).tolist() == [0, 1, 2, 3, 7]
-
-
-def test_values_are_clipped_before_they_are_cast() -> None:
+@pytest.mark.parametrize(
+    ("values", "limits", "expected"),
+    [
+        ([0.5, 1.5, 2.5, 3.5, 4094.5], (0, 4095), [0, 2, 2, 4, 4094]),
+        ([0.49, 0.51, math.nextafter(2.5, 0), math.nextafter(2.5, 9), 7.0], (0, 4095), [0, 1, 2, 3, 7]),
+        ([-1.0, -70000.0, 70000.0, 1e10, 1e300, math.inf, -math.inf], (0, 65535), [0, 0, *[65535] * 4, 0]),
+        ([-5.0, 239.6, 240.4, 4095.6], (240, 4095), [240, 240, 240, 4095]),
+    ],
+    ids=["halves to even", "nearest", "clipped before the cast", "limits of the caller"],
+)
+def test_values_are_rounded_then_clipped_then_cast(
+    values: list[float], limits: tuple[int, int], expected: list[int]
+) -> None:
     """A cast alone would wrap: 70000 to 4464, and -1 to 65535 or to 0, by the processor."""
-    values = np.array([-1.0, -70000.0, 70000.0, 1e10, 1e300, math.inf, -math.inf])
-    assert quantise(values, 0, 65535).tolist() == [0, 0, 65535, 65535, 65535, 65535, 0]
-
-
-def test_limits_are_those_of_the_caller() -> None:
-    assert quantise(np.array([-5.0, 239.6, 240.4, 4095.6]), 240, 4095).tolist() == [240, 240, 240, 4095]
-
-
-def test_quantised_frames_are_uint16() -> None:
-    assert quantise(np.zeros((2, 3)), 0, 1).dtype == np.uint16
+    found = quantise(np.array(values), *limits)
+    assert (found.tolist(), found.dtype) == (expected, np.uint16)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,6 @@ from unprocess_gen.simulation.kernels.jit import kernel
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
     Output,
-    ReadOut,
     average_patterns,
     count_zero_variance,
     draw_noise,
@@ -48,7 +47,6 @@ from unprocess_gen.simulation.kernels.site_patterns import EQUAL_RESPONSE, light
 from unprocess_gen.simulation.kernels.strips import COUNT_FIELDS, STRIP, Scratch, buffers_in, locate, scratch_of_thread
 from unprocess_gen.simulation.plan import FAST, Plan
 from unprocess_gen.simulation.plan_slots import slots_of
-from unprocess_gen.simulation.slots import Slots
 
 Shape = tuple[int, int]
 CODES = 256, 65536
@@ -62,30 +60,102 @@ def render_pairs(
     dark_pixels: DarkPixels | None = None,
 ) -> list[Pair]:
     """Simulate pairs that share the clean frame, in one pass; arguments as for `pair.make_pairs`."""
-    clean, noisy, numbers = _frames_of(srgb, tuple(plans), len(plans), origin, dark_pixels)
+    renderer = _renderer_of(srgb, tuple(plans), origin)
+    inverse, noise = renderer.records(origin, dark_pixels)
+    clean, noisy, numbers = renderer.fill(srgb, inverse, noise, renderer.keys, origin)
     counts = _counts_of(numbers, plans[0])
     return [Pair(clean, frame, counted) for frame, counted in zip(noisy, counts, strict=True)]
 
 
-class CropRenderer:
-    """Render crops of a plan in its epochs, all of ``shape``, without a dark frame.
+def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
+    """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
+    renderer = _renderer_of(srgb, (plan.replace(dark=None),), origin)
+    return renderer.fill(srgb, *renderer.records(origin), renderer.keys[:0], origin)[0]
 
-    What crops share is prepared once, which takes longer than a crop of 128 x 128. ``frame`` are the sides of their
-    image, ``corner`` the place of their first site in the tile, and ``codes`` the number of codes of the image.
+
+Noise = Gaussian | Gaussian32 | Electrons
+
+
+class Renderer:
+    """Render crops of ``shape`` from ``codes`` codes, whose first site is ``corner`` of the tile.
+
+    What they share is prepared once, which takes longer than a crop of 128 x 128.
     """
 
-    def __init__(self, plan: Plan, shape: Shape, frame: Shape, corner: Shape, codes: int) -> None:
-        self._plan, self._plans, self._shape, self._frame = plan, (plan,), shape, frame
-        self._form = _form(self._plans, shape, corner, codes)
+    def __init__(self, plans: tuple[Plan, ...], shape: Shape, corner: Shape, codes: int) -> None:
+        first, in_float32 = plans[0], uses_float32(plans[0])
+        packed = first.output.layout == PACKED
+        self._plans, self._shape = plans, shape
+        self._frame_shape = (4, shape[0] // 2, shape[1] // 2) if packed else shape
+        self._dtypes: Any = [
+            np.float32 if is_normalised else np.uint16
+            for is_normalised in (first.output.clean_normalised, first.output.normalised)
+        ]
+        kind = Unprocessing32 if in_float32 else Unprocessing  # selects the precision
+        self._inverse = unprocessing_of(first, codes, corner, kind)
+        self._noise: Gaussian | Gaussian32 | None = None  # noise in electrons depends on the place
+        if not first.counts_electrons:
+            self._noise = (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
+        self._slots = () if self._noise else tuple(map(slots_of, plans))
+        self._readout = readout_of(plans, shape if packed else (0, 0), corner, in_float32)
+        self.keys = philox_keys(plans)
 
-    def __call__(self, srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
-        """Return the clean frame, the noisy frame and a function that returns their counts, which takes 5 µs."""
-        form = self._form
-        inverse, noise = _records(form, self._plans, self._shape, origin, epoch=epoch, frame=self._frame)
-        keys = form.keys.copy()
-        keys[0, 3] = frame_word(self._plan.place.frame, epoch)
-        clean, noisy, numbers = _fill_frames(srgb, form, inverse, noise, keys, origin)
-        return clean, noisy[0], lambda: _counts_of(numbers, self._plan)[0]
+    def records(
+        self,
+        origin: tuple[int, int],
+        dark_pixels: DarkPixels | None = None,
+        epoch: int = 0,
+        frame: Shape | None = None,
+    ) -> tuple[Unprocessing, Noise]:
+        """Numbers of the unprocessing and the noise at a place, whose classes select the compiled code."""
+        first, inverse, frames = self._plans[0], self._inverse, self._slots
+        if self._noise is not None:
+            return inverse, self._noise
+        if epoch and any(slots.depends_on_epoch for slots in frames):
+            frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in self._plans)
+        patterns = patterns_at(frames[0].patterns, self._shape, origin, frame)
+        factor = light_factor(frames[0].patterns, patterns, self._shape, origin, first.averaged)
+        if factor is not None:
+            inverse = with_response(inverse, factor)
+        if first.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
+            patterns = patterns._replace(response=EQUAL_RESPONSE)
+        return inverse, electron_noise(self._plans, frames, patterns, dark_pixels, self._shape, origin)
+
+    def fill(
+        self, srgb: Srgb, inverse: Unprocessing, noise: Noise, keys: NDArray[np.uint64], origin: tuple[int, int]
+    ) -> tuple[Frame, Frame, NDArray[np.int64]]:
+        """Clean frame, a noisy frame for each key, and their numbers of `Counts`.
+
+        Only the numbers of the first noisy frame include the counts of the clean frame.
+        """
+        clean = np.empty(self._frame_shape, self._dtypes[0])
+        noisy = np.empty((len(keys), *self._frame_shape), self._dtypes[1])
+        counts = np.zeros((max(len(keys), 1), COUNT_FIELDS), np.int64)
+        # a view, a read-only array or a subclass would be another type, compiled again
+        codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
+        scratch = scratch_of_thread(np.float32 if type(inverse) is Unprocessing32 else np.float64)
+        frames = clean.reshape(-1), noisy.reshape(len(keys), clean.size)
+        _render(codes, inverse, noise, keys, origin, self._readout, scratch, *frames, counts)
+        return clean, noisy, counts
+
+    def crop(
+        self, srgb: Srgb, origin: tuple[int, int], epoch: int, frame: Shape
+    ) -> tuple[Frame, Frame, Callable[[], Counts]]:
+        """Clean and noisy frame of a crop of a ``frame`` in an epoch, and a function that counts sites, in 5 µs."""
+        plan, keys = self._plans[0], self.keys.copy()
+        keys[0, 3] = frame_word(plan.place.frame, epoch)
+        inverse, noise = self.records(origin, epoch=epoch, frame=frame)
+        clean, noisy, numbers = self.fill(srgb, inverse, noise, keys, origin)
+        return clean, noisy[0], lambda: _counts_of(numbers, plan)[0]
+
+
+_renderers = [functools.lru_cache(maxsize=count)(Renderer) for count in KEPT_FORMS]
+"""Renderers of images of 8 bits and of 16 bits, wherever they are: kept for each size, because records are hashed."""
+
+
+def _renderer_of(srgb: Srgb, plans: tuple[Plan, ...], origin: tuple[int, int]) -> Renderer:
+    is_wide = srgb.itemsize > 1
+    return _renderers[is_wide](plans, srgb.shape[:2], (origin[0] % 2, origin[1] % 2), CODES[is_wide])
 
 
 def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
@@ -96,104 +166,6 @@ def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
         Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, light)
         for _, _, noisy_low, noisy_high, _, zero_variance, _ in numbers.tolist()
     ]
-
-
-def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
-    """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
-    return _frames_of(srgb, (plan.replace(dark=None),), 0, origin)[0]
-
-
-Noise = Gaussian | Gaussian32 | Electrons
-
-
-class _Form(NamedTuple):
-    """Records that all crops of one size share, wherever they are: kept for each size, because records are hashed."""
-
-    shape: tuple[int, ...]
-    clean_dtype: Any
-    noisy_dtype: Any
-    inverse: Unprocessing  # its class selects the precision
-    noise: Gaussian | Gaussian32 | None  # None for noise in electrons, which depends on the place
-    frames: tuple[Slots, ...]  # of noise in electrons
-    readout: ReadOut
-    keys: NDArray[np.uint64]
-
-
-def _form(plans: tuple[Plan, ...], shape: tuple[int, int], corner: tuple[int, int], codes: int) -> _Form:
-    """Return the form of frames of ``shape``, from ``codes`` codes, whose first site is ``corner`` of a tile."""
-    first, in_float32 = plans[0], uses_float32(plans[0])
-    packed = first.output.layout == PACKED
-    noise = None if first.counts_electrons else (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
-    return _Form(
-        (4, shape[0] // 2, shape[1] // 2) if packed else shape,
-        np.float32 if first.output.clean_normalised else np.uint16,
-        np.float32 if first.output.normalised else np.uint16,
-        unprocessing_of(first, codes, corner, Unprocessing32 if in_float32 else Unprocessing),
-        noise,
-        () if noise else tuple(map(slots_of, plans)),
-        readout_of(plans, shape if packed else (0, 0), corner, in_float32),
-        philox_keys(plans),
-    )
-
-
-_forms = [functools.lru_cache(maxsize=count)(_form) for count in KEPT_FORMS]
-
-
-def _frames_of(
-    srgb: Srgb,
-    plans: tuple[Plan, ...],
-    count: int,
-    origin: tuple[int, int],
-    dark_pixels: DarkPixels | None = None,
-) -> tuple[Frame, Frame, NDArray[np.int64]]:
-    """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`."""
-    shape, is_wide = srgb.shape[:2], srgb.itemsize > 1
-    form = _forms[is_wide](plans, shape, (origin[0] % 2, origin[1] % 2), CODES[is_wide])
-    inverse, noise = _records(form, plans, shape, origin, dark_pixels)
-    return _fill_frames(srgb, form, inverse, noise, form.keys[:count], origin)
-
-
-def _fill_frames(
-    srgb: Srgb, form: _Form, inverse: Unprocessing, noise: Noise, keys: NDArray[np.uint64], origin: tuple[int, int]
-) -> tuple[Frame, Frame, NDArray[np.int64]]:
-    """Return the clean frame, a noisy frame for each key, and their numbers of `Counts`.
-
-    Only the numbers of the first noisy frame include the counts of the clean frame.
-    """
-    clean = np.empty(form.shape, form.clean_dtype)
-    noisy = np.empty((len(keys), *form.shape), form.noisy_dtype)
-    counts = np.zeros((max(len(keys), 1), COUNT_FIELDS), np.int64)
-    # a view, a read-only array or a subclass would be another type, compiled again
-    codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
-    scratch = scratch_of_thread(np.float32 if type(inverse) is Unprocessing32 else np.float64)
-    frames = clean.reshape(-1), noisy.reshape(len(keys), clean.size)
-    _render(codes, inverse, noise, keys, origin, form.readout, scratch, *frames, counts)
-    return clean, noisy, counts
-
-
-def _records(
-    form: _Form,
-    plans: tuple[Plan, ...],
-    shape: tuple[int, int],
-    origin: tuple[int, int],
-    dark_pixels: DarkPixels | None = None,
-    epoch: int = 0,
-    frame: Shape | None = None,
-) -> tuple[Unprocessing, Noise]:
-    """Return the numbers of the unprocessing and the noise at a place, whose classes select the compiled code."""
-    first, inverse = plans[0], form.inverse
-    if form.noise is not None:
-        return inverse, form.noise
-    frames = form.frames
-    if epoch and any(slots.depends_on_epoch for slots in frames):
-        frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in plans)
-    patterns = patterns_at(frames[0].patterns, shape, origin, frame)
-    factor = light_factor(frames[0].patterns, patterns, shape, origin, first.averaged)
-    if factor is not None:
-        inverse = with_response(inverse, factor)
-    if first.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
-        patterns = patterns._replace(response=EQUAL_RESPONSE)
-    return inverse, electron_noise(plans, frames, patterns, dark_pixels, shape, origin)
 
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
