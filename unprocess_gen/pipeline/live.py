@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import noise_levels, patch_rule
+from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
@@ -44,7 +44,7 @@ from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import CropMaker, crop_maker
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.plan import Plan, noisy_frames
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
@@ -411,7 +411,7 @@ class PlannedPairs:
         self.settings = run.settings
         self._sources = [source for source in run.sources if source.reason is None]
         self._patches = 1 if rule is None else rule.count
-        self._plans = len(noise_levels(config.noise)) * config.noise.draws
+        self._plans = noisy_frames(config)
         self._planned: Recent[int, tuple[str, int, tuple[Plan, ...], tuple[Patch, ...]]] = Recent(KEPT)
         self._decoded: tuple[Source, str, Photograph] | None = None
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import noise_levels, patch_rule
+from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import free_bytes
@@ -15,6 +15,7 @@ from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
+from unprocess_gen.simulation.plan import noisy_frames
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.loader import load_source
@@ -30,7 +31,7 @@ OTHER_BYTES = 8000
 
 def source_bytes(config: Config, height: int, width: int) -> int:
     """Bytes of the pairs of a source with these sides after ``source.downscale``: arrays, and 8 kB a pair."""
-    output, pairs = config.output, len(noise_levels(config.noise)) * config.noise.draws
+    output, pairs = config.output, noisy_frames(config)
     patches = list_patches(patch_rule(config.source), 0, height, width, output.layout)
     clean, noisy = (np.dtype(name).itemsize for name in (output.clean_dtype or output.dtype, output.dtype))
     site = clean + pairs * noisy + len(output.targets) * 3 * np.dtype(np.float32).itemsize

@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.core.arrays import MOSAIC, Float
 from unprocess_gen.core.errors import ConfigError, SourceError
@@ -40,7 +39,7 @@ from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.render import render_clean
 from unprocess_gen.simulation.kernels.site_patterns import forget_patterns
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan
+from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan, noisy_frames
 from unprocess_gen.simulation.reference.electrons import noise_variance
 from unprocess_gen.simulation.reference.sensor import in_dn
 from unprocess_gen.sources.image.decode import Photograph
@@ -149,7 +148,7 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
 def select_inputs(config: Config, folder: Path) -> Inputs:
     """Select the first photographs; synthetic ones are written to ``folder``. ConfigError without one."""
     source = config.source if config.source.place is not None else _written_pictures(config.source, folder)
-    listed, most_pixels = list_photographs(source).sources, RUN_PIXELS // frames_per_photograph(config)
+    listed, most_pixels = list_photographs(source).sources, RUN_PIXELS // noisy_frames(config)
     samples, pixels, limit = list[tuple[Photograph, Source, str]](), 0, 0
     for number, photo in enumerate(listed, start=1):
         with suppress(SourceError):
@@ -179,17 +178,12 @@ def _written_pictures(source: SourceConfig, folder: Path) -> SourceConfig:
     return replace(source, root=str(folder / "photographs"), include=("*.jpg",), clips=False)
 
 
-def frames_per_photograph(config: Config) -> int:
-    """Noisy frames that a run makes of a photograph."""
-    return len(noise_levels(config.noise)) * config.noise.draws
-
-
 # ---------------------------------------------------------------------------------------------------------------- times
 
 
 def measure_runs(config: Config, inputs: Inputs, out: Path) -> dict[str, list[RunTimes]]:
     """Times of the runs of every tier by round; of the reference one, or none if its run would be too long."""
-    is_short = inputs.pixels * frames_per_photograph(config) <= MOST_REFERENCE_PIXELS
+    is_short = inputs.pixels * noisy_frames(config) <= MOST_REFERENCE_PIXELS
     compiled = [tier for tier in TIERS if tier != REFERENCE]
 
     def measure(tier: str, _: int) -> RunTimes:

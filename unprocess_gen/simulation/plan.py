@@ -89,13 +89,13 @@ FLOAT_CLEAN = Condition(
 )
 
 
-def _noisy_frames(config: Any) -> int:
+def noisy_frames(config: Any) -> int:
     """Number of noisy frames of each clean frame."""
     levels = config.noise.levels
     return int(config.noise.draws * (1 if levels is None else levels if isinstance(levels, int) else len(levels)))
 
 
-NOISY_FRAMES = Condition("each image has one noisy frame", lambda config: _noisy_frames(config) > 1)
+NOISY_FRAMES = Condition("each image has one noisy frame", lambda config: noisy_frames(config) > 1)
 
 
 # ------------------------------------------------------------------------------------------------------------- records

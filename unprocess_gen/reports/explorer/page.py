@@ -90,7 +90,7 @@ class Page:
         self._x, self._y = (Range1d(*ends, min_interval=SMALLEST_PX) for ends in ((0, 1), (1, 0)))
         self._message, self._facts, self._plan = map(_text_box, ("message", "facts", "plan"))
         self._pictures = [self._picture(name) for name in views.PICTURES]
-        self._lines = {name: ColumnDataSource({"xs": [], "ys": [], "label": [], "colour": []}) for name in views.PLOTS}
+        self._lines = {name: ColumnDataSource({part: [] for part in views.Curve._fields}) for name in views.PLOTS}
         self._curves = {name: self._curve(name) for name in views.PLOTS}
         self._curves["transfer"].scatter("x", "y", source=self._points, size=3, alpha=0.5, color=views.COLOURS["clean"])
         self._command = TextInput(name="command", title="Command of this pair")
@@ -200,9 +200,7 @@ class Page:
     def _draw_statistics(self, shown: Shown) -> None:
         fit = views.noise_fit(shown)
         for name, lines in views.curves(shown, fit).items():
-            labels, colours, xs, ys = zip(*lines, strict=True) if lines else [()] * 4
-            data = {"xs": [list(x) for x in xs], "ys": [list(y) for y in ys], "label": list(labels)}
-            self._lines[name].data = data | {"colour": list(colours)}
+            self._lines[name].data = {part: [getattr(line, part) for line in lines] for part in views.Curve._fields}
         points: Any = ([], []) if fit is None else (fit.signal_dn, fit.variance_dn2)
         step = len(points[0]) // POINTS_DRAWN + 1
         self._points.data = {"x": points[0][::step], "y": points[1][::step]}

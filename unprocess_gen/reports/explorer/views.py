@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -85,8 +85,14 @@ COLOURS = {"red": "#d1495b", "green": "#2e8b57", "blue": "#2f6db5", "clean": "#0
 BINS = 128
 FITTED_PX = 512
 
-Curve = tuple[str, str, Any, Any]
-"""Label, colour, x and y."""
+
+class Curve(NamedTuple):
+    """A line of a plot."""
+
+    label: str
+    colour: str
+    xs: Any
+    ys: Any
 
 
 def curves(shown: Shown, fit: NoiseFit | None) -> dict[str, list[Curve]]:
@@ -95,21 +101,21 @@ def curves(shown: Shown, fit: NoiseFit | None) -> dict[str, list[Curve]]:
     grey = np.repeat(light[:, None], 3, axis=1)
     inverted = unprocess.invert_gains(grey, camera.inverse_gains, isp.highlight, isp.highlight_threshold)
     highlight = [
-        (f"{name}, {gain:.3g}", COLOURS[name], light, inverted[:, channel])
+        Curve(f"{name}, {gain:.3g}", COLOURS[name], light, inverted[:, channel])
         for channel, (name, gain) in enumerate(zip(("red", "green", "blue"), camera.inverse_gains, strict=True))
     ]
     return {
         "source_histogram": list(_source_histogram(shown)),
         "raw_histogram": list(_raw_histogram(shown)),
         "highlight": highlight,
-        "transfer": [] if fit is None else [("expected", COLOURS["noisy"], *fit.line)],
+        "transfer": [] if fit is None else [Curve("expected", COLOURS["noisy"], *fit.line)],
     }
 
 
 def _source_histogram(shown: Shown) -> Iterator[Curve]:
     for channel, name in enumerate(("red", "green", "blue")):
         counts, edges = np.histogram(shown.srgb[..., channel], BINS, (0.0, np.iinfo(shown.srgb.dtype).max + 1.0))
-        yield name, COLOURS[name], edges[:-1], counts / counts.sum()
+        yield Curve(name, COLOURS[name], edges[:-1], counts / counts.sum())
 
 
 def _raw_histogram(shown: Shown) -> Iterator[Curve]:
@@ -119,7 +125,7 @@ def _raw_histogram(shown: Shown) -> Iterator[Curve]:
     edges = np.arange(low, high + 2, 1 + (high - low) // BINS) - 0.5
     for name, frame in (("clean", shown.clean), ("noisy", shown.noisy)):
         counts = np.histogram(frame, edges)[0]
-        yield name, COLOURS[name], edges[:-1] + 0.5, np.where(counts, counts / frame.size, np.nan)
+        yield Curve(name, COLOURS[name], edges[:-1] + 0.5, np.where(counts, counts / frame.size, np.nan))
 
 
 def noise_fit(shown: Shown) -> NoiseFit | None:
