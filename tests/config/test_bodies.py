@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers.cases import slow_except
-from helpers.commands import RunMain
 from helpers.datasets import Settings
 
 import unprocess_gen as ug
@@ -74,16 +73,3 @@ def test_own_body_uses_its_own_options(tmp_path: Path) -> None:
     config = ug.load_config(["body=mine", "camera.name=other"], tmp_path)
     assert config.camera.name == "other"
     assert "no noise profile of it is published, so noise=imx385_iso3200 applies" in body_sentence(config)
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("body=sony", "body=sony: no such option"),
-        ("body=[imx385]", "name of an option"),
-        ("body.missing=[a]", "a list of"),
-    ],
-)
-def test_wrong_bodies_are_refused(override: str, message: str, run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("plan", override, f"out={tmp_path}/ds")
-    assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1
