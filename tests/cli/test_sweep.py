@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -126,29 +125,6 @@ def test_plan_of_a_sweep_prints_every_job_and_totals(run_main: RunMain, source: 
     assert sorted(os.listdir(tmp_path)) == ["p"]
 
 
-KILLED = """
-import os, signal, sys
-from unprocess_gen.cli.main import main
-from unprocess_gen.pipeline import worker
-
-commit, made = worker.commit_shard, []
-
-
-def commits(*arguments):
-    report = commit(*arguments)
-    made.append(report)
-    if len(made) == 6:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return report
-
-
-worker.commit_shard = commits
-main()
-"""
-"""A command that is killed once it has committed 6 shards."""
-
-
-@pytest.mark.linux_only("kills a process by a signal")
 def test_sweep_into_a_dataset_changes_nothing(
     run_main: RunMain, make: Make, source: Path, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
@@ -168,23 +144,15 @@ def test_repair_of_a_sweep_leaves_jobs_without_a_dataset(run_main: RunMain, sour
     assert "sweep/seed=2: dataset.json: is missing: the job ended with exit code 5" in done.err
 
 
-def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path) -> None:
-    source = fill(tmp_path / "p", 4)
-    arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")
-    folders = [f"{folder},output.pairs_per_shard=1" for folder in FOLDERS]
-    command = [sys.executable, "-c", KILLED, *arguments]
-    killed = subprocess.run(command, cwd=tmp_path, env=environment(PYTHONPATH=PATHS), capture_output=True, check=False)
-    assert killed.returncode == -signal.SIGKILL
-    assert len(list((tmp_path / "sweep").glob("*/shards/*.tar"))) == 6
-    assert len(list((tmp_path / "sweep").glob("*/dataset.json"))) == 1
-
-    done = run_main(*arguments)
-    assert (done.code, done.out.count("nothing to do") >= 1) == (0, True)
-    assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*folders, "sweep.csv"])
-    assert [row["exit"] for row in sweep_rows(tmp_path / "sweep")] == ["0"] * 4
-    for (camera, noise), folder in zip(COMBINATIONS, folders, strict=True):
-        make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}", "output.pairs_per_shard=1")
-        assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
+def test_rerun_makes_what_a_killed_sweep_lacks(
+    run_main: RunMain, source: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    for out in ("sweep/seed=1", "two"):
+        make(source, tmp_path / out, f"seed={1 + (out == 'two')}")
+    done = run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    assert (done.code, done.out.count("nothing to do")) == (0, 1)
+    assert tree_hash(tmp_path / "sweep/seed=2") == tree_hash(tmp_path / "two")
+    assert [row["exit"] for row in sweep_rows(tmp_path / "sweep")] == ["0"] * 2
 
 
 def test_too_many_jobs_are_refused_at_once(run_main: RunMain, tmp_path: Path) -> None:

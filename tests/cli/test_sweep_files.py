@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import TreeHash, sweep_rows
 from helpers.photographs import fill
@@ -45,38 +44,21 @@ def jobs(*overrides: str, own: Path | None = None, multirun: bool = False) -> li
     return [",".join(named_overrides(job.overrides)) for job in jobs]
 
 
-WAYS = {
-    "sweep": ("sweep/two.yaml", {}, ["+sweep=two"]),
-    "primary config": ("two.yaml", {"defaults": ["config", "_self_"]}, ["-cn", "two"]),
-}
-"""Each way in which a file reaches Hydra: the file, its other content, and the arguments."""
-
-
-@pytest.fixture
-def swept(run_main: RunMain, mine: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the sweep of `PARAMS` on the command line; the first test that asks for it generates it."""
-    kept = tmp_path_factory.getbasetemp() / "swept_on_the_command_line"
-    if not kept.exists():
-        done = run_main("-m", *(f"{key}={value}" for key, value in PARAMS.items()), *REST)
-        assert done.code == 0, done.err
-        (tmp_path / "sweep").rename(kept)
-    return kept
-
-
-@pytest.mark.parametrize("way", slow_except(("sweep",), WAYS))
 def test_sweep_in_a_file_equals_the_command_line(
-    way: str, mine: Path, swept: Path, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
+    mine: Path, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
-    file, other, arguments = WAYS[way]
-    write(mine / file, other | SWEEP, "" if other else "# @package _global_\n")
-
-    done = run_main(*arguments, *REST)
-    assert done.code == 0, done.err
-    assert sorted(os.listdir(tmp_path / "sweep")) == sorted(os.listdir(swept)) == sorted([*NAMED, "sweep.csv"])
-    rows, expected = sweep_rows(tmp_path / "sweep"), sweep_rows(swept)
-    assert [row | {"seconds": ""} for row in rows] == [row | {"seconds": ""} for row in expected]
-    for name in NAMED:
-        assert tree_hash(tmp_path / "sweep" / name) == tree_hash(swept / name)
+    write(mine / "sweep/two.yaml", SWEEP)
+    write(mine / "two.yaml", {"defaults": ["config", "_self_"]} | SWEEP, "")
+    params = [f"{key}={value}" for key, value in PARAMS.items()]
+    found = []
+    for arguments in (["-m", *params], ["+sweep=two"], ["-cn", "two"]):
+        done = run_main(*arguments, *REST)
+        assert done.code == 0, done.err
+        rows = [row | {"seconds": ""} for row in sweep_rows(tmp_path / "sweep")]
+        found.append((rows, [tree_hash(tmp_path / "sweep" / name) for name in NAMED]))
+        shutil.rmtree(tmp_path / "sweep")
+    assert [row["folder"] for row in found[0][0]] == NAMED
+    assert found[1] == found[2] == found[0]
 
 
 def test_settings_next_to_the_params_hold_for_every_job(mine: Path) -> None:
@@ -149,19 +131,26 @@ def test_sweeps_that_cannot_be_honoured_are_refused(case: str, mine: Path, run_m
     assert not (tmp_path / "sweep").exists()
 
 
-def test_params_in_an_option_that_the_sweep_selects_are_refused(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+MISREAD = [
+    ("sweep/seeds.yaml", SWEEP, ["+sweep=seeds"], "expected '# @package _global_' as its first line"),
+    ("config.yaml", {"seed": 3}, ["--config-name", "config"], "mine/config.yaml has the name of a built-in file"),
+    (
+        "noise/hides.yaml",
+        {"defaults": [{"/sweep@_global_": "inner"}]},
+        ["-m", "noise=hides,none"],
+        "params.seed: found in an",
+    ),
+]
+
+
+@pytest.mark.parametrize(("file", "content", "arguments", "sentence"), MISREAD, ids=[file for file, *_ in MISREAD])
+def test_files_that_hydra_would_misread_are_refused(
+    file: str, content: dict[str, Any], arguments: list[str], sentence: str, mine: Path, run_main: RunMain
+) -> None:
     write(mine / "sweep/inner.yaml", {"hydra": {"sweeper": {"params": {"seed": "1,2"}}}})
-    write(mine / "sweep/outer.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"+sweep@x": "inner"}}}})
-    write(mine / "noise/hides.yaml", {"defaults": ["/sweep@_global_: inner"]}, "")
-    done = run_main("-m", "noise=hides", *REST)
-    assert (done.code, done.err.count("\n")) == (2, 1), done.err
-    assert not list((tmp_path).glob("sweep/*/dataset.json"))
-
-
-def test_sweep_file_without_package_line_is_refused_with_advice(mine: Path, run_main: RunMain) -> None:
-    write(mine / "sweep/seeds.yaml", SWEEP, header="")
-    done = run_main("+sweep=seeds", *REST)
-    assert (done.code, done.err.count("\n"), "expected '# @package _global_'" in done.err) == (2, 1, True)
+    write(mine / file, content, header="")
+    done = run_main(*arguments, *REST)
+    assert (done.code, done.err.count("\n"), sentence in done.err) == (2, 1, True), done.err
 
 
 SHIPPED = {"iso_ladder": 5, "cameras": 4, "camera_by_iso": 20, "gain_extremes": 8, "paper_figure6": 4}
@@ -186,13 +175,3 @@ def test_cfg_job_prints_every_job_of_a_sweep(mine: Path, run_main: RunMain) -> N
     assert done.code == 0
     cameras = re.findall(r"^camera:\n  name: (\w+)$", done.out, re.MULTILINE)
     assert cameras == ["sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p"]
-
-
-def test_primary_config_that_the_built_in_one_hides_is_refused(mine: Path, run_main: RunMain) -> None:
-    write(mine / "config.yaml", {"seed": 3}, "")
-    done = run_main("--config-dir", "mine", "--config-name", "config", "--cfg", "job")
-    assert (done.code, done.err.count("\n"), "mine/config.yaml has the name of a built-in file" in done.err) == (
-        2,
-        1,
-        True,
-    )
