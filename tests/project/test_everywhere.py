@@ -2,8 +2,7 @@
 
 Each test makes one small dataset in a new process under settings that change the code path of a library, and compares
 every byte with a plain run. The process reports whether the settings took effect (`everywhere`); a setting that a
-library no longer knows proves nothing. A slow test applies all settings of libraries at once, others apply them one by
-one, to name the setting that changes a byte; they also compile the kernels with other options.
+library no longer knows proves nothing. Others compile the kernels with other options.
 
 A change in the last place of a double changes one DN in 10^12 sites, so that bytes alone could miss it. Doubles before
 rounding are therefore compared too, and the machine code of the kernels is inspected for x86-64 with AVX-512, Arm and
@@ -31,6 +30,7 @@ import numpy as np
 import pytest
 from helpers import everywhere
 from helpers.commands import run_process
+from helpers.datasets import contents
 from helpers.photographs import pixels
 from helpers.promise_report import Figure
 from packaging.requirements import Requirement
@@ -118,17 +118,13 @@ def compiled(make: Make, plain: Made, tmp_path_factory: pytest.TempPathFactory) 
     return made
 
 
-def files(made: Made) -> dict[str, bytes]:
-    return {str(path.relative_to(made.out)): path.read_bytes() for path in made.out.rglob("*.*")}
-
-
 def assert_same(made: Made, plain: Made) -> None:
-    mine, theirs = files(made), files(plain)
+    mine, theirs = contents(made.out), contents(plain.out)
     assert {name for name in mine | theirs if mine.get(name) != theirs.get(name)} <= {"dataset.json"}
     assert made.facts["doubles"] == plain.facts["doubles"]
 
 
-# All settings at once -------------------------------------------------------------------------------------------------
+# Settings -------------------------------------------------------------------------------------------------------------
 
 ENABLED = [
     name for name in np._core._multiarray_umath.__cpu_dispatch__ if np._core._multiarray_umath.__cpu_features__[name]
@@ -147,76 +143,35 @@ OLD_OPENCV = {"OPENCV_CPU_DISABLE": ",".join(everywhere.opencv_features()), "OPE
 LIBRARIES = OLD_OPENCV | {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED), "GLIBC_TUNABLES": WITHOUT_FMA}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("flags", [(), ("-O",), ("-OO",)])
-def test_all_settings_together_change_no_byte(flags: tuple[str, ...], make: Make, plain: Made, figure: Figure) -> None:
-    """Libraries use their oldest code; ``-O`` compiles all Python modules again, without assertions."""
-    made = make(sys.executable, *flags, **SURROUNDINGS, **LIBRARIES)
-    assert made.facts["optimize"] == "".join(flags).count("O")
-    assert (made.facts["numpy"], made.facts["opencv"], made.facts["ipp"]) == ([], [], False)
-    assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-@pytest.mark.slow
-def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
-    made = make(NUMBA_DISABLE_JIT="1")
-
-    assert not made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
-    assert_same(made, plain)
-
-
-# One setting ----------------------------------------------------------------------------------------------------------
-
-SETTINGS = [
-    *({name: value} for name, value in SURROUNDINGS.items()),
-    *(OLD_OPENCV, {"GLIBC_TUNABLES": WITHOUT_FMA}),
-    *({"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED[first:])} for first in range(len(ENABLED))),
-    *({"OPENBLAS_CORETYPE": core} for core in ("Prescott", "Nehalem", "Haswell", "Zen", "SkylakeX")),
+SETTINGS: list[tuple[str, dict[str, str]]] = [
+    *((flag, SURROUNDINGS | LIBRARIES) for flag in ("", "-O", "-OO")),
+    ("", {"NUMBA_DISABLE_JIT": "1"}),
+    *(("", {name: value}) for name, value in SURROUNDINGS.items()),
+    *(("", env) for env in (OLD_OPENCV, {"GLIBC_TUNABLES": WITHOUT_FMA})),
+    *(("", {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED[first:])}) for first in range(len(ENABLED))),
+    *(("", {"OPENBLAS_CORETYPE": core}) for core in ("Prescott", "Nehalem", "Haswell", "Zen", "SkylakeX")),
 ]
-CHANGED = {"OPENCV_CPU_DISABLE": "opencv", "GLIBC_TUNABLES": "libm"}
+"""Flags of Python and settings: the oldest code of all libraries at once, then one by one, to name what changes a byte.
+
+``-O`` compiles all Python modules again, without assertions.
+"""
+CHANGED = {"OPENCV_CPU_DISABLE": "opencv", "GLIBC_TUNABLES": "libm", "NUMBA_DISABLE_JIT": "kernels"}
 CHANGED |= {"NPY_DISABLE_CPU_FEATURES": "numpy", "OPENBLAS_CORETYPE": "product"}
 """The fact in which a setting shows."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env", SETTINGS, ids=lambda env: " ".join(f"{name}={value}" for name, value in env.items()))
-def test_one_setting_changes_no_byte(env: dict[str, str], make: Make, plain: Made, figure: Figure) -> None:
-    made = make(**env)
+@pytest.mark.parametrize(
+    ("flag", "env"), SETTINGS, ids=lambda value: " ".join(value) if isinstance(value, dict) else ""
+)
+def test_settings_change_no_byte(flag: str, env: dict[str, str], make: Make, plain: Made, figure: Figure) -> None:
+    made = make(sys.executable, *filter(None, [flag]), **env)
+    assert made.facts["optimize"] == flag.count("O")
     for name in env.keys() & CHANGED.keys():
         if made.facts[CHANGED[name]] == plain.facts[CHANGED[name]]:
             pytest.skip(f"{name} changes nothing on this machine")
     assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-SHORT_OF_MEMORY = """
-import resource, sys
-from unprocess_gen.sources.image.decode import decode
-from unprocess_gen.core.errors import SourceError
-small, large = (open(path, "rb").read() for path in sys.argv[1:])
-decode(small, max_pixels=2**26, icc="ignore")
-taken = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (taken + 2**24, resource.RLIM_INFINITY))
-try:
-    decode(large, max_pixels=2**26, icc="ignore")
-except SourceError as error:
-    print(f"a row that says {error.reason}")
-except Exception as error:
-    print(type(error).__name__)
-else:
-    print("decoded")
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the memory of a process is limited as on Linux")
-def test_a_photograph_is_not_corrupt_when_memory_is_short(photographs: Path, tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "large.jpg"), np.full((4000, 4000, 3), 99, dtype=np.uint8))
-
-    command = [sys.executable, "-c", SHORT_OF_MEMORY, photographs / "444.jpg", tmp_path / "large.jpg"]
-    done = run_process(*command)
-
-    assert done.stdout.strip() in ("MachineError", "MemoryError")
+    figure("machines", f"same bytes in {len(contents(plain.out))} files")
 
 
 WITHOUT_VECTOR_CODE = """
@@ -270,7 +225,7 @@ def test_other_compiler_options_change_no_byte(
     assert made.facts["kernels"]["code"] != compiled.facts["kernels"]["code"]
     assert env is not GENERIC or not made.facts["kernels"]["ymm"]
     assert_same(made, compiled)
-    figure("machines", f"same bytes in {len(files(compiled))} files")
+    figure("machines", f"same bytes in {len(contents(compiled.out))} files")
 
 
 @pytest.fixture(scope="module")
@@ -352,4 +307,4 @@ def test_library_versions_change_no_byte(which: str, make: Make, plain: Made, tm
     assert (plainest.facts["numpy"], plainest.facts["opencv"]) == ([], [])
     assert_same(made, plain)
     assert_same(plainest, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
+    figure("machines", f"same bytes in {len(contents(plain.out))} files")

@@ -1,4 +1,4 @@
-"""Limits of size and circles: no module above 500 lines of code, no function above 45, no import closes a circle."""
+"""Limits of size, circles of imports, which modules may import a library, and kernels without fast-math."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import io
 import tokenize
 from pathlib import Path
 
+import pytest
+from helpers.everywhere import KERNELS
 from helpers.modules import MODULES, PACKAGE, tree
 
 MODULE, FUNCTION = 500, 45
@@ -41,18 +43,52 @@ NAMES = {name.removesuffix(".__init__") for name in MODULE_OF}
 
 
 def imports(path: Path) -> set[str]:
-    """Return the modules of the package that a module imports, for type checking and inside functions too."""
+    """Return the modules that a module imports, for type checking and inside functions too."""
     found: set[str] = set()
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            names = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {full if full in NAMES else node.module or "" for full in names.values()}
-    return found & NAMES
+            assert node.level == 0, f"{path} has a relative import"
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in NAMES else node.module or "" for name in names}
+    return found
 
 
-GRAPH = {name.removesuffix(".__init__"): imports(path) for name, path in MODULE_OF.items()}
+IMPORTS = {name.removesuffix(".__init__"): imports(path) for name, path in MODULE_OF.items()}
+GRAPH = {name: modules & NAMES for name, modules in IMPORTS.items()}
+
+ONLY_IN = {
+    "hydra": {"config.composition", "config.composition_errors"},
+    "omegaconf": {"config.composition", "config.composition_errors", "config.serialization"},
+    "joblib": {"pipeline.executors.local"},
+    "llvmlite": {"simulation.kernels.simd"},
+    "numba": {"simulation.kernels.jit", "simulation.kernels.simd"},
+    "cv2": {
+        *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
+        *("reports.explorer.views", "reports.panels", "camera_noise"),
+    },
+    "PIL": {"reports.pictures", "sources.image.decode", "sources.image.headers"},
+    "tarfile": {"dataset.shards"},
+    "tifffile": {"dataset.dng", "sources.raw.decode"},
+    "rawpy": {"sources.raw.decode"},
+    "scipy": {"calibration.calibrate", "calibration.frame_sums", "calibration.shape"},
+    "torch": {"torch"},
+    "dask": {"pipeline.executors.dask"},
+    "distributed": {"pipeline.executors.dask"},
+}
+"""The modules that may import a library."""
+
+
+@pytest.mark.parametrize("library", ONLY_IN)
+def test_libraries_are_imported_in_listed_modules_only(library: str) -> None:
+    users = {name for name, modules in IMPORTS.items() if library in {module.split(".")[0] for module in modules}}
+    assert {name.partition(".")[2] for name in users} == ONLY_IN[library]
+
+
+def test_no_kernel_is_compiled_with_fast_math() -> None:
+    assert len(KERNELS) >= 20
+    assert not any(kernel.targetoptions.get("fastmath") for kernel in KERNELS.values())
 
 
 def test_no_import_closes_a_circle() -> None:
