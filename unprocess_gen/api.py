@@ -29,6 +29,7 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row, Value
+from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.dataset.row import pair_row, plan_from_row
@@ -326,7 +327,7 @@ def replay(
         keys = str(keys) if isinstance(keys, int) else ",".join(map(str, keys))
     rows = select_rows(manifest, keys)
     given = (None if place is None else os.fspath(place) for place in (root, dark_frames))
-    places = _replay.places_of(manifest.parent, *given)
+    places = recorded_places(manifest.parent, *given)
     return list(_replay.replay(rows, places.root, None if to is None else Path(to), places.dark_frames))
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.messages import print_results, report, report_error
-from unprocess_gen.cli.places import dataset_folder, given_root, recorded_places
+from unprocess_gen.cli.places import dataset_folder, given_places, given_root
 from unprocess_gen.cli.sweep import worst
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 from unprocess_gen.reports.formatting import counted
@@ -75,7 +75,7 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
     from unprocess_gen.pipeline.repair import repair
 
     refusal = f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset"
-    places, codes = recorded_places(folder, call), []
+    places, codes = given_places(folder, call), []
     for step in repair(local_path(folder, refusal), places.root, places.dark_frames):
         (report if step.exit_code else print_results)(step.text)
         codes.append(step.exit_code)
@@ -86,7 +86,7 @@ def _regenerated(folder: AnyPath, call: Call) -> list[ReplayResult]:
     """Regenerate rows that are spread evenly over the dataset, and compare them."""
     from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay
 
-    rows, places = evenly_spaced_rows(folder / "manifest.csv", call.regenerate), recorded_places(folder, call)
+    rows, places = evenly_spaced_rows(folder / "manifest.csv", call.regenerate), given_places(folder, call)
     return list(replay(rows, places.root, dark_frames=places.dark_frames))
 
 
@@ -101,7 +101,7 @@ def _check_noise(folder: AnyPath, call: Call) -> list[str]:
     from unprocess_gen.reports.noise_check.alarms import check_pairs
     from unprocess_gen.sources.dark_frames import dark_folder
 
-    dark_frames = recorded_places(folder, call).dark_frames
+    dark_frames = given_places(folder, call).dark_frames
     try:
         access = None if dark_frames is None else dark_folder(dark_frames)
     except ConfigError:  # without the recorded files, the pairs are counted as not checked
@@ -154,7 +154,7 @@ def replay(call: Call) -> int:
     failed: list[Row] = []
     rows = _ok_rows(select_rows(manifest, call.keys, failed), failed)
     codes, written, unknown = [], False, 0
-    places = recorded_places(manifest.parent, call)
+    places = given_places(manifest.parent, call)
     for result in replay(rows, places.root, call.to, places.dark_frames):
         codes.append(result.exit_code)
         written |= result.written

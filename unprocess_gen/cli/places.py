@@ -9,7 +9,7 @@ from unprocess_gen.core.errors import ConfigError, DamageError
 
 if TYPE_CHECKING:
     from unprocess_gen.core.paths import AnyPath
-    from unprocess_gen.pipeline.replay import Places
+    from unprocess_gen.dataset.dataset_json import Places
 
 
 def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
@@ -50,8 +50,8 @@ def given_root(call: Call) -> str | None:
     return root
 
 
-def recorded_places(folder: AnyPath, call: Call) -> Places:
+def given_places(folder: AnyPath, call: Call) -> Places:
     """Places of sources and dark frames of a dataset, by the call or by ``dataset.json``."""
-    from unprocess_gen.pipeline.replay import places_of
+    from unprocess_gen.dataset.dataset_json import recorded_places
 
-    return places_of(folder, given_root(call), call.settings.get("noise.dark_frames"))
+    return recorded_places(folder, given_root(call), call.settings.get("noise.dark_frames"))

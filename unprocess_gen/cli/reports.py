@@ -10,7 +10,7 @@ from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.jobs import Job, composed_jobs, option_folders, run_jobs
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.messages import report as report_message
-from unprocess_gen.cli.places import dataset_folder, recorded_places
+from unprocess_gen.cli.places import dataset_folder, given_places
 from unprocess_gen.cli.sweep import swept_keys
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.libraries import require
@@ -72,7 +72,7 @@ def report(call: Call) -> int:
     folder = dataset_folder(call, sweeps=True)
     if isinstance(folder, Path) and is_sweep(folder):
         return _report_sweep(folder, call)
-    places = recorded_places(folder, call)
+    places = given_places(folder, call)
     root, dark = places.root, places.dark_frames
     if "noise.dark_frames" in call.settings and dark is not None:
         dark_folder(dark)  # refuses a folder that the user names and that does not exist
@@ -98,7 +98,7 @@ def preview(call: Call) -> int:
     from unprocess_gen.reports.sheets import write_sheets
 
     folder = dataset_folder(call)
-    to, root, keys = call.to, recorded_places(folder, call).root, call.keys or ""
+    to, root, keys = call.to, given_places(folder, call).root, call.keys or ""
     files = code = 0
     failed = select_pairs(folder / "manifest.csv", keys).failed if keys else 0
     _check_not_among_photographs(to, root)

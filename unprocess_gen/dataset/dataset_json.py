@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.core.records import MAX_BYTES, Amount, Count, Digest, check_record, parse_json
+from unprocess_gen.core.records import MAX_BYTES, Amount, Count, Digest, check_record, parse_json, parse_record
 from unprocess_gen.dataset.shards import shard_name
 
 
@@ -165,6 +165,36 @@ def read_dataset(path: AnyPath) -> dict[str, Any]:
     if not intact:
         raise DamageError(f"{path}: was changed: its SHA-256 differs from dataset_sha256")
     return dict(facts)
+
+
+class Places(NamedTuple):
+    """Places of sources, of the file that lists them, and of dark frames; None for what is unknown or not used."""
+
+    root: str | None
+    list: str | None
+    dark_frames: str | None
+
+    @property
+    def settings(self) -> dict[str, str | None]:
+        """Settings that give these places."""
+        sources = {"source.root": self.root, "source.list": self.list if self.root else None}
+        return sources | {"noise.dark_frames": self.dark_frames}
+
+
+class _Recorded(msgspec.Struct, frozen=True):
+    source: SourceFacts = SourceFacts("synthetic", None)
+    dark_frames: DarkFrameFacts | None = None
+
+
+def recorded_places(folder: AnyPath, root: str | None = None, dark_frames: str | None = None) -> Places:
+    """Places that are given, else those in ``dataset.json``, which may be missing or damaged."""
+    try:
+        recorded = parse_record((folder / "dataset.json").read_bytes(), _Recorded)
+    except (OSError, ValueError):
+        recorded = _Recorded()
+    recorded_frames = recorded.dark_frames or DarkFrameFacts()
+    recorded_root = recorded.source.root if root is None else root
+    return Places(recorded_root, recorded.source.list, dark_frames or recorded_frames.root)
 
 
 _END = "\n}\n"

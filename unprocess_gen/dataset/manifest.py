@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import itertools
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from typing import BinaryIO, TextIO
 
@@ -51,6 +53,29 @@ def read_rows(path: AnyPath) -> Iterator[Row]:
     DamageError if the file is not a manifest, or a value is not allowed; the sentence names row, column and value.
     """
     return (row for _, row in rows_with_offsets(path))
+
+
+ShardRows = tuple[int, list[Row]]
+"""Number of a shard, and its rows in the order of the manifest."""
+
+
+def shard_rows(manifest: AnyPath) -> Iterator[ShardRows]:
+    """Read the rows of a manifest shard by shard.
+
+    Raises DamageError if the manifest cannot be read, or its shards are not in ascending order.
+    """
+    last = -1
+    for number, group in itertools.groupby(read_rows(manifest), key=operator.itemgetter("shard")):
+        rows = list(group)
+        if number is None:
+            raise DamageError(f"{manifest}: row {rows[0]['key']} names no shard")
+        if number <= last:
+            raise DamageError(
+                f"{manifest}: row {rows[0]['key']} of shard {number} follows rows of shard {last}; expected shards in "
+                "ascending order"
+            )
+        last = number
+        yield number, rows
 
 
 def rows_with_offsets(path: AnyPath) -> Iterator[tuple[int, Row]]:

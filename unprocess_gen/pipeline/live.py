@@ -30,12 +30,13 @@ from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.dataset.columns import Value
+from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, open_datasets
 from unprocess_gen.dataset.row import COLUMNS, pair_row, patch_from_row, plan_from_row
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.pairs import PairSettings, levels_of, plan_pixels, targets_of
-from unprocess_gen.pipeline.replay import PairRegenerator, places_of, source_of
+from unprocess_gen.pipeline.replay import PairRegenerator, source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
@@ -370,7 +371,7 @@ class RecordedPairs(DatasetRows):
     def __init__(self, root: str | None, folder: AnyPath, split: str | None = None) -> None:
         super().__init__(folder, split)
         config, _ = read_dataset_yaml(folder / "config.yaml")
-        places = places_of(folder, root)
+        places = recorded_places(folder, root)
         self.settings = PairSettings.read(replaced(config, {"noise.dark_frames": places.dark_frames}))
         self._sources = PairRegenerator(places.root, places.dark_frames)
         self._kept: Recent[int, LiveImage] = Recent(KEPT)

@@ -21,13 +21,13 @@ from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, So
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text, fingerprint, read_dataset
+from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text, fingerprint, read_dataset, recorded_places
 from unprocess_gen.dataset.keys import group_by_sample, image_key, key_text, sample_key
-from unprocess_gen.dataset.manifest import header_text, read_rows, rows_text
+from unprocess_gen.dataset.manifest import header_text, read_rows, rows_text, shard_rows
 from unprocess_gen.dataset.row import columns_of, has_frames, row_json
 from unprocess_gen.dataset.shards import ShardWriter, shard_name, stored_rows
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, Places, check_root, places_of
+from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, check_root
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.tasks import (
     ROWS,
@@ -40,7 +40,7 @@ from unprocess_gen.pipeline.tasks import (
     read_records,
     tar_name,
 )
-from unprocess_gen.pipeline.verify import CONFIG, DATASET, MANIFEST, shard_rows, verify
+from unprocess_gen.pipeline.verify import CONFIG, DATASET, MANIFEST, verify
 from unprocess_gen.pipeline.worker import make_shard
 
 LEAST_PROOF = 100
@@ -73,7 +73,7 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
         elif CONFIG in damaged:
             place.write(CONFIG, facts["config"].encode())
             yield RepairStep(f"{CONFIG}: restored from {DATASET}")
-        config, kind = _read_config(folder, places_of(folder, root, dark_frames))
+        config, kind = _read_config(folder, root, dark_frames)
         if facts and MANIFEST in damaged:
             yield _restore_manifest(place, folder, facts, config, kind)
             damaged = {damage.file for damage in verify(folder)}
@@ -86,9 +86,10 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
             yield RepairStep(f"{DATASET}: rewritten; host, time and versions of the run are lost")
 
 
-def _read_config(folder: Path, places: Places) -> tuple[Config, str]:
+def _read_config(folder: Path, root: str | None = None, dark_frames: str | None = None) -> tuple[Config, str]:
     """Read the settings with the place of the sources, empty if it is unknown, and the kind of the sources."""
     config, kind = read_dataset_yaml(folder / CONFIG)
+    places = recorded_places(folder, root, dark_frames)
     root = None if kind == "synthetic" else places.root or ""
     return replaced(config, {**places.settings, "source.root": root}), kind
 
@@ -102,7 +103,7 @@ def _check_proof(folder: Path, damaged: set[str]) -> None:
         agree = fingerprint(*own) in left or all(f'"{digest}"' in left for digest in own)
         if len(left) < LEAST_PROOF:
             text = (folder / CONFIG).read_text(encoding="utf-8")
-            agree = damaged == {DATASET} and dataset_yaml(_read_config(folder, places_of(folder))[0]) == text
+            agree = damaged == {DATASET} and dataset_yaml(_read_config(folder)[0]) == text
     except (OSError, ValueError, ConfigError, DamageError):
         agree = False
     if not agree:

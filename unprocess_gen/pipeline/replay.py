@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from unprocess_gen.config.schema import RawConfig, SourceConfig
@@ -20,12 +18,10 @@ from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
 from unprocess_gen.dataset.row import has_frames, patch_from_row, plan_from_row
@@ -65,36 +61,6 @@ class ReplayResult:
         if not self.complaint:
             return 0
         return SourceChangedError.exit_code if self.source_changed else DamageError.exit_code
-
-
-class Places(NamedTuple):
-    """Places of sources, of the file that lists them, and of dark frames; None for what is unknown or not used."""
-
-    root: str | None
-    list: str | None
-    dark_frames: str | None
-
-    @property
-    def settings(self) -> dict[str, str | None]:
-        """Settings that give these places."""
-        sources = {"source.root": self.root, "source.list": self.list if self.root else None}
-        return sources | {"noise.dark_frames": self.dark_frames}
-
-
-class _Recorded(msgspec.Struct, frozen=True):
-    source: SourceFacts = SourceFacts("synthetic", None)
-    dark_frames: DarkFrameFacts | None = None
-
-
-def places_of(folder: AnyPath, root: str | None = None, dark_frames: str | None = None) -> Places:
-    """Places that are given, else those in ``dataset.json``, which may be missing or damaged."""
-    try:
-        recorded = parse_record((folder / "dataset.json").read_bytes(), _Recorded)
-    except (OSError, ValueError):
-        recorded = _Recorded()
-    recorded_frames = recorded.dark_frames or DarkFrameFacts()
-    recorded_root = recorded.source.root if root is None else root
-    return Places(recorded_root, recorded.source.list, dark_frames or recorded_frames.root)
 
 
 def check_root(folder: AnyPath, kind: str, root: str | None, verb: str = "") -> None:

@@ -239,7 +239,7 @@ def check_finished(folder: OutFolder, config: Config, sources: Sequence[Source],
     if (folder / "config.yaml").size() is None:
         raise DamageError(f"{folder}/config.yaml: is missing from a finished dataset; {repair}")
     check_settings(folder, dataset_yaml(config))
-    _check_sources(folder, lambda: _sources_of_rows(folder / "manifest.csv"), sources, listed=False)
+    _check_sources(folder, lambda: sources_of_rows(folder / "manifest.csv"), sources, listed=False)
     sizes = (folder / "shards").entries()
     for entry in facts["shards"]:
         size = sizes.get(str(entry["file"]).partition("/")[2])
@@ -318,7 +318,7 @@ def _read_listing(folder: OutFolder, known: RunFile) -> RecordedSources | None:
     return folder.record(LISTING, parse, MOST_BYTES)
 
 
-def _sources_of_rows(manifest: AnyPath) -> Iterator[Source]:
+def sources_of_rows(manifest: AnyPath) -> Iterator[Source]:
     """Yield the source of every image, with name, size and digest only."""
     for index, rows in enumerate(group_by_image(read_rows(manifest))):
         size, name = rows[0]["source_bytes"], str(rows[0]["source"])

@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import check_format, read_dataset
 from unprocess_gen.dataset.keys import group_by_sample
-from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.manifest import ShardRows, shard_rows
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 from unprocess_gen.dataset.row import has_frames
 from unprocess_gen.dataset.shards import check_members, shard_name
@@ -125,29 +124,6 @@ def check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
             continue
         if facts.get(field, digest) != digest:
             yield Damage(name, f"its SHA-256 is {digest}, dataset.json records {facts[field]}")
-
-
-ShardRows = tuple[int, list[Row]]
-"""Number of a shard, and its rows in the order of the manifest."""
-
-
-def shard_rows(manifest: AnyPath) -> Iterator[ShardRows]:
-    """Read the rows of a manifest shard by shard.
-
-    Raises DamageError if the manifest cannot be read, or its shards are not in ascending order.
-    """
-    last = -1
-    for number, group in itertools.groupby(read_rows(manifest), key=operator.itemgetter("shard")):
-        rows = list(group)
-        if number is None:
-            raise DamageError(f"{manifest}: row {rows[0]['key']} names no shard")
-        if number <= last:
-            raise DamageError(
-                f"{manifest}: row {rows[0]['key']} of shard {number} follows rows of shard {last}; expected shards in "
-                "ascending order"
-            )
-        last = number
-        yield number, rows
 
 
 def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], expected: Iterator[ShardRows]) -> list[Damage]:

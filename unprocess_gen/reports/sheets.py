@@ -23,11 +23,12 @@ from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.row import patch_from_row, plan_from_row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
-from unprocess_gen.pipeline.replay import PairRegenerator, places_of, source_of
+from unprocess_gen.pipeline.replay import PairRegenerator, source_of
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
@@ -70,7 +71,7 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
     pairs, manifest = RawPairs(folder), folder / "manifest.csv"
     if not len(pairs):
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
-    sources = PairRegenerator(places_of(folder, None if source is None else str(source)).root)
+    sources = PairRegenerator(recorded_places(folder, None if source is None else str(source)).root)
     for number in select_pairs(manifest, keys).rows if keys else evenly_spaced(range(len(pairs)), PAIRS_SHOWN):
         clean, noisy, row = pairs[number]
         plan, part, missing = plan_from_row(row), None, ""

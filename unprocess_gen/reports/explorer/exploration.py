@@ -24,13 +24,13 @@ from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.source import NO_CLIP, Source
 from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.keys import image_key, pair_key, patch_key
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.dataset.row import pair_row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
-from unprocess_gen.pipeline.replay import places_of
 from unprocess_gen.reports.estimate import predicted_levels
 from unprocess_gen.reports.explorer.overrides import overrides_of
 from unprocess_gen.reports.panels import MosaicArray
@@ -232,7 +232,7 @@ def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
     recorded, kind = read_dataset_yaml(folder / "config.yaml")
     settings = overrides_of(recorded)
     settings.pop("source.limit", None)
-    places = places_of(folder, given.pop("source.root", None))
+    places = recorded_places(folder, given.pop("source.root", None))
     if kind == "folder" and places.root is None:
         raise ConfigError(f"explore: {folder} does not record the folder of its sources; give source.root=ROOT")
     for key, place in places.settings.items():
