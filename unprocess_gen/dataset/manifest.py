@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import io
 import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import BinaryIO, TextIO
 
 from unprocess_gen.core.errors import DamageError
@@ -29,6 +31,16 @@ def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> Non
     r"""Write rows as CSV: ``\n`` line ends, quotes only if needed, empty cells for None."""
     stream.write(header_text(names))
     stream.writelines(rows_text([row], names) for row in rows)
+
+
+def write_manifest(path: Path, names: Sequence[str], texts: Iterable[bytes]) -> str:
+    """Write a manifest, given its lines in pieces; its SHA-256."""
+    digest = hashlib.sha256()
+    with path.open("wb", buffering=2**20) as stream:
+        for text in itertools.chain([header_text(names).encode()], texts):
+            digest.update(text)
+            stream.write(text)
+    return digest.hexdigest()
 
 
 def rows_text(rows: Iterable[Row], names: Sequence[str]) -> str:

@@ -8,25 +8,23 @@ Design: ``docs/design/pipeline.md``.
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 import platform
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
-from unprocess_gen.config.schema import Config, replaced
-from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
-from unprocess_gen.config.values import error_in_one_line
-from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import dataset_yaml
+from unprocess_gen.core.errors import RESUME, ConfigError, MachineError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text
-from unprocess_gen.dataset.manifest import header_text
-from unprocess_gen.dataset.row import columns_of
+from unprocess_gen.dataset.manifest import write_manifest
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
@@ -154,7 +152,7 @@ def generate(config: Config, label: str = "") -> Summary:
         if facts is not None:
             check_finished(folder, run.config, run.sources, facts)
         else:
-            known, made = _make(folder, run, None, label)
+            made = _make(folder, run, None, label)
             facts = folder.finished()  # by a concurrent run, where there is no lock
         if facts is not None:
             with suppress(OSError):  # may be read-only
@@ -168,7 +166,7 @@ def generate(config: Config, label: str = "") -> Summary:
                 "shards_made": made.shards,
                 "max_failed": config.source.max_failed,
             }
-            facts = _finish(folder, known, columns_of(run.config), run.file(None).facts(), process)
+            facts = _finish(folder, run.file(None), process)
     return Summary.of(folder.path, facts, started, made=made.rows, times=made.times, unmatched=run.listing.unmatched)
 
 
@@ -188,7 +186,7 @@ def make_part(config: Config, part: int, parts: int, label: str = "") -> Made | 
                 f"part {part}/{parts}: this dataset has {run.shards} shard{'s' * (run.shards != 1)}; expected N "
                 f"from 1 to {run.shards}; lower N or output.pairs_per_shard"
             )
-        _, made = _make(folder, run, (part, parts), label)
+        made = _make(folder, run, (part, parts), label)
         if folder.finished() is not None:  # another process made the part and merged
             folder.remove_work()
         return made
@@ -213,18 +211,14 @@ def merge(out: str) -> tuple[Summary, int]:
             return summary, sum(summary.failed.values()) if max_failed is None else max_failed
         if known is None:
             raise ConfigError(f"merge: {out}: no run has begun there; expected one; run gen-dataset part K/N first")
-        try:
-            config, _ = parse_dataset_yaml(known.config)
-        except (ValueError, ConfigError) as error:
-            raise DamageError(f"{out}: its config cannot be read ({error_in_one_line(error)})") from error
-        config = replaced(config, {"source.root": known.source.root})
+        check_settings(folder, known.config)
         process = {"max_failed": known.max_failed} | ({"parts": known.parts} if known.parts else {})
-        facts = _finish(folder, known, columns_of(config), known.facts(), process)
+        facts = _finish(folder, known, process)
     summary = Summary.of(folder.path, facts, started)
     return replace(summary, made=summary.rows), known.max_failed
 
 
-def _make(folder: OutFolder, run: Run, part: tuple[int, int] | None, label: str) -> tuple[RunFile, Made]:
+def _make(folder: OutFolder, run: Run, part: tuple[int, int] | None, label: str) -> Made:
     """Make and commit the shards that are not done, all or those of part K of N."""
     if run.config.executor.kind == "dask":
         from unprocess_gen.pipeline.executors.dask import make_shards
@@ -236,8 +230,8 @@ def _make(folder: OutFolder, run: Run, part: tuple[int, int] | None, label: str)
     todo = [run.task(shard) for shard in shards if shard not in done]
     if run.config.check_disk:
         check_free_space(run.config, [source for task in todo for source in task.sources])
-    known, made = begin(folder, run, parts if part else None), Made(done=len(done))
-    images = sum(len(task.sources) for task in todo)
+    begin(folder, run, parts if part else None)
+    made, images = Made(done=len(done)), sum(len(task.sources) for task in todo)
     total = images if part else len(run.sources)
     label = ": ".join(filter(None, (label, part and f"part {first} of {parts}")))
     with machine_errors(folder.path, RESUME), Progress(total, total - images, label) as progress:
@@ -247,42 +241,37 @@ def _make(folder: OutFolder, run: Run, part: tuple[int, int] | None, label: str)
             for warning in made.add(report):
                 progress.warn(warning)
             progress.advance(report.images, report.failed)
-    return known, made
+    return made
 
 
-def _finish(
-    folder: OutFolder, run: RunFile, columns: Sequence[str], sources: dict[str, Any], process: dict[str, Any]
-) -> dict[str, Any]:
-    """Write ``manifest.csv``, then ``dataset.json``, whose contents are returned, with facts on sources and process.
+def _finish(folder: OutFolder, run: RunFile, process: dict[str, Any]) -> dict[str, Any]:
+    """Write ``manifest.csv``, then ``dataset.json``, whose contents are returned, with facts on the process.
 
     If a row is provisional, ``.work`` is kept, so that the next run retries it. MachineError if shards are missing.
     """
     entries, missing, counts = list[dict[str, Any]](), list[int](), Counter[str]()
+
+    def lines() -> Iterator[bytes]:
+        for shard, read in enumerate(read_records(folder, range(run.shards))):
+            if read is None:
+                missing.append(shard)
+                continue
+            record, csv = read
+            entries.append(record.entry)
+            counts.update(record.counts)
+            yield csv
+
     with machine_errors(folder.path, RESUME):
-        manifest, digest = folder.scratch / "manifest.csv", hashlib.sha256()
-        with manifest.open("wb", buffering=2**20) as stream:
-
-            def add(text: bytes) -> None:
-                digest.update(text)
-                stream.write(text)
-
-            add(header_text(columns).encode())
-            for shard, read in enumerate(read_records(folder, range(run.shards))):
-                if read is None:
-                    missing.append(shard)
-                    continue
-                record, csv = read
-                entries.append(record.entry)
-                counts.update(record.counts)
-                add(csv)
+        manifest = folder.scratch / "manifest.csv"
+        digest = write_manifest(manifest, run.columns, lines())
         if missing:
             raise _missing_error(folder, run, missing)
         (folder / "manifest.csv").commit(manifest)
         decoders = decoder_versions() if run.source.kind == "raw" else {}
         versions = {package: version(package) for package in PACKAGES} | decoders
         machine = {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
-        facts = count_facts(counts) | sources | {"run": process | machine, "versions": versions}
-        dataset = dataset_facts(run.config, digest.hexdigest(), entries, facts)
+        facts = count_facts(counts) | run.facts() | {"run": process | machine, "versions": versions}
+        dataset = dataset_facts(run.config, digest, entries, facts)
         folder.write("dataset.json", dataset_text(dataset).encode())
         if not any(entry.get("provisional") for entry in entries):
             folder.remove_work()
@@ -301,11 +290,7 @@ def _missing_error(folder: OutFolder, run: RunFile, missing: Sequence[int]) -> M
 
 def _ranges(numbers: Sequence[int]) -> str:
     """Numbers as ranges, as batch systems take them: ``3,7-9``; at most `RANGES_SHOWN`."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and runs[-1][1] == number - 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    texts = [str(first) if first == last else f"{first}-{last}" for first, last in runs[:RANGES_SHOWN]]
-    return ",".join(texts) + ", …" * (len(runs) > RANGES_SHOWN)
+    runs = itertools.groupby(enumerate(numbers), lambda item: item[1] - item[0])
+    ranges = [[number for _, number in run] for _, run in itertools.islice(runs, RANGES_SHOWN + 1)]
+    texts = [str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in ranges[:RANGES_SHOWN]]
+    return ",".join(texts) + ", …" * (len(ranges) > RANGES_SHOWN)

@@ -23,7 +23,7 @@ from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text, fingerprint, read_dataset, recorded_places
 from unprocess_gen.dataset.keys import group_by_sample, image_key, key_text, sample_key
-from unprocess_gen.dataset.manifest import header_text, read_rows, rows_text, shard_rows
+from unprocess_gen.dataset.manifest import read_rows, rows_text, shard_rows, write_manifest
 from unprocess_gen.dataset.row import columns_of, has_frames, row_json
 from unprocess_gen.dataset.shards import ShardWriter, shard_name, stored_rows
 from unprocess_gen.pipeline.folder import OutFolder
@@ -139,10 +139,7 @@ def _restore_manifest(place: OutFolder, folder: Path, facts: dict[str, Any], con
 def _is_manifest(place: OutFolder, columns: Sequence[str], texts: Iterable[bytes], facts: dict[str, Any]) -> bool:
     """Write a manifest, given the lines of each shard, and put it in place if it has the recorded digest."""
     part = place.scratch / MANIFEST
-    with part.open("wb") as stream:
-        stream.write(header_text(columns).encode())
-        stream.writelines(texts)
-    if file_sha256(part) != facts["manifest_sha256"]:
+    if write_manifest(part, columns, texts) != facts["manifest_sha256"]:
         return False
     (place / MANIFEST).commit(part)
     return True

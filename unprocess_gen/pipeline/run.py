@@ -17,13 +17,12 @@ import math
 import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
 from typing import Any
 
 import msgspec
-import numpy as np
 from yaml import YAMLError
 
 from unprocess_gen.config.schema import Config
@@ -36,13 +35,14 @@ from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.row import columns_of
 from unprocess_gen.pipeline.deaths import DEATHS
 from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.planning.advice import body_sentence, dark_scene_warning, sensor_warning
 from unprocess_gen.sources.listing import Listing, list_photographs
-from unprocess_gen.sources.names import decode_name
+from unprocess_gen.sources.recorded import RecordedSources, recorded_text
 
 RUN, LISTING = f"{WORK}/run.json", f"{WORK}/listing.jsonl"
 
@@ -58,6 +58,7 @@ class RunFile(msgspec.Struct, frozen=True):
 
     version: str
     config: str
+    columns: tuple[str, ...]
     sources: Count
     shards: Count
     parts: Count | None
@@ -110,9 +111,7 @@ class Run:
     @cached_property
     def listing_text(self) -> bytes:
         """Lines of `LISTING`."""
-        if isinstance(self.sources, RecordedSources):
-            return self.sources.content
-        return b"".join(msgspec.json.encode(_values(source)) + b"\n" for source in self.sources)
+        return recorded_text(self.sources)
 
     def file(self, parts: int | None) -> RunFile:
         """Facts on which all processes of the run must agree, as this process finds them."""
@@ -121,6 +120,7 @@ class Run:
         return RunFile(
             version=version("unprocess_gen"),
             config=dataset_yaml(config),
+            columns=columns_of(config),
             sources=len(self.sources),
             shards=self.shards,
             parts=parts,
@@ -169,8 +169,8 @@ def read_run(folder: OutFolder) -> RunFile | None:
     return folder.record(RUN, lambda content: parse_record(content, RunFile))
 
 
-def begin(folder: OutFolder, run: Run, parts: int | None = None) -> RunFile:
-    """Record a run, or check that it is the one that is recorded; return the record.
+def begin(folder: OutFolder, run: Run, parts: int | None = None) -> None:
+    """Record a run, or check that it is the one that is recorded.
 
     ConfigError if it was begun with other settings, sources or parts, a part also if by another version; if the folder
     cannot be written. MachineError if the disk is full.
@@ -207,7 +207,6 @@ def begin(folder: OutFolder, run: Run, parts: int | None = None) -> RunFile:
         if folder.finished() is not None:  # by another run since this one began
             folder.remove_work()
         raise
-    return known
 
 
 def check_version(folder: OutFolder, known: RunFile) -> None:
@@ -273,38 +272,6 @@ def check_settings(folder: OutFolder, config_yaml: str, place: str | None = None
 
 
 # ------------------------------------------------------------------------------------------------------------ sources
-
-_FIELDS = tuple(field.name for field in fields(Source) if field.name not in ("index", "path"))
-_DEFAULTS = tuple(field.default for field in fields(Source) if field.name not in ("index", "path"))
-
-
-class RecordedSources(Sequence[Source]):
-    """Sources of a recorded listing, each parsed when it is taken: a part of a million takes only its own."""
-
-    def __init__(self, content: bytes) -> None:
-        self.content = content
-        letters, size = np.frombuffer(content, np.uint8), 2**24
-        starts = range(0, len(content), size)
-        self._ends = np.concatenate([np.flatnonzero(letters[i : i + size] == ord("\n")) + i for i in starts])
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    def __getitem__(self, item: Any) -> Any:
-        if isinstance(item, slice):
-            return tuple(self[index] for index in range(*item.indices(len(self))))
-        start = self._ends[item - 1] + 1 if item else 0
-        values = parse_record(self.content[start : self._ends[item]], list[Any])
-        source = dict(zip(_FIELDS, values, strict=False))
-        return check_record({"index": item, "path": decode_name(str(source["name"])), **source}, Source)
-
-
-def _values(source: Source) -> list[Any]:
-    """Values of a source, without those at the end that are defaults."""
-    values = [getattr(source, name) for name in _FIELDS]
-    while values[-1] == _DEFAULTS[len(values) - 1]:
-        values.pop()
-    return values
 
 
 def _read_listing(folder: OutFolder, known: RunFile) -> RecordedSources | None:
