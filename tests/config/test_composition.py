@@ -13,7 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 
 from unprocess_gen.config import composition
-from unprocess_gen.config.composition import compose_node, load_config
+from unprocess_gen.config.composition import compose_node, load_config, typed_config
 from unprocess_gen.config.option_files import OptionFolders, conf_dir
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.raw_files import SUFFIXES
@@ -160,7 +160,9 @@ def test_interpolations_resolve_in_every_value(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("name", ["$HOME", "a$b", r"\${x}", "it's", "été", "a b", "[1]", "back\\slash", "=", "a,b"])
 def test_folder_names_are_taken_as_they_are(name: str) -> None:
-    assert load_config([f"+out=~/{name}"]).out == os.path.expanduser("~/") + name.replace(r"\${", "${")
+    place = os.path.expanduser("~/") + name.replace(r"\${", "${")
+    assert load_config([f"+out=~/{name}"]).out == place
+    assert typed_config(compose_node([f"noise.dark_frames=~/{name}"]), []).noise.dark_frames == place
 
 
 BOMB = "".join(f"l{level}: &l{level} [{', '.join([f'*l{level - 1}' if level else '1'] * 9)}]\n" for level in range(12))

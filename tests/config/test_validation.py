@@ -131,7 +131,7 @@ REFUSED = [
     ),
     ("out=''", r"out='': expected the name of a folder"),
     ("source.root=/no/such/folder", r"source.root=/no/such/folder: no such folder"),
-    ("source.include=[]", r"source.include=\[\]: expected at least one pattern"),
+    ("source.include=[]", r"source.include=\[\]: expected a list of at least one pattern"),
     ("camera.law=fixed", r"camera.name=convex: expected one of nexus_6p, sony_a7r, olympus_em10, sony_rx100"),
     (
         f"camera.xyz2cam={MATRIX}",

@@ -18,7 +18,7 @@ from unprocess_gen.calibration.frame_sums import ROUNDING_DN2, Measurement
 from unprocess_gen.core.errors import ConfigError
 
 
-class Limits(NamedTuple):
+class Bounds(NamedTuple):
     """From which value of a statistic frames are doubtful, and refused; what it means, and what is expected."""
 
     doubtful: float
@@ -28,35 +28,35 @@ class Limits(NamedTuple):
 
 
 LIMITS = {
-    "light in darks": Limits(
+    "light in darks": Bounds(
         *(math.inf, 0.05, "the mean is {:.1%} of white away from black"),
         "frames without light; correct kind, or black_level_dn in captures.csv",
     ),
-    "clipped black": Limits(
+    "clipped black": Bounds(
         *(math.inf, 0.005, "{:.1%} of the values are the lowest that occurs: black is clipped, and noise is missing"),
         "raw frames with an offset",
     ),
-    "frames differ": Limits(
+    "frames differ": Bounds(
         *(math.inf, 1.2, "the variances of the frames differ by a factor of {:.2f}"),
         "frames of one ISO and exposure; remove those of another",
     ),
-    "missing codes": Limits(
+    "missing codes": Bounds(
         *(0.02, 0.25, "{:.0%} of the values within the noise never occur: the camera scales its values"),
         "values of the converter, not scaled ones, or ones of fewer bits",
     ),
-    "neighbours": Limits(  # real sensors reach 0.03 (EMVA 1288 reference set 001)
+    "neighbours": Bounds(  # real sensors reach 0.03 (EMVA 1288 reference set 001)
         *(0.025, 0.08, "the noise of neighbouring sites has a correlation of {:.3f}; a profile has none"),
         "raw frames without noise reduction or sharpening; switch off long-exposure and high-ISO noise reduction",
     ),
-    "flicker": Limits(
+    "flicker": Bounds(
         *(0.005, 0.02, "the mean differs by {:.1%} between the frames"),
         "one exposure in steady light; correct level and exposure_s, or use a lamp that does not flicker",
     ),
-    "bands": Limits(
+    "bands": Bounds(
         *(0.002, 0.01, "rows change by {:.2%} from frame to frame: the lamp flickers"),
         "steady light, or exposures of many periods of the mains",
     ),
-    "vignetting": Limits(
+    "vignetting": Bounds(
         *(0.2, 0.5, "the darkest sixteenth of the frame has {:.0%} less light than the brightest"),
         "even light; defocus, use a diffuser, or stop down",
     ),

@@ -60,7 +60,7 @@ VERSION_BASE = "1.3"
 PLAIN_ERRORS = (ValueError, TypeError, AttributeError, AssertionError, OSError, RecursionError)
 """Other exceptions that Hydra and OmegaConf raise for wrong overrides and files."""
 
-PATH_KEYS = ("source.root", "source.list", "out")
+PATH_KEYS = ("source.root", "source.list", "noise.dark_frames", "out")
 """Keys whose values are paths, which are quoted for Hydra's grammar."""
 
 SHORTHANDS = {"source.kind=raw": "source=raw", "source.kind=srgb": "source=default"}

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import math
 import pickle
-from pathlib import Path
 from typing import Any
 
 from unprocess_gen.config.interpretation import (
@@ -32,8 +31,6 @@ from unprocess_gen.config.schema import (
     Config,
     EffectsConfig,
     Group,
-    NoiseConfig,
-    SourceConfig,
 )
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import one_of, refusal
@@ -64,7 +61,6 @@ def validate_config(config: Config) -> None:
     """Check a configuration before a run: its values, and whether they fit this machine."""
     check_values(config)
     _check_environment(config)
-    _check_dark_folder(config.noise)
 
 
 def check_values(config: Config) -> None:
@@ -84,7 +80,7 @@ _allowed: Recent[bytes, bool] = Recent(64)
 def _check_values(config: Config) -> None:
     """Check all values but the seed."""
     _check_settings(config)
-    _check_source(config.source)
+    patch_rule(config.source)
     check_raw_source(config)
     _check_camera(config.camera)
     gain_distributions(config.gains)
@@ -118,8 +114,12 @@ def _check_settings(group: Any, prefix: str = "") -> None:
 
 
 def _check_environment(config: Config) -> None:
-    source = config.source
-    _check_places(source)
+    """Check that the files, folders and optional libraries of a run exist."""
+    source, noise = config.source, config.noise
+    if source.list is not None:
+        refused = f"source.list={source.list}: a list is a local text or CSV file; copy it to one"
+        if not local_path(source.list, refused).is_file():
+            raise ConfigError(f"source.list={source.list}: no such file; expected a text file with a path in each line")
     if source.root is not None:
         _check_root(source.root)
     if source.kind == "raw":
@@ -129,14 +129,13 @@ def _check_environment(config: Config) -> None:
             require(library, f"source.kind=raw: needs {library}", "raw")
     if config.executor.kind == "dask":
         require("distributed", "executor.kind=dask: needs Dask", "dask", ", or set executor=local")
-
-
-def _check_places(source: SourceConfig) -> None:
-    """Check the file of ``list``."""
-    if source.list is not None:
-        expected = f"source.list={source.list}: a list is a local text or CSV file; copy it to one"
-        if not local_path(source.list, expected).is_file():
-            raise ConfigError(f"source.list={source.list}: no such file; expected a text file with a path in each line")
+    if noise.dark_frames is not None:
+        given = f"noise.dark_frames={noise.dark_frames}"
+        refused = f"{given}: dark frames are read from a local folder only; copy them to one"
+        if not local_path(noise.dark_frames, refused).is_dir():
+            raise ConfigError(f"{given}: no such folder; expected a folder of dark frames")
+    elif noise.dark_frames_sha256 is not None:
+        raise ConfigError("noise.dark_frames is missing; expected the folder of the recorded dark frames")
 
 
 def _check_root(root: str) -> None:
@@ -149,12 +148,6 @@ def _check_root(root: str) -> None:
     if not exists:
         problem = "no such folder or file; expected photographs, or null for the synthetic pictures"
         raise ConfigError(f"source.root={root}: {problem}")
-
-
-def _check_source(source: SourceConfig) -> None:
-    if not source.include:
-        raise refusal("source.include", [], "expected at least one pattern such as '*.jpg'")
-    patch_rule(source)
 
 
 def _check_camera(camera: CameraConfig) -> None:
@@ -222,19 +215,6 @@ def _check_dark_frames(config: Config) -> None:
             raise refusal(f"effects.{effect}", "on", "the dark frames contain it; expected auto or off")
     if _named_switch(config, "read") == "off":
         raise refusal("effects.read", "off", "dark frames replace the read noise; expected auto, or no dark frames")
-
-
-def _check_dark_folder(noise: NoiseConfig) -> None:
-    """Raise ConfigError if the dark frames of a recorded config are not given, or do not exist."""
-    frames = noise.dark_frames
-    if frames is None and noise.dark_frames_sha256 is not None:
-        raise ConfigError("noise.dark_frames is missing; expected the folder of the recorded dark frames")
-    if frames is not None and not _local("dark_frames", frames, "dark frames").is_dir():
-        raise ConfigError(f"noise.dark_frames={frames}: no such folder; expected a folder of dark frames")
-
-
-def _local(key: str, place: str, content: str) -> Path:
-    return local_path(place, f"noise.{key}={place}: {content} are read from a local folder only; copy them to one")
 
 
 def _check_lights(config: Config) -> None:
