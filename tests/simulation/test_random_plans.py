@@ -28,7 +28,7 @@ from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
-from unprocess_gen.simulation.plan import REFERENCE, DarkFramePlan, Physics, Plan
+from unprocess_gen.simulation.plan import DarkFramePlan, Physics, Plan
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN
@@ -285,13 +285,6 @@ def simulate(one: Case) -> Pair:
     return make_pair(one.srgb, one.plan, one.origin, one.dark_pixels)
 
 
-def simulate_reference(one: Case) -> Pair:
-    """Simulate the reference: with its formulas for integer frames, with the exact curve for frames in float32."""
-    if not one.plan.output.clean_normalised:
-        return reference_pair(one.srgb, one.plan, one.origin, one.dark_pixels)
-    return make_pair(one.srgb, one.plan.replace(accuracy=REFERENCE), one.origin, one.dark_pixels)
-
-
 def differences(found: Pair, expected: Pair) -> str:
     """Return in what two pairs differ, as text; "" if all bytes and counts are equal."""
     texts = []
@@ -325,7 +318,7 @@ def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count:
     failed = {}
     for number in range(count):
         one = case(kind, number, dtype)
-        if text := differences(simulate(one), simulate_reference(one)):
+        if text := differences(simulate(one), reference_pair(one.srgb, one.plan, one.origin, one.dark_pixels)):
             failed[f"case({kind!r}, {number}, {dtype!r})"] = text
     assert failed == {}
     figure("kernels", f"{count} random plans, {kind}, {dtype}: 0 pairs differ from the reference")
@@ -427,5 +420,5 @@ def test_pixels_at_the_limit_of_a_share_equal_the_reference(effect: str) -> None
             physics = plan.physics.replace(**numbers, **shares, hot_pixel_e=2e4, full_well_e=1e6, body_key=KEY)
             one = Case(srgb, plan.replace(physics=physics), (0, 0))
             found.append(simulate(one).noisy)
-            assert differences(simulate(one), simulate_reference(one)) == ""
+            assert differences(simulate(one), reference_pair(one.srgb, one.plan, one.origin, one.dark_pixels)) == ""
     assert all((without != with_one).sum() == 1 for without, with_one in zip(found[::2], found[1::2], strict=True))

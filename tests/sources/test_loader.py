@@ -71,7 +71,7 @@ CURVE = linear_table("smoothstep", 2.2, 256)
 
 def test_dither_moves_codes_uniformly_by_half_a_code(dithered: object) -> None:
     """Each of 257 offsets is as likely; 120,000 of them: six standard errors of mean and variance."""
-    moved = dequantise(np.full((200, 200, 3), 100, dtype=np.uint8), dithered, CURVE).astype(int) - 25_700  # type: ignore[arg-type]
+    moved = dequantise(np.full((200, 200, 3), 100, dtype=np.uint8), dithered).astype(int) - 25_700  # type: ignore[arg-type]
     assert (moved.min(), moved.max()) == (-128, 128)
     assert abs(moved.mean()) < 6 * 74.2 / np.sqrt(moved.size)
     assert abs(moved.var() / ((257**2 - 1) / 12) - 1) < 6 * np.sqrt(0.8 / moved.size)
@@ -79,7 +79,7 @@ def test_dither_moves_codes_uniformly_by_half_a_code(dithered: object) -> None:
 
 def test_black_white_and_highlights_are_not_moved(dithered: object) -> None:
     codes = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(40, axis=0).repeat(3, axis=2)
-    moved = (dequantise(codes, dithered, CURVE) != codes.astype(np.uint16) * 257).any(axis=(0, 2))  # type: ignore[arg-type]
+    moved = (dequantise(codes, dithered) != codes.astype(np.uint16) * 257).any(axis=(0, 2))  # type: ignore[arg-type]
     assert moved.tolist() == [0 < code < 255 and CURVE[code] <= 0.9 for code in range(256)]
 
 
@@ -87,24 +87,24 @@ def test_dither_all_fills_every_band_and_keeps_white(settings: Settings) -> None
     """Codes keep their order, every 16-bit code above the first half code occurs, and only white is white."""
     plan = plan_image(settings("source.dequantize=dither_all"), "d" * 64)
     codes = np.arange(240, 256, dtype=np.uint8)
-    moved = dequantise(codes[None, :, None].repeat(9000, axis=0).repeat(3, axis=2), plan, CURVE)
+    moved = dequantise(codes[None, :, None].repeat(9000, axis=0).repeat(3, axis=2), plan)
     lowest, highest = moved.min(axis=(0, 2)).astype(int), moved.max(axis=(0, 2)).astype(int)
     assert (lowest[1:] - highest[:-1] == 1).all()
     assert (lowest[-1], highest[-1], highest[-2]) == (65535, 65535, 65534)
     assert set(moved[:, 13].ravel().tolist()) == set(range(253 * 257 - 128, 253 * 257 + 129))
     assert set(moved[:, 14].ravel().tolist()) == set(range(254 * 257 - 128, 65535))
-    assert (dequantise(np.zeros((9, 9, 3), dtype=np.uint8), plan, CURVE) == 0).all()
+    assert (dequantise(np.zeros((9, 9, 3), dtype=np.uint8), plan) == 0).all()
 
 
 def test_channels_are_moved_independently(dithered: object) -> None:
-    moved = dequantise(np.full((100, 100, 3), 77, dtype=np.uint8), dithered, CURVE).reshape(-1, 3)  # type: ignore[arg-type]
+    moved = dequantise(np.full((100, 100, 3), 77, dtype=np.uint8), dithered).reshape(-1, 3)  # type: ignore[arg-type]
     assert np.abs(np.corrcoef(moved.T) - np.eye(3)).max() < 6 / 100
 
 
 def test_dither_of_a_crop_is_the_crop_of_the_dither(dithered: object) -> None:
     srgb = pixels(3, 40, 90)
-    full = dequantise(srgb, dithered, CURVE)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(dequantise(srgb[7:, 65:], dithered, CURVE, (7, 65)), full[7:, 65:])  # type: ignore[arg-type]
+    full = dequantise(srgb, dithered)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(dequantise(srgb[7:, 65:], dithered, (7, 65)), full[7:, 65:])  # type: ignore[arg-type]
 
 
 def test_16_bit_photographs_are_not_dithered(dithered: object, settings: Settings) -> None:

@@ -17,7 +17,6 @@ from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import filters
 from unprocess_gen.simulation.reference.unprocess import camera_light
-from unprocess_gen.simulation.tone_curves import linear_table
 
 TILE_SIDE = 32
 """Side of a tile, pixels; its green plane has half of it."""
@@ -70,7 +69,7 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     if plan.source.is_raw:
         light = (codes[quiet][..., 1] - black) / (white - black)
     else:
-        light = camera_light(codes[quiet], plan, linear_table(plan.isp.tone, plan.isp.gamma, last + 1))[..., 1]
+        light = camera_light(codes[quiet], plan)[..., 1]
     span = float(plan.sensor.white_level_dn - plan.sensor.black_level_dn)
     steps = np.rint(np.clip(light, 0, 1) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
     _, height, width = steps.shape

@@ -5,7 +5,7 @@ frames with compiled kernels, much faster; datasets are made with it. Tests comp
 on every option.
 
 In both, a pair is computed in three steps: unprocess the image to the clean frame, add the effects of the sensor, then
-clip and round both frames (`_reference_pair`).
+clip and round both frames.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
 from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
-from unprocess_gen.simulation.tone_curves import linear_table
 
 
 def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None) -> Pair:
@@ -82,12 +81,11 @@ def _pairs(
     """Yield the pair of each plan, several from each pass over the image."""
     if not plans:
         return
-    srgb = _dequantise(srgb, plans[0], origin)
+    srgb = dequantise(srgb, plans[0], origin)
     clean: Frame | None = None
     for group in _passes(plans):
         if plans[0].accuracy == REFERENCE:
-            for plan in group:
-                yield _reference_pair(srgb, plan, origin, _curve(srgb, plan), dark_pixels)
+            yield from (reference_pair(srgb, plan, origin, dark_pixels) for plan in group)
             continue
         for pair in render_pairs(srgb, group, origin, dark_pixels):
             clean = pair.clean if clean is None else clean
@@ -121,7 +119,7 @@ def crop_maker(
         return make
     is_dithered = plan.source.dequantize != "off" and codes == CODES[0]
     renderer = Renderer((plan,), shape, (corner[0] % 2, corner[1] % 2), CODES[1] if is_dithered else codes)
-    return lambda srgb, origin, epoch: renderer.crop(_dequantise(srgb, plan, origin), origin, epoch, frame)
+    return lambda srgb, origin, epoch: renderer.crop(dequantise(srgb, plan, origin), origin, epoch, frame)
 
 
 def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:
@@ -132,7 +130,7 @@ def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Norm
     few are therefore the second nearest float32. ``accuracy=fast`` changes clean frames, and not these values.
     """
     _check_image(srgb, plan, origin)
-    srgb, levels_dn = _dequantise(srgb, plan, origin), (plan.sensor.black_level_dn, plan.sensor.white_level_dn)
+    srgb, levels_dn = dequantise(srgb, plan, origin), (plan.sensor.black_level_dn, plan.sensor.white_level_dn)
     channels: list[Normalised] = []
     for pattern in ONE_COLOUR:
         colour = plan.replace(pattern=pattern, layout=MOSAIC, accuracy=EXACT)
@@ -166,26 +164,16 @@ def reference_pair(
 ) -> Pair:
     """Simulate a pair with the NumPy reference: Algorithm 1, exposure of the scene, noise, rounding.
 
-    Arguments, result and errors are those of `make_pair`.
+    Arguments, result and errors are those of `make_pair`. Noise is added to the clean frame before both are clipped,
+    then rounded or normalised.
     """
     _check_image(srgb, plan, origin)
-    return _reference_pair(_dequantise(srgb, plan, origin), plan, origin, dark_pixels=dark_pixels)
-
-
-def _reference_pair(
-    srgb: Srgb,
-    plan: Plan,
-    origin: tuple[int, int],
-    curve: Float | None = None,
-    dark_pixels: DarkPixels | None = None,
-) -> Pair:
-    """Return the pair in the plan's layout; ``curve`` is the exact table of the tone curve, or None for its formulas.
-
-    Noise is added to the clean frame before both are clipped, then rounded or normalised.
-    """
     sensor, output = plan.sensor, plan.output
-    photograph = unprocess(srgb, plan, origin, curve)
-    light = _scene_light(photograph, plan, origin)
+    light = photograph = unprocess(dequantise(srgb, plan, origin), plan, origin)
+    if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
+        light = np.minimum(light, 1) * plan.scene.exposure
+    factor = electrons.light_factor(plan, (light.shape[0], light.shape[1]), origin)
+    light = light if factor is None else light * factor
     clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest)
     noisy_dn = electrons.noisy(clean_dn, plan, origin, dark_pixels)
     if plan.pins_saturated:
@@ -211,31 +199,9 @@ def _reference_pair(
     return Pair(clean, noisy, counts)
 
 
-def _scene_light(light: Float, plan: Plan, origin: tuple[int, int]) -> Float:
-    """Return the light of the scene at each CFA site, from the photograph's light, before clipping to the levels."""
-    if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
-        light = np.minimum(light, 1) * plan.scene.exposure
-    factor = electrons.light_factor(plan, (light.shape[0], light.shape[1]), origin)
-    return light if factor is None else light * factor
-
-
 def _frame_of(dn: Float, limits_dn: tuple[float, float], normalised: bool, levels_dn: tuple[int, int]) -> Frame:
     """Clip unrounded DN, then normalise or round them."""
     return normalise(dn, *limits_dn, levels_dn) if normalised else quantise(dn, *limits_dn)
-
-
-def _dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Srgb:
-    """Dither 8-bit codes to 16 bits if the plan asks for it."""
-    if plan.source.dequantize == "off" or srgb.dtype != np.uint8:
-        return srgb
-    return dequantise(srgb, plan, linear_table(plan.isp.tone, plan.isp.gamma, 256), origin)
-
-
-def _curve(srgb: Srgb, plan: Plan) -> Float | None:
-    """Return the exact curve from the image's codes to linear light; raw sources have none."""
-    if plan.source.is_raw:
-        return None
-    return linear_table(plan.isp.tone, plan.isp.gamma, int(np.iinfo(srgb.dtype).max) + 1)
 
 
 _DTYPES = np.dtype(np.uint8), np.dtype(np.uint16)

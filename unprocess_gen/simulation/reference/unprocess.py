@@ -3,9 +3,9 @@
 This is the reference (NumPy, float64, one function per step, in the article's order). It defines the clean frame; the
 kernels compute the same DN, much faster (``docs/performance.md``).
 
-The formulas of the tone curves use libm, whose last bit differs between machines. Datasets never depend on it: kernels,
-and ``accuracy=reference``, read exact tables (`simulation.tone_curves`). With 8-bit sources and all five sensors, table
-values are at least 6.7e-4 DN from a rounding boundary.
+Codes become linear light by exact tables (`simulation.tone_curves`). The formulas below, `INVERSE_TONES` and
+`expand_gamma`, show the steps in pictures; their last bit differs between machines, because they use libm. With 8-bit
+sources and all five sensors, table values are at least 6.7e-4 DN from a rounding boundary.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.core.random_streams import declare_stream, words
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import mosaic, plane_sites
+from unprocess_gen.simulation.tone_curves import linear_table
 
 
-def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: Float | None = None) -> Float:
+def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
     """Compute the clean mosaic before clipping: normalised light, 0 at black and 1 at white, [H, W].
 
     Parameters
@@ -29,12 +30,10 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: F
         Parameters of the pair.
     origin : (int, int)
         Row and column of ``srgb[0, 0]`` in the full frame, for the phase of the CFA pattern.
-    curve : ndarray of float64, optional
-        Linear light of every code (`tone_curves.linear_table`). By default the formulas are used.
     """
     if plan.source.is_raw:
         return raw_light(srgb, plan, origin)
-    return mosaic(camera_light(srgb, plan, curve), plan.sensor.pattern, origin)
+    return mosaic(camera_light(srgb, plan), plan.sensor.pattern, origin)
 
 
 def raw_light(codes: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
@@ -52,15 +51,17 @@ def raw_light(codes: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Floa
 DEQUANTIZE = declare_stream("dequantize", 10)
 
 
-def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:
-    """Dither 8-bit codes to 16 bits, [H, W, 3], so that 256 codes do not become 256 levels of raw.
+def dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Srgb:
+    """Dither 8-bit codes to 16 bits, [H, W, 3], so that 256 codes do not become 256 levels of raw, if the plan does.
 
     Each channel of each pixel gets an offset from the random stream ``dequantize``: one of the 257 integers within half
     an 8-bit code. Codes 0 and 255 get none. For ``dither``, highlights get none either, because half a code is hundreds
-    of DN there: codes whose linear light in ``curve`` is above the threshold of highlights. For ``dither_all`` they do,
+    of DN there: codes whose linear light is above the threshold of highlights. For ``dither_all`` they do,
     and code 254 gets one of 385 integers up to white, which it does not reach: so the 16-bit codes have no gaps, white
     stays white, and codes keep their order.
     """
+    if plan.source.dequantize == "off" or srgb.dtype != np.uint8:
+        return srgb
     size = (srgb.shape[0], srgb.shape[1])
     channels = [words(plan.stream_key, DEQUANTIZE, size, origin=origin, draw=channel) for channel in range(3)]
     kept = (srgb == 0) | (srgb == 255)
@@ -68,12 +69,12 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
         steps = np.where(srgb == 254, np.uint64(385), np.uint64(257))  # 254 · 257 + 256 is one less than white
     else:
         steps = np.broadcast_to(np.uint64(257), srgb.shape)
-        kept |= curve[srgb] > plan.isp.highlight_threshold
+        kept |= linear_light(srgb, plan.isp.tone, plan.isp.gamma) > plan.isp.highlight_threshold
     offsets = (np.stack(channels, axis=-1).astype(np.uint64) * steps >> np.uint64(32)).astype(np.int32) - 128
     return (srgb.astype(np.int32) * 257 + np.where(kept, 0, offsets)).astype(np.uint16)
 
 
-def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
+def camera_light(srgb: Srgb, plan: Plan) -> Float:
     """Compute the light at the sensor in all three channels, before clipping.
 
     Parameters
@@ -82,23 +83,20 @@ def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
         Codes k, which mean k / 255 or k / 65535.
     plan : Plan
         Parameters of the pair.
-    curve : ndarray of float64, optional
-        Linear light of every code. By default the formulas are used.
 
     Returns
     -------
     ndarray of float64, [H, W, 3]
         Camera RGB, 0 at black and 1 at white.
     """
-    image = linear_light(srgb, plan.isp.tone, plan.isp.gamma) if curve is None else curve[srgb]
+    image = linear_light(srgb, plan.isp.tone, plan.isp.gamma)
     image = apply_ccm(image, plan.camera.rgb2cam)
     return invert_gains(image, plan.camera.inverse_gains, plan.isp.highlight, plan.isp.highlight_threshold)
 
 
 def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:
-    """Invert the tone curve (key of `INVERSE_TONES`) and the gamma (exponent, or ``srgb``) by their formulas."""
-    white = np.float64(np.iinfo(srgb.dtype).max)
-    return expand_gamma(INVERSE_TONES[tone](srgb / white, (white - srgb) / white), gamma)
+    """Invert the tone curve (key of `INVERSE_TONES`) and the gamma (exponent, or ``srgb``), by the exact table."""
+    return linear_table(tone, gamma, int(np.iinfo(srgb.dtype).max) + 1)[srgb]
 
 
 def inverse_smoothstep(x: Float, rest: Float) -> Float:
