@@ -10,6 +10,7 @@ Each PNG file names the digest of its manifest: sheets of two datasets in a fold
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -134,7 +135,8 @@ def _heading(pair: SheetPair, window: Window) -> list[str]:
 
 def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> list[SheetPanel]:
     """Panels of the source, of both frames raw and developed, and of their difference."""
-    plan, drawn = pair.plan, [SheetPanel("source", f"not available: {pair.missing_source}", None)]
+    reason = re.sub(r"([0-9a-f]{8})[0-9a-f]{56}", r"\1...", pair.missing_source)  # of a SHA-256, the beginning
+    plan, drawn = pair.plan, [SheetPanel("source", f"not available: {reason}", None)]
     if pair.source is not None:
         drawn = [SheetPanel("source", f"{8 * pair.source.itemsize} bits", *_views(pair.source, window, panel_px))]
     white_dn = plan.sensor.black_level_dn + plan.sensor.span_dn * plan.scene.exposure

@@ -43,6 +43,8 @@ def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: Dark
     """
     shape = clean_dn.shape[0], clean_dn.shape[1]
     if not plan.counts_electrons:
+        if plan.noise.variance_line == (0.0, 0.0):
+            return clean_dn
         n = normals(frame_words(plan, heteroscedastic.STREAM, shape, origin))
         return np.asarray(clean_dn + np.sqrt(noise_variance(clean_dn, plan)) * n)
     slots, patterns = slots_of(plan), slots_of(plan).patterns
