@@ -24,7 +24,7 @@ import pytest
 from helpers import object_store as servers
 from helpers.commands import COMMAND, Cli, Done, RunMain, run_process
 from helpers.configs import composed
-from helpers.datasets import MadeHash, Make, Settings, TreeHash
+from helpers.datasets import Make, Settings
 from helpers.photographs import pixels
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
@@ -253,17 +253,6 @@ def _tree_hash(folder: Path) -> str:
 def tree_hash() -> Callable[[Path], str]:
     """Return a function that hashes what a dataset's data are: names and bytes of shards, manifest and config."""
     return _tree_hash
-
-
-@pytest.fixture(scope="session")
-def made_hash(make: Make, tree_hash: TreeHash) -> MadeHash:
-    """Return a function that makes a dataset of a folder, next to it as ``ds``, and returns its `tree_hash`."""
-
-    def made(root: Path, *overrides: str) -> str:
-        make(root, root.parent / "ds", *overrides)
-        return tree_hash(root.parent / "ds")
-
-    return made
 
 
 @pytest.fixture

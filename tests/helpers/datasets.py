@@ -57,6 +57,3 @@ Make = Callable[..., runner.Summary]
 
 TreeHash = Callable[[Path], str]
 """Type of the fixture `tree_hash`."""
-
-MadeHash = Callable[..., str]
-"""Type of the fixture `made_hash`."""

@@ -94,13 +94,7 @@ def open_frames(folder: Path) -> dict[str, np.ndarray]:
     return {one.sha256: access.frame(one.sha256) for one in frames.frames}
 
 
-def test_draws_use_different_frames_at_the_same_place(made: Path) -> None:
-    for first, second in zip(rows(made)[::2], rows(made)[1::2], strict=True):
-        assert first["dark_frame"] != second["dark_frame"]
-        assert [first[f"dark_frame_{axis}"] for axis in "yx"] == [second[f"dark_frame_{axis}"] for axis in "yx"]
-
-
-def test_frames_of_a_clip_take_turns_at_one_place(darks: Path) -> None:
+def test_draws_and_frames_of_a_clip_take_turns_at_one_place(darks: Path) -> None:
     config = ug.load_config([*NOISE, f"noise.dark_frames={darks}", "noise.draws=2"])
     config, frames, _ = open_dark_frames(config)
     assert frames is not None

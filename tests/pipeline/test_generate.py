@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.cli.messages import logging_to_stderr
-from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import worker
@@ -229,11 +227,6 @@ def test_times_of_stages_are_those_of_all_shards(n_jobs: int, photos: Path, make
     assert times.decode_s > 0
     assert times.simulate_s > 0
     assert n_jobs == 2 or times.decode_s + times.simulate_s < own_s
-
-
-def test_config_yaml_is_the_resolved_config(dataset: Path, settings: Callable[..., Any]) -> None:
-    config = settings(SHARDS_OF_5, "source.root=photos")
-    assert (dataset / "config.yaml").read_text(encoding="utf-8") == dataset_yaml(config)
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "manifest.csv"])

@@ -120,15 +120,20 @@ def test_edited_file_of_a_dataset_is_reported_in_one_line(name: str, folder: Pat
     assert not list(filter(None, problems))
 
 
-def test_edited_record_names_file_problem_and_remedy(folder: Path, run_main: RunMain) -> None:
+EDITS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    RUN: (
+        lambda content: json.dumps(json.loads(content) | {"parts": 1e308}).encode(),
+        "parts: expected `int | null`, got `float`); delete ds/.work and run again\n",
+    ),
+    LISTING: (lambda content: b'["a",1]\n', "its SHA-256 differs from that in "),
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_edited_record_names_file_problem_and_remedy(name: str, folder: Path, run_main: RunMain) -> None:
     assert run_main("part", "0/2", *SETTINGS).code == 0
-    run = json.loads((folder / "ds" / RUN).read_text())
-    (folder / "ds" / RUN).write_text(json.dumps(run | {"parts": 1e308}))
-
-    done = run_main("merge", "ds")
-
-    assert done.code == 5
-    assert done.err == (
-        f"gen-dataset: ds/{RUN}: cannot be read (parts: expected `int | null`, got `float`); delete ds/.work and run "
-        "again\n"
-    )
+    path, (edit, problem) = folder / "ds" / name, EDITS[name]
+    path.write_bytes(edit(path.read_bytes()))
+    done = run_main("part", "1/2", *SETTINGS)
+    assert (done.code, done.err.count("\n")) == (5, 1)
+    assert done.err.startswith(f"gen-dataset: ds/{name}: cannot be read ({problem}"), done.err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from unprocess_gen.dataset.manifest import read_columns, write_rows
 from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.dataset.row import row_json
 from unprocess_gen.dataset.shards import ShardWriter, member_of, shard_name
-from unprocess_gen.pipeline.verify import verify
 
 PEAK = """
 {code}
@@ -113,62 +112,6 @@ def original(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
     folder = tmp_path_factory.mktemp("original")
     make(fill(folder / "p", 1), folder / "ds", "source.downscale=6")
     return folder / "ds"
-
-
-@pytest.fixture
-def copies(original: Path, tmp_path: Path) -> Path:
-    """Write a dataset of twelve copies of it, in three shards."""
-    return write_copies(original, tmp_path / "copies", 12, 4)
-
-
-def edit(folder: Path, change: Callable[[list[str]], None]) -> list[str]:
-    """Change the lines of a manifest, and return the damage that is found apart from its digest."""
-    manifest = folder / "manifest.csv"
-    lines = manifest.read_text(encoding="utf-8").splitlines(keepends=True)
-    change(lines)
-    manifest.write_text("".join(lines), encoding="utf-8")
-    digest, *others = map(str, verify(folder))
-    assert digest.startswith(f"manifest.csv: its SHA-256 is {file_sha256(manifest)}")
-    return others
-
-
-def test_shards_out_of_order_in_the_manifest_are_named(copies: Path) -> None:
-    def move_last_shard_first(lines: list[str]) -> None:
-        lines[1:] = lines[9:] + lines[1:9]
-
-    assert edit(copies, move_last_shard_first) == [
-        "manifest.csv: row 00000000 of shard 0 follows rows of shard 2; expected shards in ascending order"
-    ]
-
-
-def test_unreadable_last_row_leaves_the_digests_of_shards(copies: Path) -> None:
-    shard = copies / "shards" / "shard-00000.tar"
-    with shard.open("r+b") as stream:
-        stream.seek(3000)
-        stream.write(b"?")
-
-    def cut_last_row(lines: list[str]) -> None:
-        lines[-1] = lines[-1][:100]
-
-    unreadable, digest = edit(copies, cut_last_row)
-    assert unreadable.startswith("manifest.csv: not a readable manifest (the last line is cut")
-    assert digest.startswith("shards/shard-00000.tar: its SHA-256 is ")
-
-
-def test_shard_without_rows_and_shard_without_entry_are_named(copies: Path) -> None:
-    (copies / "shards" / "shard-00007.tar").touch()
-    (copies / "shards" / "shard-00001.tar").rename(copies / "shards" / "shard-00009.tar")
-
-    def drop_shard_2_and_add_shard_5(lines: list[str]) -> None:
-        lines[9:] = [line.replace(",2,0,", ",5,0,", 1) for line in lines[9:]]
-
-    assert edit(copies, drop_shard_2_and_add_shard_5) == [
-        "shards/shard-00007.tar: is not part of this dataset",
-        "shards/shard-00009.tar: is not part of this dataset",
-        "shards/shard-00001.tar: is missing",
-        "shards/shard-00002.tar: something follows the end",
-        "shards/shard-00005.tar: is missing",
-    ]
 
 
 @pytest.mark.slow

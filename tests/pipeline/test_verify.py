@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.dataset.shards import read_index
@@ -105,6 +107,50 @@ def test_a_shard_of_a_dataset_with_another_seed_is_found(copy: Path, intact: Pat
     make(intact.parent / "p", tmp_path / "other", "output.pairs_per_shard=2", "seed=1")
     shutil.copy(tmp_path / "other/shards/shard-00000.tar", copy / "shards/shard-00000.tar")
     assert "00000000.noisy.npy: the XXH3-128 of its data is" in "\n".join(damage_texts(copy))
+
+
+def edit(folder: Path, change: Callable[[list[str]], None]) -> list[str]:
+    """Change the lines of a manifest, and return the damage that is found apart from its digest."""
+    manifest = folder / "manifest.csv"
+    lines = manifest.read_text(encoding="utf-8").splitlines(keepends=True)
+    change(lines)
+    manifest.write_text("".join(lines), encoding="utf-8")
+    digest, *others = damage_texts(folder)
+    assert digest.startswith(f"manifest.csv: its SHA-256 is {file_sha256(manifest)}")
+    return others
+
+
+def test_shards_out_of_order_in_the_manifest_are_named(copy: Path) -> None:
+    def move_last_row_first(lines: list[str]) -> None:
+        lines.insert(1, lines.pop())
+
+    assert edit(copy, move_last_row_first) == [
+        "manifest.csv: row 00000000 of shard 0 follows rows of shard 1; expected shards in ascending order"
+    ]
+
+
+def test_unreadable_last_row_leaves_the_digests_of_shards(copy: Path) -> None:
+    flip(copy / "shards/shard-00000.tar", 3000)
+
+    def cut_last_row(lines: list[str]) -> None:
+        lines[-1] = lines[-1][:100]
+
+    unreadable, digest = edit(copy, cut_last_row)
+    assert unreadable.startswith("manifest.csv: not a readable manifest (the last line is cut")
+    assert digest.startswith("shards/shard-00000.tar: its SHA-256 is ")
+
+
+def test_shard_without_rows_and_shard_without_entry_are_named(copy: Path) -> None:
+    (copy / "shards/shard-00007.tar").touch()
+
+    def give_the_last_row_to_shard_5(lines: list[str]) -> None:
+        lines[-1] = lines[-1].replace(",1,0,", ",5,0,", 1)
+
+    assert edit(copy, give_the_last_row_to_shard_5) == [
+        "shards/shard-00007.tar: is not part of this dataset",
+        "shards/shard-00001.tar: something follows the end",
+        "shards/shard-00005.tar: is missing",
+    ]
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "manifest.csv", "dataset.json"])
