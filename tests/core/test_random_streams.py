@@ -12,14 +12,9 @@ from hypothesis import strategies as st
 
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.random_streams import (
-    STREAMS,
     body_key,
-    frame_word,
-    parameter_uniforms,
-    patch_words,
     philox4x32,
     purpose,
-    scatter_uniforms,
     stream_key,
     words,
 )
@@ -130,20 +125,3 @@ def test_a_level_or_draw_out_of_range_is_refused(level: int, draw: int) -> None:
 )
 def test_keys_never_change(key: int, name: str) -> None:
     assert key == int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
-
-
-# Parameters -----------------------------------------------------------------------------------------------------------
-
-
-@given(keys, st.integers(0, 50), st.integers(0, 4095), st.integers(0, 2**14 - 1))
-def test_uniform_n_is_the_first_52_bits_of_counter_n(key: int, number: int, level: int, epoch: int) -> None:
-    high, low, _, _ = philox_by_hand((0, number, purpose(0, level), frame_word(0, epoch)), key)
-    assert parameter_uniforms(key, (3, number), level, epoch)[1] == ((high << 20 | low >> 12) + 0.5) / 2**52
-    high, low, _, _ = philox_by_hand((0, number, STREAMS["scatter"] << 24, 0), key)
-    assert scatter_uniforms(key, number + 1)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
-
-
-@given(keys, st.integers(0, 50))
-def test_patch_n_uses_the_first_two_words_of_its_counter(key: int, number: int) -> None:
-    first, second, _, _ = philox_by_hand((0, number, STREAMS["patch"] << 24, 0), key)
-    assert patch_words(key, number + 1)[number] == (first, second)

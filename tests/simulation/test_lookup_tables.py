@@ -104,9 +104,9 @@ def test_integer_gammas_share_one_curve() -> None:
 @pytest.fixture
 def no_cached_curves() -> Iterator[None]:
     """Forget the curves that this process holds, before and after the test."""
-    tone_curves._linear_table.cache_clear()
+    tone_curves.linear_table.cache_clear()
     yield
-    tone_curves._linear_table.cache_clear()
+    tone_curves.linear_table.cache_clear()
 
 
 @pytest.mark.parametrize(("tone", "gamma"), CURVES_16)

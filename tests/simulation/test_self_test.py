@@ -135,7 +135,7 @@ def last_bit(table: np.ndarray) -> np.ndarray:
 def test_a_table_one_unit_off_is_detected(module: ModuleType, build: str, monkeypatch: pytest.MonkeyPatch) -> None:
     true: Callable[..., object] = getattr(module, build)
     monkeypatch.setattr(module, build, lambda *given: last_bit(np.array(true(*given)) * (1 + 2**-20)))
-    tone_curves._linear_table.cache_clear()
+    tone_curves.linear_table.cache_clear()
     lookup_tables.normal_table.cache_clear()
     try:
         with pytest.raises(
@@ -143,7 +143,7 @@ def test_a_table_one_unit_off_is_detected(module: ModuleType, build: str, monkey
         ):
             selftest.check([selftest.GOLDEN_PLAN])
     finally:
-        tone_curves._linear_table.cache_clear()
+        tone_curves.linear_table.cache_clear()
         lookup_tables.normal_table.cache_clear()
 
 

@@ -16,15 +16,12 @@ Pixel x takes output word x % 64 // 16. The layout does not depend on the image 
 consecutive counters, which vectorises. The epoch is 0 in every stored dataset; live pairs have others. Alternatives:
 ``docs/design/random_numbers.md``.
 
-This module is the NumPy reference; `simulation.kernels.philox` contains the compiled form.
+This module is the NumPy reference; `simulation.kernels.philox` and `draws` contain the compiled form.
 """
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import struct
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,15 +137,6 @@ def words(
     return np.asarray(np.choose(chosen, outputs), dtype=np.uint32)
 
 
-def patch_words(key: int, count: int, epoch: int = 0) -> list[tuple[int, int]]:
-    """Draw two 32-bit words for each of the first ``count`` patches of an image.
-
-    Patch n uses counter (0, n) of the stream ``patch``, so that a larger ``count`` does not move the first patches.
-    """
-    first, second, _, _ = _outputs(key, range(count), purpose(PATCH), frame_word(0, epoch))
-    return list(zip(_split(first, count), _split(second, count), strict=True))
-
-
 def crop_words(key: int, patch: int, level: int, draw: int, word_3: int, crop: int = 0) -> tuple[int, int]:
     """Draw two 32-bit words for the place of a live crop in a patch; ``word_3`` is `frame_word`.
 
@@ -164,60 +152,3 @@ def shuffled(length: int, seed: int, epoch: int) -> NDArray[np.int64]:
     key = _hash64(f"unprocess_gen order 1\0{seed}")
     high, low, _, _ = philox4x32(tuple(np.asarray(word, dtype=np.uint64) for word in counter), key)
     return np.argsort(high.astype(np.uint64) << np.uint64(32) | low, kind="stable")
-
-
-def dark_frame_words(key: int) -> tuple[int, int, int]:
-    """Draw three 32-bit words, which choose a dark frame, its row and its column."""
-    return _outputs(key, range(1), purpose(DARK_FRAME), 0)[:3]
-
-
-def parameter_uniforms(key: int, counters: Sequence[int], level: int = 0, epoch: int = 0) -> list[float]:
-    """Draw uniform deviates (k + ½)·2**-52 with a 52-bit integer k, for some parameters of an image.
-
-    Parameter n uses counter (0, n) of the stream ``parameters``: add new parameters at the end, never renumber.
-    """
-    return _uniforms(key, counters, purpose(PARAMETERS, level), frame_word(0, epoch))
-
-
-def scatter_uniforms(key: int, count: int) -> list[float]:
-    """Draw uniform deviates as `parameter_uniforms`, for the numbers of a sensor unit with `body_key` ``key``.
-
-    Number n uses counter n of the stream ``scatter``: add new numbers at the end, never renumber.
-    """
-    return _uniforms(key, range(count), purpose(SCATTER), 0)
-
-
-def _uniforms(key: int, counters: Sequence[int], word_2: int, word_3: int) -> list[float]:
-    """Uniform deviates (k + ½)·2**-52 from the first 52 bits k of the output of each counter."""
-    first, second, _, _ = _outputs(key, counters, word_2, word_3)
-    bits = first << 20 | (second >> 12 & (LOW >> 12) * _packed(counters)[0])
-    return [(k + 0.5) * 2.0**-52 for k in _split(bits, len(counters))]
-
-
-def _outputs(key: int, counters: Sequence[int], word_2: int, word_3: int) -> tuple[int, int, int, int]:
-    """Output words of Philox for counters (0, n, word_2, word_3) with n in ``counters``.
-
-    An integer holds one word of all counters, at intervals of 64 bits, so that no product reaches the next word. NumPy
-    takes ten times as long for the few counters of an image, as long as all other planning.
-    """
-    ones, numbers = _packed(counters)
-    low = LOW * ones
-    c0, c1, c2, c3 = 0, numbers, word_2 * ones, word_3 * ones
-    k0, k1 = key & LOW, key >> 32
-    for _ in range(ROUNDS):
-        p0, p1 = MULTIPLIERS[0] * c0, MULTIPLIERS[1] * c2
-        c0, c1 = (p1 >> 32 & low) ^ c1 ^ k0 * ones, p1 & low
-        c2, c3 = (p0 >> 32 & low) ^ c3 ^ k1 * ones, p0 & low
-        k0, k1 = (k0 + KEY_STEPS[0]) & LOW, (k1 + KEY_STEPS[1]) & LOW
-    return c0, c1, c2, c3
-
-
-@functools.cache
-def _packed(counters: Sequence[int]) -> tuple[int, int]:
-    """A one for each counter, and the counters, at intervals of 64 bits."""
-    return sum(1 << 64 * n for n in range(len(counters))), sum(number << 64 * n for n, number in enumerate(counters))
-
-
-def _split(words: int, count: int) -> tuple[int, ...]:
-    """Words at intervals of 64 bits."""
-    return struct.unpack(f"<{count}Q", words.to_bytes(8 * count, "little"))

@@ -25,7 +25,7 @@ from unprocess_gen.config.distributions import lowest
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.arrays import Srgb
-from unprocess_gen.planning.frame_model import FIXED, RARE, FrameModel, SignalRange, ratio_to_noise
+from unprocess_gen.planning.frame_model import FIXED, RARE, AtLevel, FrameModel, SignalRange, ratio_to_noise
 from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS
 from unprocess_gen.simulation.effects.prediction import STATISTICS
 from unprocess_gen.simulation.facts import Facts, RawParts
@@ -137,9 +137,9 @@ class EffectRules:
         self.converter_dn = math.inf if unclipped else 2.0**sensor.bits - 1 - sensor.black_level_dn  # above black
         self.body_light_dn = min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn)  # most of the scene
 
-    def frame(self, physics: Physics, facts: Facts, signals: SignalRange) -> FrameModel:
+    def frame(self, physics: Physics, facts: Facts, signals: SignalRange, at_dark: AtLevel | None = None) -> FrameModel:
         """Model of a frame of the sensor."""
-        return FrameModel(physics, facts, signals, self.black_level_dn, self.converter_dn)
+        return FrameModel(physics, facts, signals, self.black_level_dn, self.converter_dn, at_dark)
 
     def select_patterns(self, physics: Physics, is_clip: bool) -> BodySelection | None:
         """Decide about the fixed patterns of a body for all of its images; None if the configuration has decided."""
@@ -154,10 +154,15 @@ class EffectRules:
         return BodySelection(frame, on, reasons)
 
     def select_effects(
-        self, physics: Physics, facts: Facts, signals: SignalRange, body: BodySelection | None
+        self,
+        physics: Physics,
+        facts: Facts,
+        signals: SignalRange,
+        body: BodySelection | None,
+        at_dark: AtLevel | None = None,
     ) -> Selection:
-        """Decide about every effect for one image, after those of its ``body``."""
-        frame, omitted = self.frame(physics, facts, signals), [*body.reasons] if body else []
+        """Decide about every effect for one image, after those of its ``body``; ``at_dark`` as for `FrameModel`."""
+        frame, omitted = self.frame(physics, facts, signals, at_dark), [*body.reasons] if body else []
         on = omit_weakest(self.tolerance, frame, self.on.difference(omitted), self.temporal, omitted)
         return Selection(self, frame, on, body)
 
@@ -227,7 +232,7 @@ def omit_weakest(
     """
 
     def strength(effect: str) -> tuple[bool, float, str]:
-        return frame.outliers(effect, on) >= MIN_OUTLIERS, frame.ratio([effect], on - {effect}), effect
+        return frame.outliers(effect, on) >= MIN_OUTLIERS, frame.ratio((effect,), on - {effect}), effect
 
     omitted = list(before)
     for effect in sorted(free, key=strength):
@@ -235,7 +240,7 @@ def omit_weakest(
         rest = on - {effect}
         if any(frame.outliers(rare, rest) >= MIN_OUTLIERS for rare in omitted if rare in RARE):
             break
-        if frame.ratio(omitted, rest) > tolerance:
+        if frame.ratio(tuple(omitted), rest) > tolerance:
             break
         on = rest
     return on
@@ -245,7 +250,7 @@ def _prediction(
     effect: str, frame: FrameModel, on: frozenset[str], forced: ForcedDecision | None, tolerance: float
 ) -> Prediction:
     """Describe an effect at the signal and in the statistic where it is strongest; the first one if several are."""
-    squares = ((level_dn, frame.squares([effect], level_dn, on)) for level_dn in frame.levels(on - {effect}))
+    squares = ((level_dn, frame.squares((effect,), level_dn, on)) for level_dn in frame.levels(on - {effect}))
     candidates = [(level_dn, [*map(math.sqrt, own)]) for level_dn, own in squares]
     level_dn, ratios = max(candidates, key=lambda candidate: max(candidate[1]))
     index = next(n for n, ratio in enumerate(ratios) if ratio >= max(ratios) * (1 - 1e-9))

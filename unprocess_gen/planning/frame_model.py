@@ -7,7 +7,8 @@ are the same on every machine and in every tier. Derivations: ``docs/design/effe
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import add, mul
 
@@ -62,8 +63,20 @@ def raw_signal_range(facts: Facts, source: SourcePlan, exposure: float, span_dn:
     return SignalRange(*(min(max(min(light, 1.0) * exposure, 0.0), 1.0) * span_dn for light in (lowest, highest)))
 
 
+class AtLevel:
+    """Results at one signal that several predictions share: most images have the darkest signal 0."""
+
+    def __init__(self) -> None:
+        self.variances: list[tuple[str, float]] = []
+        self.contributions: dict[tuple[str, float], tuple[Contribution, list[float]]] = {}
+        self.squares: dict[tuple[Sequence[str], frozenset[str]], list[float]] = {}
+
+
 class FrameModel(FrameFacts):
-    """Predictions for a frame, and results that several predictions share; effects are given by their names."""
+    """Predictions for a frame; effects are given by their names.
+
+    ``at_dark`` has results of a model that differs in ``signals`` only, at the signal 0.
+    """
 
     def __init__(
         self,
@@ -72,14 +85,14 @@ class FrameModel(FrameFacts):
         signals: SignalRange,
         black_level_dn: float,
         converter_dn: float = math.inf,
+        at_dark: AtLevel | None = None,
     ) -> None:
         super().__init__(physics, facts, black_level_dn, converter_dn)
         self._roots = tuple(map(math.sqrt, self.counts))
         full_dn = physics.full_well_e * physics.dn_per_e
         self._levels = signals.dark_dn, signals.bright_dn
         self._levels_in_well = min(signals.dark_dn, full_dn), min(signals.bright_dn, full_dn)
-        self._variances: dict[float, list[tuple[str, float]]] = {}
-        self._contributions: dict[tuple[str, float, float], tuple[Contribution, list[float]]] = {}
+        self._known: dict[float, AtLevel] = defaultdict(AtLevel, {0.0: at_dark or AtLevel()})
 
     def levels(self, on: frozenset[str]) -> tuple[float, float]:
         """The two signals at which effects are predicted, DN above black; between them no ratio is larger."""
@@ -98,25 +111,31 @@ class FrameModel(FrameFacts):
 
     def _variances_at(self, level_dn: float) -> list[tuple[str, float]]:
         """Variance of a pixel due to each of `MASKING` at a signal, DN²."""
-        known = self._variances.get(level_dn)
-        if known is None:
-            known = self._variances[level_dn] = [(effect.name, effect.variance(self, level_dn)) for effect in MASKING]
-        return known
+        known = self._known[level_dn]
+        if not known.variances:
+            known.variances = [(effect.name, effect.variance(self, level_dn)) for effect in MASKING]
+        return known.variances
 
     def contribution(self, effect: str, level_dn: float, masking: float) -> tuple[Contribution, list[float]]:
         """Contribution of an effect where the other noise has the variance ``masking``, and its variances by count."""
-        key = effect, level_dn, masking if effect in RARE else 0.0
-        known = self._contributions.get(key)
+        contributions, key = self._known[level_dn].contributions, (effect, masking if effect in RARE else 0.0)
+        known = contributions.get(key)
         if known is None:
             predicted = BY_NAME[effect].contribution(self, level_dn, masking)
-            known = self._contributions[key] = predicted, [*map(mul, predicted.variances, self.counts)]
+            known = contributions[key] = predicted, [*map(mul, predicted.variances, self.counts)]
         return known
 
-    def squares(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> list[float]:
+    def squares(self, effects: Sequence[str], level_dn: float, on: frozenset[str]) -> list[float]:
         """Square of the ratio of several effects together to the masking noise, in each statistic.
 
         Variances add; offsets add linearly.
         """
+        known, key = self._known[level_dn].squares, (effects, on)
+        if key not in known:
+            known[key] = self._squares(effects, level_dn, on)
+        return known[key]
+
+    def _squares(self, effects: Sequence[str], level_dn: float, on: frozenset[str]) -> list[float]:
         squares: list[float] = []
         offsets: list[float] = []
         before_well = 0.0

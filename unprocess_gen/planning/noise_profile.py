@@ -18,9 +18,10 @@ from unprocess_gen.config.limits import EXPOSURE_S, ISO, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile
-from unprocess_gen.core.random_streams import body_key, scatter_uniforms
+from unprocess_gen.core.random_streams import body_key
 from unprocess_gen.planning.draws import Draw
 from unprocess_gen.planning.parameters import draw_parameter
+from unprocess_gen.simulation.kernels.draws import scatter_uniforms
 from unprocess_gen.simulation.numbers import DN, RATE, SHAPE, SITES, Number
 from unprocess_gen.simulation.plan import NUMBERS, Physics
 from unprocess_gen.simulation.reference import cfa

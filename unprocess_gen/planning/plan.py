@@ -18,17 +18,29 @@ from unprocess_gen.config import interpretation
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.arrays import FLOAT32
-from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, split_uniform, stream_key
+from unprocess_gen.core.random_streams import split_uniform, stream_key
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import NOT_ROUNDED, BodySelection, EffectRules, Prediction, Selection
-from unprocess_gen.planning.frame_model import SignalRange, raw_signal_range, signal_range
+from unprocess_gen.planning.frame_model import AtLevel, SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.parameters import draw_parameter
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
-from unprocess_gen.simulation import plan as records
 from unprocess_gen.simulation.facts import DarkFrames, Facts
-from unprocess_gen.simulation.plan import Physics, Place, Plan
+from unprocess_gen.simulation.kernels.draws import dark_frame_words, mixed_rgb2cam, parameter_uniforms
+from unprocess_gen.simulation.plan import (
+    CameraPlan,
+    DarkFramePlan,
+    IspPlan,
+    NoisePlan,
+    OutputPlan,
+    Physics,
+    Place,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+)
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
@@ -77,9 +89,8 @@ def plan_pairs(
 def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int) -> Plan:
     """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay."""
     planner = _planner(with_raw_sensor(config, parts_of(plan)))
-    levels = planner.levels_of_key(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
-    redrawn, _ = next(itertools.islice(levels, plan.place.level, None))
-    return redrawn.replace(place=plan.place, dark=plan.dark)
+    image = planner.image(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
+    return planner.plan(image, plan.place, plan.dark)[0]
 
 
 def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
@@ -92,11 +103,11 @@ def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
 
 def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int) -> Plan:
     """Choose the dark frame of one pair."""
-    chosen, row, column = dark_frame_words(plan.stream_key)
+    chosen, row, column, _ = dark_frame_words(plan.stream_key)
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
-    return plan.replace(dark=records.DarkFramePlan(frame.sha256, shift, dark_frames.black_dn, dark_frames.scale))
+    return plan.replace(dark=DarkFramePlan(frame.sha256, shift, dark_frames.black_dn, dark_frames.scale))
 
 
 def _even_place(word: int, available: int, needed: int) -> int:
@@ -154,26 +165,15 @@ class Planner:
         kind, levels = PhysicalLevel if self._is_physical else TwoNumberLevel, interpretation.noise_levels(config.noise)
         self._levels = [kind(replace(config, noise=noise)) for noise in levels]
         self._accuracy, self._scene_name = config.accuracy, config.scene.name
-        self._source = records.SourcePlan(config.source.downscale, config.source.dequantize)
+        self._source = SourcePlan(config.source.downscale, config.source.dequantize)
         isp, gains, sensor = config.isp, config.gains, config.sensor
         gamma = "srgb" if isp.gamma == "srgb" else float(isp.gamma)
-        self._isp = records.IspPlan(isp.tone, gamma, gains.highlight, gains.threshold)
+        self._isp = IspPlan(isp.tone, gamma, gains.highlight, gains.threshold)
         self._splits: dict[str, float] = config.split or {}
         levels_dn, saturated_as = (sensor.black_level_dn, sensor.white_level_dn), interpretation.saturated_as(config)
-        self._sensor = records.SensorPlan(sensor.pattern, sensor.bits, *levels_dn, sensor.clip, saturated_as)
+        self._sensor = SensorPlan(sensor.pattern, sensor.bits, *levels_dn, sensor.clip, saturated_as)
         clean_dtype = FLOAT32 if interpretation.has_float_clean(config) else ""
-        self._output = records.OutputPlan(config.output.dtype, config.output.layout, clean_dtype)
-        distributions = {
-            Draw.RED: self._red, Draw.BLUE: self._blue, Draw.INVERSE_RGB: self._inverse_rgb,
-            Draw.EXPOSURE_RATIO: self._exposure_ratio, **self._levels[0].distributions,
-        }  # fmt: skip
-        drawn = {draw for draw, distribution in distributions.items() if distribution.kind != "constant"}
-        if config.camera.law == "convex" and config.camera.weights is None:
-            drawn |= {Draw.WEIGHT_0, Draw.WEIGHT_1, Draw.WEIGHT_2, Draw.WEIGHT_3}
-        drawn |= {Draw.CHOICE} if config.camera.law == "choice" else set()
-        drawn |= {Draw.LIGHT, Draw.CCT, Draw.LIGHT_DISTANCE} if self._lights else set()
-        drawn |= {Draw.SENSOR_UNIT} if self._is_physical and sensor.units != "image" else set()
-        self._drawn = tuple(sorted(drawn))
+        self._output = OutputPlan(config.output.dtype, config.output.layout, clean_dtype)
 
     def levels(
         self,
@@ -185,19 +185,19 @@ class Planner:
     ) -> Iterator[tuple[Plan, Selection | None]]:
         """Yield the plan of one image at each noise level, and the selection of effects of a physical profile."""
         key, split = stream_key(seed, source_sha256, occurrence), self._draw_split(seed, source_sha256)
-        return self.levels_of_key(seed, key, split, facts, dark_frames)
+        image = self.image(seed, key, split, facts, dark_frames)
+        return (self.plan(image, Place(level=number)) for number in range(len(self._levels)))
 
-    def levels_of_key(
+    def image(
         self, seed: int, key: int, split: str, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int = 0
-    ) -> Iterator[tuple[Plan, Selection | None]]:
-        """Yield plan and selection at each noise level, for the key of an image and an epoch."""
+    ) -> Image:
+        """Draw what the noise levels of an image share in an epoch."""
         if self._needs_dark_frames and dark_frames is None:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
-        uniforms = [math.nan] * DRAW_COUNT  # of parameters that are not drawn
-        _draw(uniforms, self._drawn, key, 0, epoch)
-        scene = records.ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
+        uniforms = parameter_uniforms(key, DRAW_COUNT, 0, epoch)
+        scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
         source, isp = self._source, self._isp
         if raw is None:
@@ -208,16 +208,20 @@ class Planner:
         if self._is_physical and facts is not None:
             light = scene.exposure, span_dn
             signals = raw_signal_range(facts, source, *light) if raw else signal_range(facts, isp, camera, *light)
-        image = Image(seed, key, facts, signals, dark_frames, source)
-        for number, level in enumerate(self._levels):
-            if number:
-                _draw(uniforms, NOISE_COUNTERS, key, number, epoch)
-            noise, physics, selection = level.draw(image, uniforms)
-            yield Plan(
-                seed=seed, stream_key=key, split=split, place=Place(level=number), camera=camera, isp=isp,
-                source=source, sensor=self._sensor, scene=scene, noise=noise, accuracy=self._accuracy,
-                physics=physics, output=self._output,
-            ), selection  # fmt: skip
+        return Image(seed, key, split, epoch, uniforms, scene, source, camera, isp, facts, signals, dark_frames)
+
+    def plan(self, image: Image, place: Place, dark: DarkFramePlan | None = None) -> tuple[Plan, Selection | None]:
+        """Draw the noise of an image at the level of a place."""
+        uniforms = image.uniforms
+        if place.level:
+            own = parameter_uniforms(image.stream_key, DRAW_COUNT, place.level, image.epoch)
+            uniforms = [own[n] if n in NOISE_COUNTERS else shared for n, shared in enumerate(uniforms)]
+        noise, physics, selection = self._levels[place.level].draw(image, uniforms)
+        return Plan(
+            seed=image.seed, stream_key=image.stream_key, split=image.split, place=place, camera=image.camera,
+            isp=image.isp, source=image.source, sensor=self._sensor, scene=image.scene, noise=noise,
+            accuracy=self._accuracy, physics=physics, dark=dark, output=self._output,
+        ), selection  # fmt: skip
 
     def _draw_split(self, seed: int, source_sha256: str) -> str:
         """Name the split of an image, empty without splits; the last one takes what the others leave."""
@@ -226,7 +230,7 @@ class Planner:
         names, ends = list(self._splits), list(itertools.accumulate(self._splits.values()))
         return names[bisect.bisect_right(ends[:-1], split_uniform(seed, source_sha256))]
 
-    def draw_camera(self, uniforms: Sequence[float]) -> records.CameraPlan:
+    def draw_camera(self, uniforms: Sequence[float]) -> CameraPlan:
         """Draw colours and gains."""
         name, weights, rgb2cam = plan_camera(self._camera, uniforms)
         red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
@@ -234,20 +238,14 @@ class Planner:
         if self._lights:
             light, cct_k, (red, blue) = draw_light(self._lights, xyz2cam(self._camera, weights), uniforms)
         inverse_rgb = draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB])
-        camera = records.CameraPlan(
+        camera = CameraPlan(
             camera=name, weights=weights, rgb2cam=rgb2cam, light=light, cct_k=cct_k, red_gain=red, blue_gain=blue,
             inverse_rgb_gain=inverse_rgb,
         )  # fmt: skip
         return without_filters(camera) if self._sensor.pattern == MONO else camera
 
 
-def _draw(uniforms: list[float], counters: tuple[int, ...], key: int, level: int, epoch: int) -> None:
-    """Fill in the uniforms of some parameters."""
-    for counter, uniform in zip(counters, parameter_uniforms(key, counters, level, epoch), strict=True):
-        uniforms[counter] = uniform
-
-
-def without_filters(camera: records.CameraPlan) -> records.CameraPlan:
+def without_filters(camera: CameraPlan) -> CameraPlan:
     """Return a camera whose channels are equal: each is the mean of the three, gains included.
 
     Highlights are kept like highlights of the mean, whose gain is the mean of the three.
@@ -259,19 +257,25 @@ def without_filters(camera: records.CameraPlan) -> records.CameraPlan:
     return camera.replace(rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=sum(gains) / 3)
 
 
-DrawnNoise = tuple[records.NoisePlan, Physics | None, Selection | None]
+DrawnNoise = tuple[NoisePlan, Physics | None, Selection | None]
 """Noise of a plan, and of a physical profile its numbers and the selection of effects."""
 
 
 class Image(NamedTuple):
-    """Facts on which the noise levels of an image depend, in addition to its uniforms."""
+    """Draws and facts that the noise levels of an image share; a physical profile needs facts and signals."""
 
     seed: int
     stream_key: int
+    split: str
+    epoch: int
+    uniforms: Sequence[float]
+    scene: ScenePlan
+    source: SourcePlan  # with the source's own noise
+    camera: CameraPlan
+    isp: IspPlan
     facts: Facts | None
-    signals: SignalRange | None  # needed by physical profiles only, as the facts
+    signals: SignalRange | None
     dark_frames: DarkFrames | None
-    source: records.SourcePlan  # with the source's own noise
 
 
 class TwoNumberLevel:
@@ -282,21 +286,27 @@ class TwoNumberLevel:
         a, b = interpretation.noise_distributions(config.noise)
         self.distributions = {Draw.A: a, Draw.B: b}
         self._span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
+        kept = functools.lru_cache(maxsize=64)  # of live pairs, which draw few of the numbers
+        self._in_dn, self._plan = kept(self._convert), kept(self._noise_plan)
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:
         """Draw the two numbers and select the effects of an image at this level."""
         a_dn, b_dn2 = self.two_numbers(uniforms)
         if self._config.source.own_noise == "subtract":  # the variances are lines, so their difference is one
             a_dn, b_dn2 = a_dn - image.source.own_a_dn, b_dn2 - image.source.own_b_dn2
-        effects, skipped = plan_effects(self._config, a_dn, b_dn2, self._span_dn)
+        return self._plan(a_dn, b_dn2), None, None
+
+    def _noise_plan(self, a_dn: float, b_dn2: float) -> NoisePlan:
         noise = self._config.noise
-        return records.NoisePlan(noise.name, noise.law, a_dn, b_dn2, effects, skipped), None, None
+        return NoisePlan(noise.name, noise.law, a_dn, b_dn2, *plan_effects(self._config, a_dn, b_dn2, self._span_dn))
 
     def two_numbers(self, uniforms: Sequence[float]) -> tuple[float, float]:
         """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
-        noise, sensor = self._config.noise, self._config.sensor
         a = draw_parameter(self.distributions[Draw.A], uniforms[Draw.A])
-        b = draw_parameter(self.distributions[Draw.B], uniforms[Draw.B], a)
+        return self._in_dn(a, draw_parameter(self.distributions[Draw.B], uniforms[Draw.B], a))
+
+    def _convert(self, a: float, b: float) -> tuple[float, float]:
+        noise, sensor = self._config.noise, self._config.sensor
         levels_dn = noise.black_level_dn or 0, noise.white_level_dn or 0
         sensor_dn = sensor.black_level_dn, sensor.white_level_dn
         meaning = {"units": noise.units or "", "black": noise.black or ""}
@@ -309,7 +319,8 @@ class PhysicalLevel:
     def __init__(self, config: Config) -> None:
         self._noise, self._rules = PhysicalNoise(config), EffectRules(config)
         self.distributions = self._noise.distributions
-        self._sensors: Recent[tuple[Any, ...], tuple[Physics, BodySelection | None]] = Recent(64)
+        self._sensors: Recent[tuple[Any, ...], tuple[Physics, BodySelection | None]] = Recent(1024)
+        self._at_dark: Recent[tuple[Any, ...], AtLevel] = Recent(1024)  # 10 kB each
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:
         """Draw the numbers of the sensor and select the effects of an image at this level."""
@@ -327,10 +338,12 @@ class PhysicalLevel:
                 physics = physics.replace(frame_size=(facts.height, facts.width))
             known = self._sensors.keep(key, (physics, self._rules.select_patterns(physics, facts.frames > 1)))
         physics, patterns = known
-        selection = self._rules.select_effects(physics, facts, image.signals, patterns)
+        frame = *key, facts.width, facts.height, facts.frames
+        at_dark = self._at_dark.get(frame) or self._at_dark.keep(frame, AtLevel())
+        selection = self._rules.select_effects(physics, facts, image.signals, patterns, at_dark)
         name, law, b_dn2 = self._noise.noise.name, self._noise.noise.law, physics.read_std_dn * physics.read_std_dn
         chosen = selection.effects, selection.skipped, selection.assumed
-        return records.NoisePlan(name, law, physics.dn_per_e, b_dn2, *chosen), physics, selection
+        return NoisePlan(name, law, physics.dn_per_e, b_dn2, *chosen), physics, selection
 
 
 # ---------------------------------------------------------------------------------------------------------- camera
@@ -347,7 +360,7 @@ def plan_camera(camera: CameraConfig, uniforms: Sequence[float]) -> tuple[str, W
         return camera.name, (0.0, 0.0, 0.0, 0.0), colour.rgb2cam(colour.matrix(camera.xyz2cam or ()))
     if camera.law == "convex":
         weights = convex_weights(uniforms if camera.weights is None else camera.weights)
-        return camera.name, weights, colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), weights))
+        return camera.name, weights, mixed_rgb2cam(weights)
     name = names[int(uniforms[Draw.CHOICE] * len(names))] if camera.law == "choice" else camera.name
     w0, w1, w2, w3 = (float(name == other) for other in names)
     return name, (w0, w1, w2, w3), colour.rgb2cam(colour.CAMERAS[name])

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any
 
+from unprocess_gen.core.sequences import Recent
 from unprocess_gen.simulation.effects import EFFECTS, heteroscedastic, shot
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.slots import Patterns, SiteNoise, Slots
 
 
-@functools.lru_cache(maxsize=1024)
 def slots_of(plan: Plan) -> Slots:
-    """Return the slots of a plan; frames that share their patterns can be simulated in one pass."""
+    """Return the slots of a plan; frames that share their patterns can be simulated in one pass.
+
+    They depend neither on the light nor on the camera's colours, so plans that differ in these share them.
+    """
+    numbers = plan.physics, plan.noise.effects, plan.noise.variance_line
+    key = *numbers, plan.sensor, plan.stream_key, plan.place, plan.dark
+    return _kept.get(key) or _kept.keep(key, _slots_of(plan))
+
+
+_kept: Recent[tuple[Any, ...], Slots] = Recent(1024)
+
+
+def _slots_of(plan: Plan) -> Slots:
     black_dn, physics = float(plan.sensor.black_level_dn), plan.physics
     if physics is None:
         return _two_numbers(plan, black_dn)

@@ -51,6 +51,7 @@ def gamma_text(gamma: float | str) -> str:
     return str(int(number)) if number.is_integer() else repr(number)
 
 
+@functools.lru_cache(maxsize=8)
 def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
     """Curve from code to linear light: float64 [codes], from 0 to 1, correctly rounded, read-only.
 
@@ -60,14 +61,10 @@ def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
     """
     if tone not in EXACT_INVERSE_TONES:
         raise ValueError(f"tone={tone}: unknown tone curve; expected one of {', '.join(EXACT_INVERSE_TONES)}")
-    return _linear_table(tone, gamma_text(gamma), codes)
-
-
-@functools.lru_cache(maxsize=8)
-def _linear_table(tone: str, gamma: str, codes: int) -> Float:
-    published = PUBLISHED_SHA256.get((tone, gamma, codes))
+    text = gamma_text(gamma)
+    published = PUBLISHED_SHA256.get((tone, text, codes))
     is_stored = published is not None and codes == 65536
-    table = _read_stored(tone, gamma) if is_stored else compute_curve(tone, gamma, codes)
+    table = _read_stored(tone, text) if is_stored else compute_curve(tone, text, codes)
     return freeze(table, published)
 
 

@@ -11,12 +11,12 @@ positions none is more likely than another by more than n / 2**32.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from unprocess_gen.config.interpretation import PatchRule
 from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb
-from unprocess_gen.core.random_streams import patch_words
 from unprocess_gen.simulation.frames import Patch
+from unprocess_gen.simulation.kernels.draws import patch_words
 
 
 def list_patches(
@@ -36,7 +36,7 @@ def list_patches(
     return tuple(Patch(rule.side, rule.side, number, y, x) for number, (y, x) in enumerate(corners))
 
 
-def even_corner(place: tuple[int, int], side: int, height: int, width: int) -> tuple[int, int]:
+def even_corner(place: Sequence[int], side: int, height: int, width: int) -> tuple[int, int]:
     """Even row and column of a square in a rectangle that two random words choose."""
     rows, columns = (height - side) // 2 + 1, (width - side) // 2 + 1
     return 2 * (place[0] * rows >> 32), 2 * (place[1] * columns >> 32)

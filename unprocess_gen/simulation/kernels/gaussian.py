@@ -10,6 +10,7 @@ Design: ``docs/design/kernels.md``.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,6 @@ from unprocess_gen.simulation.kernels.jit import inner
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer
 from unprocess_gen.simulation.kernels.strips import SIZE, Buffers, Float32, Strip
-from unprocess_gen.simulation.plan import Plan
 
 NORMAL_PURPOSE = np.uint64(purpose(STREAM))
 
@@ -52,26 +52,23 @@ class Gaussian32(NamedTuple):
     black_dn: NDArray[np.float32]  # [SIZE] equal values
 
 
-def variance_lines(plans: tuple[Plan, ...], dtype: Any = np.float64) -> NDArray[Any]:
-    """Return the variance lines of the plans' frames, [N, 2]."""
-    lines = np.array([plan.noise.variance_line for plan in plans])
-    if dtype is np.float64:
-        return lines
+VarianceLines = tuple[tuple[float, float], ...]
+"""a and b of each frame."""
+
+
+def variance_lines(lines: VarianceLines, dtype: Any = np.float64) -> NDArray[Any]:
+    """Return the variance lines of frames, [N, 2]."""
     with np.errstate(over="ignore"):  # a variance beyond float32 becomes infinite, and the site is clipped
-        return lines.astype(dtype)
+        return np.array(lines).astype(dtype, copy=False)
 
 
-def gaussian_noise(plans: tuple[Plan, ...]) -> Gaussian:
-    """Return the noise of the plans' frames."""
-    lines, error, _, quadratics = normal.normal_quantiles()
-    black_dn = float(plans[0].sensor.black_level_dn)
-    return Gaussian(variance_lines(plans), black_dn, lines, quadratics, float(error) + ROUNDING_ERROR)
-
-
-def gaussian_noise32(plans: tuple[Plan, ...]) -> Gaussian32:
-    """Return the noise of the plans' frames in float32."""
-    black_dn = np.full(SIZE, plans[0].sensor.black_level_dn, dtype=np.float32)
-    return Gaussian32(variance_lines(plans, np.float32), black_dn)
+@functools.lru_cache(maxsize=256)
+def gaussian_noise(lines: VarianceLines, black_dn: float, in_float32: bool) -> Gaussian | Gaussian32:
+    """Return the noise of frames, which live pairs with the same numbers share."""
+    if in_float32:
+        return Gaussian32(variance_lines(lines, np.float32), np.full(SIZE, black_dn, dtype=np.float32))
+    approximate, error, _, quadratics = normal.normal_quantiles()
+    return Gaussian(variance_lines(lines), black_dn, approximate, quadratics, float(error) + ROUNDING_ERROR)
 
 
 @inner

@@ -30,7 +30,7 @@ from unprocess_gen.simulation.kernels.clean import (
 )
 from unprocess_gen.simulation.kernels.electron_records import electron_noise
 from unprocess_gen.simulation.kernels.electrons import Electrons
-from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
+from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise
 from unprocess_gen.simulation.kernels.jit import kernel
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
@@ -95,7 +95,8 @@ class Renderer:
         self._inverse = unprocessing_of(first, codes, corner, kind)
         self._noise: Gaussian | Gaussian32 | None = None  # noise in electrons depends on the place
         if not first.counts_electrons:
-            self._noise = (gaussian_noise32 if in_float32 else gaussian_noise)(plans)
+            lines = tuple(plan.noise.variance_line for plan in plans)
+            self._noise = gaussian_noise(lines, float(first.sensor.black_level_dn), in_float32)
         self._slots = () if self._noise else tuple(map(slots_of, plans))
         self._readout = readout_of(plans, shape if packed else (0, 0), corner, in_float32)
         self.keys = philox_keys(plans)

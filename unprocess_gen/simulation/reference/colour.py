@@ -137,10 +137,10 @@ def normalise_rows(entries: Matrix) -> Matrix:
         if not condition(entries) <= MAX_CONDITION:
             raise ValueError(f"the camera matrix is not invertible (condition number above {MAX_CONDITION:g})")
     a, b, c, d, e, f, g, h, i = entries
-    return *_unit_row(a, b, c), *_unit_row(d, e, f), *_unit_row(g, h, i)
+    return *unit_row(a, b, c), *unit_row(d, e, f), *unit_row(g, h, i)
 
 
-def _unit_row(a: float, b: float, c: float) -> tuple[float, float, float]:
+def unit_row(a: float, b: float, c: float) -> tuple[float, float, float]:
     """Return one row divided by its sum, on the grid of `normalise_rows`; the largest entry is 1 minus the others."""
     total = a + b + c
     if abs(total) <= 1e-9 * max(abs(a), abs(b), abs(c)):
