@@ -142,6 +142,32 @@ class Call(argparse.Namespace):
         return local_path(self.place, f"{self.verb.name}: {self.place} is in an object store; expected a local path")
 
 
+def verb(
+    *arguments: Operand | Flag, keys: Mapping[str, str] = MappingProxyType({}), composes: bool = False
+) -> Callable[[Callable[[Call], int]], Verb]:
+    """Make a verb of the function that runs it, whose docstring is its summary; ``arguments`` are a place and flags."""
+
+    def declare(run: Callable[[Call], int]) -> Verb:
+        summary = (run.__doc__ or "").rstrip(".")  # python -OO removes docstrings
+        place = next((argument for argument in arguments if isinstance(argument, Operand)), None)
+        flags = tuple(argument for argument in arguments if isinstance(argument, Flag))
+        return Verb(run.__name__, summary[:1].lower() + summary[1:], run, place, flags, keys, composes)
+
+    return declare
+
+
+DATASET = Operand("DIR", "the folder of a dataset")
+ANY_DATASET = Operand("DIR", "the folder of a dataset or of a sweep")
+BEGUN = Operand("OUT", "the folder of a run in parts")
+N_JOBS = {"n_jobs=N": "number of worker processes; -1: all cores"}
+SOURCE = {"source.root=ROOT": "folder of the photographs; by default the one recorded in dataset.json"}
+INPUTS = SOURCE | {"noise.dark_frames=FOLDER": "folder of the dark frames, if it is not the recorded one"}
+"""Where the files are that pairs are regenerated from."""
+
+ROWS = "rows by source index, range or key, such as 3,7-9,00000012-p0007"
+KEYS = flag("--keys", "KEYS", ROWS)
+
+
 class _Parser(argparse.ArgumentParser):
     """A parser that raises ConfigError instead of ending the process."""
 

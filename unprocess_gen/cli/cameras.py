@@ -7,14 +7,20 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.arguments import Call, Operand, flag, local, verb
 from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.reports.formatting import counted, short_number
 
 
+@verb(
+    Operand("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
+    flag("--to", "FILE", "write the profile to FILE.yaml, and estimates to FILE.json", local, required=True),
+    flag("--report", "PAGE", "draw curves, histograms and maps in PAGE (HTML)", local),
+    flag("--from", "noise_profile", "read tags of DNG files", dest="origin", choices=("noise_profile",)),
+)
 def calibrate(call: Call) -> int:
-    """Write a noise profile and the list of its estimates, from captures or from what DNG files state."""
+    """Measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile."""
     from unprocess_gen.calibration.profile import check_outputs
 
     folder, to, page = call.local_place, call.to, call.report
@@ -80,8 +86,13 @@ def _usage(**options: Path) -> str:
     return f"--config-dir {shlex.quote(str(folders.pop()))} {chosen}"
 
 
+@verb(
+    Operand("FILE", "the raw file: a DNG, or another one that LibRaw reads"),
+    flag("--to", "CAMERA", "write the matrix of the camera to CAMERA.yaml", local, required=True),
+    flag("--sensor", "SENSOR", "write pattern, bits and levels to SENSOR.yaml", local),
+)
 def camera(call: Call) -> int:
-    """Write the options, and print what was read from which tag."""
+    """Write a camera option, and a sensor option, from one raw file."""
     from unprocess_gen.core.files import machine_errors
     from unprocess_gen.core.paths import LocalPath
     from unprocess_gen.sources.raw.options import camera_options, check_options

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.arguments import ANY_DATASET, INPUTS, KEYS, Call, Operand, count, flag, local, switch, verb
 from unprocess_gen.cli.messages import print_results, report, report_error
 from unprocess_gen.cli.places import dataset_folder, given_places, given_root
 from unprocess_gen.cli.sweep import worst
@@ -21,8 +21,16 @@ if TYPE_CHECKING:
     from unprocess_gen.pipeline.replay import ReplayResult
 
 
+@verb(
+    ANY_DATASET,
+    flag("--regenerate", "N", "regenerate N pairs and compare them", count),
+    switch("--repair", "restore damaged files to the same bytes"),
+    switch("--noise", "check whether the noise in the arrays is that of the manifest"),
+    flag("--against", "FRAMES", "compare raw darks and flats of a camera with the noise profile", local),
+    keys=INPUTS,
+)
 def verify(call: Call) -> int:
-    """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
+    """Check every byte of a dataset or sweep; repair, regenerate, check noise."""
     from unprocess_gen.pipeline.verify import is_sweep, verify, verify_sweep
 
     folder = dataset_folder(call, sweeps=True)
@@ -144,8 +152,14 @@ def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
     return texts
 
 
+@verb(
+    Operand("MANIFEST", "a manifest.csv, or the folder of a dataset"),
+    KEYS,
+    flag("--to", "FOLDER", "write the arrays to FOLDER", local),
+    keys=INPUTS,
+)
 def replay(call: Call) -> int:
-    """Regenerate rows of a manifest, and compare or write their arrays."""
+    """Regenerate rows and compare them, or write their arrays."""
     from unprocess_gen.dataset.selection import select_rows
     from unprocess_gen.pipeline.replay import replay
 

@@ -115,7 +115,7 @@ def group_help(group: str) -> str:
 def verb_help(verb: Verb) -> str:
     """Help of one verb, as argparse formats it."""
     parser = verb.parser
-    parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
+    parser.description = verb.run.__doc__
     if verb.place is not None:
         parser.add_argument(verb.place.metavar, help=verb.place.expected, nargs="?" if verb.place.optional else None)
     if verb.composes:

@@ -6,7 +6,21 @@ import os
 import shlex
 from pathlib import Path
 
-from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.arguments import (
+    ANY_DATASET,
+    DATASET,
+    INPUTS,
+    KEYS,
+    ROWS,
+    SOURCE,
+    Call,
+    Operand,
+    count,
+    flag,
+    local,
+    switch,
+    verb,
+)
 from unprocess_gen.cli.jobs import Job, composed_jobs, option_folders, run_jobs
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.messages import report as report_message
@@ -17,8 +31,13 @@ from unprocess_gen.core.libraries import require
 from unprocess_gen.reports.formatting import counted
 
 
+@verb(
+    switch("--all", "read every photograph, and name those that fail"),
+    switch("--numbers", "state the source of each number of the noise profile"),
+    composes=True,
+)
 def plan(call: Call) -> int:
-    """Estimate pairs, bytes and time of a run, and explain which effects it simulates."""
+    """Estimate pairs, bytes and time, and explain the effects; write nothing."""
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run
     from unprocess_gen.reports.plan_text import format_estimate, totals_line
@@ -37,8 +56,9 @@ def plan(call: Call) -> int:
     return code
 
 
+@verb(composes=True)
 def accuracy(call: Call) -> int:
-    """Measure error and time of every tier, stage by stage, and write a report, never into a dataset."""
+    """Measure time and error of each tier; default out: accuracy."""
     from unprocess_gen.config.raw_validation import require_photographs
     from unprocess_gen.core.paths import local_path
     from unprocess_gen.reports.accuracy_page import REPORT_FILES, report_text, write_accuracy
@@ -62,8 +82,9 @@ def accuracy(call: Call) -> int:
     return run_jobs(composed_jobs(call), measure)
 
 
+@verb(ANY_DATASET, flag("--to", "FILE", "write FILE instead of DIR/report.html", local), keys=INPUTS)
 def report(call: Call) -> int:
-    """Write the HTML page of a dataset or a sweep."""
+    """Write an HTML page about a dataset or a sweep."""
     from unprocess_gen.core.paths import any_path
     from unprocess_gen.pipeline.verify import is_sweep
     from unprocess_gen.reports.dataset_page import write_dataset_report
@@ -91,8 +112,15 @@ def _report_sweep(folder: Path, call: Call) -> int:
     return 0
 
 
+@verb(
+    DATASET,
+    KEYS,
+    flag("--to", "FOLDER", "write the pictures to FOLDER", local, required=True),
+    switch("--stages", "draw each processing step too"),
+    keys=SOURCE,
+)
 def preview(call: Call) -> int:
-    """Draw contact sheets of pairs."""
+    """Draw contact sheets of pairs, and of each processing step."""
     from unprocess_gen.core.paths import any_path
     from unprocess_gen.dataset.selection import select_pairs
     from unprocess_gen.reports.sheets import write_sheets
@@ -121,8 +149,15 @@ def _check_not_among_photographs(to: Path, root: str | None) -> None:
         raise ConfigError(f"--to {to}: is inside the folder of the photographs, {root}; {expected}")
 
 
+@verb(
+    DATASET,
+    flag("--keys", "KEYS", ROWS, required=True),
+    flag("--to", "FOLDER", "write the files to FOLDER", local, required=True),
+    switch("--noisy", "only noisy frames"),
+    switch("--clean", "only clean frames"),
+)
 def dng(call: Call) -> int:
-    """Write frames as DNG files."""
+    """Write frames as DNG files, for raw converters."""
     from unprocess_gen.dataset.dng import FRAMES, export
 
     frames = [frame for frame in FRAMES if getattr(call, frame)] or FRAMES
@@ -138,8 +173,15 @@ def dng(call: Call) -> int:
     return 0
 
 
+@verb(
+    Operand("PHOTO", "a photograph, a folder of photographs, or a dataset", optional=True),
+    KEYS,
+    flag("--port", "N", "number of the port on 127.0.0.1; default: a free one", count, default=0),
+    switch("--no-browser", "print the address, and open no browser"),
+    composes=True,
+)
 def explore(call: Call) -> int:
-    """Serve a page on this machine until it is interrupted."""
+    """Try settings on a photograph or a row, in a page of the browser on this machine."""
     for library in ("bokeh", "jinja2"):
         require(library, f"explore: the page needs {library}", "explore")
     if call.multirun or call.cfg or call.resolve:

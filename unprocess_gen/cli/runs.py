@@ -8,9 +8,10 @@ import re
 from collections.abc import Mapping
 from functools import partial
 from operator import attrgetter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.arguments import BEGUN, DATASET, INPUTS, N_JOBS, Call, Operand, flag, local, switch, verb
 from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
 from unprocess_gen.cli.jobs import Job, checked_jobs, composed_jobs, run_jobs
 from unprocess_gen.cli.messages import print_results, report
@@ -34,12 +35,13 @@ DIFFERENCES_LISTED = 20
 """Differences from a build that are listed; the others are counted."""
 
 
-def generate(call: Call, changes: Mapping[str, Any] | None = None) -> int:
-    """Generate a dataset, or one for each combination of a sweep; ``changes`` are settings that differ."""
-    return run_jobs(composed_jobs(call), partial(_generate, changes=changes or {}), has_table=True)
+@verb(composes=True)
+def generate(call: Call) -> int:
+    """Generate a dataset; the default verb."""
+    return run_jobs(composed_jobs(call), _generate, has_table=True)
 
 
-def _generate(job: Job, changes: Mapping[str, Any]) -> list[str]:
+def _generate(job: Job, changes: Mapping[str, Any] = MappingProxyType({})) -> list[str]:
     """Generate the dataset of a job; the lines to print about it."""
     from unprocess_gen.config.schema import replaced
     from unprocess_gen.pipeline.generate import generate
@@ -50,9 +52,10 @@ def _generate(job: Job, changes: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+@verb(composes=True)
 def manifest(call: Call) -> int:
-    """Write the manifest of a dataset, or one for each combination of a sweep, without making frames."""
-    return generate(call, {"output.frames": False})
+    """Write the manifest of a dataset without frames, for ug.LivePairs."""
+    return run_jobs(composed_jobs(call), partial(_generate, changes={"output.frames": False}), has_table=True)
 
 
 def outcome(summary: Summary, max_failed: int) -> tuple[int, list[str]]:
@@ -63,8 +66,9 @@ def outcome(summary: Summary, max_failed: int) -> tuple[int, list[str]]:
     return TOO_MANY_FAILED if sum(summary.failed.values()) > max_failed else DONE, list(filter(None, lines))
 
 
+@verb(Operand("K/N", "part K (from 0) of N; or /N in a job of an array"), composes=True)
 def part(call: Call) -> int:
-    """Generate one part of a dataset, or of each dataset of a sweep."""
+    """Generate part K (from 0) of N of a dataset, for separate jobs; merge finishes it."""
     from unprocess_gen.pipeline.generate import make_part
 
     number, parts = _part(str(call.place or ""))
@@ -91,8 +95,9 @@ def _part(text: str) -> tuple[int, int]:
     return int(given), int(written[2])
 
 
+@verb(BEGUN)
 def merge(call: Call) -> int:
-    """Write manifest and ``dataset.json`` of a run whose parts are done."""
+    """Write manifest.csv and dataset.json when all parts are finished."""
     from unprocess_gen.pipeline.generate import merge
 
     code, lines = outcome(*merge(str(call.place)))
@@ -100,8 +105,21 @@ def merge(call: Call) -> int:
     return code
 
 
+@verb(
+    DATASET,
+    keys={
+        "out=FOLDER": "folder of the new dataset (required)",
+        **INPUTS,
+        **N_JOBS,
+        "executor=NAME": "what runs the workers: local or dask",
+        "executor.address=ADDRESS": "address of a Dask scheduler",
+        "executor.no_workers_s=SECONDS": "time without any worker after which the run ends",
+        "output.frames=true": "make the frames of a manifest without frames",
+        "source.max_failed=N": "largest number of failed sources with exit code 0",
+    },
+)
 def again(call: Call) -> int:
-    """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
+    """Regenerate a dataset from its config.yaml in another folder, and compare."""
     from unprocess_gen.config.composition import load_config
     from unprocess_gen.core.paths import any_path
     from unprocess_gen.pipeline.again import compare, recorded_config
@@ -123,8 +141,14 @@ def again(call: Call) -> int:
     return code
 
 
+@verb(
+    Operand("NAME", "the name of a build", optional=True),
+    flag("--to", "DIR", "write the build to DIR", local),
+    switch("--list", "list all builds"),
+    keys=N_JOBS,
+)
 def build(call: Call) -> int:
-    """Make a benchmark build, or compare an existing one; list all builds."""
+    """Make a benchmark build and compare every byte with its recorded digests."""
     from unprocess_gen.reports.builds import build_names, read_build
 
     if call.list:
@@ -157,4 +181,4 @@ def make_build(build: Build, folder: Path, n_jobs: str = "-1") -> int:
 
     settings = [*build.overrides(folder, build.photographs_folder()), f"n_jobs={n_jobs}"]
     composed = compose_jobs(settings, OptionFolders(), multirun=bool(build.recipe.sweep))
-    return run_jobs(checked_jobs(composed, only_swept=True), lambda job: _generate(job, {})[:1], has_table=True)
+    return run_jobs(checked_jobs(composed, only_swept=True), lambda job: _generate(job)[:1], has_table=True)
