@@ -27,6 +27,7 @@ from helpers.processes import (
     committed,
     held,
     imported_first,
+    interrupt,
     kill_group,
     processes_per_core,
     running,
@@ -39,6 +40,7 @@ from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.pipeline.executors import local
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.generate import Summary
 
@@ -185,16 +187,17 @@ def test_resumed_run_makes_only_missing_shards(begun: Path, make: Make) -> None:
     assert {name: after[name] for name in before} == before
 
 
-def test_unfinished_files_of_a_killed_process_are_deleted(begun: Path, make: Make) -> None:
+def test_unfinished_files_of_a_killed_process_are_deleted_at_the_start(
+    begun: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     left = begun / "ds/.work/tmp/host-1-a/shard-00002.tar.1.1"
     left.parent.mkdir(parents=True)
     left.write_bytes(b"half")
     left.parent.with_suffix(".lock").touch()
-    with OutFolder(begun / "ds") as folder:
-        folder.open()
-        assert not left.exists()
-    make(begun / "p", begun / "ds", FOUR)
-    assert_complete(begun / "ds")
+    monkeypatch.setattr(local, "make_shards", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        make(begun / "p", begun / "ds", FOUR)
+    assert not left.exists()
 
 
 def test_unfinished_files_of_a_running_process_are_kept(begun: Path, make: Make, tree_hash: TreeHash) -> None:
