@@ -1,4 +1,4 @@
-"""A browser for the tests of pages."""
+"""A dataset with noise that can be fitted, and a browser, for the tests of pages."""
 
 from __future__ import annotations
 
@@ -10,6 +10,15 @@ from typing import Any
 
 import pytest
 from helpers.browser import FLAGS
+from helpers.datasets import Make
+
+
+@pytest.fixture(scope="session")
+def scenes(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of two synthetic pictures, large enough that their noise can be fitted; no test changes it."""
+    out = tmp_path_factory.mktemp("scenes") / "ds"
+    make(None, out, "source.limit=2")
+    return out
 
 
 @pytest.fixture

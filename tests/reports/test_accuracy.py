@@ -148,14 +148,13 @@ def test_ended_measurement_leaves_nothing(folder: Path, settings: Settings, monk
         tier_costs.measure_accuracy(settings())
 
 
-def test_built_in_scenes_are_read_from_files(settings: Settings, tmp_path: Path) -> None:
-    inputs = tier_costs.select_inputs(settings("source.limit=2", "source.downscale=2"), tmp_path)
-    assert [source.path[-4:] for source in list_photographs(inputs.source).sources] == [".jpg"] * 2
-
-
 def test_photographs_end_with_enough_pixels(
     settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    synthetic = tier_costs.select_inputs(
+        settings("source.limit=2", "source.downscale=2"), tmp_path / "synthetic"
+    ).source
+    assert [source.path[-4:] for source in list_photographs(synthetic).sources] == [".jpg"] * 2
     root = fill(tmp_path / "photos", 9)
     (root / "000.png").write_bytes(b"")  # cannot be read
     for pixels, overrides, count in (

@@ -16,13 +16,6 @@ from unprocess_gen import RawPairs, make_pair
 from unprocess_gen.sources import synthetic
 
 
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
-    out = tmp_path_factory.mktemp("transfer") / "ds"
-    make(None, out, "source.limit=3")
-    return out
-
-
 @pytest.mark.parametrize(
     "overrides",
     [

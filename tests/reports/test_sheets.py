@@ -246,7 +246,6 @@ def test_changed_photograph_is_named_and_its_panel_omitted(
         ("DS --to sheets source.root=nowhere", "source.root=nowhere: no such folder or file"),
         ("DS --to file", "--to file: is a file; expected a folder"),
         ("DS --to DS/sheets", "--to DS/sheets: is inside the dataset "),
-        ("DS --to sheets --draw 1", "preview: --draw: no such flag; expected "),
     ],
 )
 def test_wrong_argument_gives_one_line_and_writes_nothing(
