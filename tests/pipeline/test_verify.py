@@ -21,7 +21,7 @@ from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.dataset.shards import read_index
-from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay
+from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 
 FILES = ("config.yaml", "manifest.csv", "dataset.json", "shards/shard-00000.tar", "shards/shard-00001.tar")
@@ -212,10 +212,9 @@ def test_selection_of_missing_rows_is_refused(keys: str, intact: Path) -> None:
         list(select_rows(intact / "manifest.csv", keys))
 
 
-def test_regenerated_rows_are_spread_over_the_manifest(intact: Path) -> None:
-    manifest = intact / "manifest.csv"
-    assert [row["key"] for row in evenly_spaced_rows(manifest, 2)] == ["00000000", "00000001"]
-    assert len(list(evenly_spaced_rows(manifest, 99))) == 3
+@pytest.mark.parametrize(("asked", "made"), [(2, 2), (99, 3)])
+def test_verify_regenerates_at_most_all_pairs(asked: int, made: int, intact: Path, run_main: RunMain) -> None:
+    assert f"; {made} pairs regenerated, bit for bit" in run_main("verify", intact, "--regenerate", asked).out
 
 
 def test_dataset_json_ends_with_its_own_digest(intact: Path) -> None:

@@ -92,9 +92,12 @@ def _repair(folder: AnyPath, call: Call) -> list[int]:
 
 def _regenerated(folder: AnyPath, call: Call) -> list[ReplayResult]:
     """Regenerate rows that are spread evenly over the dataset, and compare them."""
-    from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay
+    from unprocess_gen.core.sequences import evenly_spaced
+    from unprocess_gen.dataset.reader import DatasetRows
+    from unprocess_gen.pipeline.replay import replay
 
-    rows, places = evenly_spaced_rows(folder / "manifest.csv", call.regenerate), given_places(folder, call)
+    pairs, places = DatasetRows(folder), given_places(folder, call)
+    rows = map(pairs.row, evenly_spaced(range(len(pairs)), call.regenerate))
     return list(replay(rows, places.root, dark_frames=places.dark_frames))
 
 

@@ -17,6 +17,9 @@ from __future__ import annotations
 RESUME = "finished shards are kept; run the same command again to resume"
 """What to do after a run ended early, for messages. It is also true of one part of a run."""
 
+RESTORE = "restore the file, or regenerate the dataset"
+"""What to do if a source of a dataset was changed or deleted."""
+
 REASONS = {
     "empty": "the file has no bytes",
     "unreadable": "the file cannot be opened or read, or leads outside `source.root`",

@@ -10,7 +10,7 @@ from typing import Any
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError, SourceError
+from unprocess_gen.core.errors import RESTORE, ConfigError, DamageError, SourceChangedError, SourceError
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path
@@ -18,7 +18,7 @@ from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import check_format, recorded_places
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.row import without_empty
-from unprocess_gen.pipeline.replay import ADVICE, check_root
+from unprocess_gen.pipeline.replay import check_root
 from unprocess_gen.pipeline.run import sources_of_rows
 from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import source_file
@@ -71,7 +71,7 @@ def compare(folder: AnyPath, new_folder: AnyPath) -> str:
         recorded, sha256 = row.get("source_sha256"), other.get("source_sha256")
         if recorded and sha256 and recorded != sha256 and row["source"] == other["source"]:
             raise SourceChangedError(
-                f"source {row['source']}: has the SHA-256 {sha256}; expected {recorded}, as recorded; {ADVICE}"
+                f"source {row['source']}: has the SHA-256 {sha256}; expected {recorded}, as recorded; {RESTORE}"
             )
         raise DamageError(f"{new}: differs from {old}; check that the sources are the same")
     return f"the same rows as {folder}, in its cells; {new} has frames too"
@@ -93,8 +93,9 @@ def _check_sizes(manifest: AnyPath, root: str) -> None:
         with suppress(OSError, ValueError, SourceError):
             size = sizes.get(path) if sizes else source_file(root, path).size()
         if size is None:
-            raise SourceChangedError(f"source {source.name}: is missing from {root}; {ADVICE}")
+            raise SourceChangedError(f"source {source.name}: is missing from {root}; {RESTORE}")
         if size != source.size_bytes:
             raise SourceChangedError(
-                f"source {source.name}: has {size} bytes in {root}; expected {source.size_bytes}, as recorded; {ADVICE}"
+                f"source {source.name}: has {size} bytes in {root}; expected {source.size_bytes}, as recorded; "
+                f"{RESTORE}"
             )

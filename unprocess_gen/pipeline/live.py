@@ -36,7 +36,7 @@ from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, open_
 from unprocess_gen.dataset.row import COLUMNS, pair_row, patch_from_row, plan_from_row
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.pairs import PairSettings, levels_of, plan_pixels, targets_of
-from unprocess_gen.pipeline.replay import PairRegenerator, source_of
+from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
@@ -50,6 +50,7 @@ from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
+from unprocess_gen.sources.recorded_photographs import RecordedPhotographs
 
 REDRAWS = ("noise", "all", "none")
 
@@ -373,7 +374,7 @@ class RecordedPairs(DatasetRows):
         config, _ = read_dataset_yaml(folder / "config.yaml")
         places = recorded_places(folder, root)
         self.settings = PairSettings.read(replaced(config, {"noise.dark_frames": places.dark_frames}))
-        self._sources = PairRegenerator(places.root, places.dark_frames)
+        self._photographs = RecordedPhotographs(places.root)
         self._kept: Recent[int, LiveImage] = Recent(KEPT)
 
     def image(self, number: int) -> LiveImage:
@@ -390,8 +391,8 @@ class RecordedPairs(DatasetRows):
         return image
 
     def decode(self, image: LiveImage) -> Srgb:
-        """Decode the image of a pair; raise as `PairRegenerator.photograph`."""
-        return self._sources.photograph(image.source, image.sha256, image.plan.source).srgb
+        """Decode the image of a pair; raise as `RecordedPhotographs`."""
+        return self._photographs.load(image.source, image.sha256, image.plan.source).srgb
 
 
 class PlannedPairs:

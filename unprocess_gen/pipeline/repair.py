@@ -17,7 +17,14 @@ from typing import Any, NamedTuple
 
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
-from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
+from unprocess_gen.core.errors import (
+    RESTORE,
+    ConfigError,
+    DamageError,
+    MachineError,
+    SourceChangedError,
+    UnprocessGenError,
+)
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import Row
@@ -27,7 +34,7 @@ from unprocess_gen.dataset.manifest import read_rows, rows_text, shard_rows, wri
 from unprocess_gen.dataset.row import columns_of, has_frames, row_json
 from unprocess_gen.dataset.shards import ShardWriter, shard_name, stored_rows
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator, check_root
+from unprocess_gen.pipeline.replay import PairRegenerator, check_root
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.tasks import (
     ROWS,
@@ -131,7 +138,7 @@ def _restore_manifest(place: OutFolder, folder: Path, facts: dict[str, Any], con
     if run.shards != len(entries) or not _is_manifest(place, columns, made, facts):
         raise SourceChangedError(
             f"{place}/{MANIFEST}: the regenerated one has another SHA-256: a source was changed, added or "
-            f"deleted; {ADVICE}"
+            f"deleted; {RESTORE}"
         )
     return RepairStep(f"{MANIFEST}: regenerated from the settings and the sources")
 

@@ -7,37 +7,27 @@ damage of the dataset: it is reported separately, with exit code 5 instead of 4.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config.schema import RawConfig, SourceConfig
-from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
+from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError
 from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import image_key
-from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
 from unprocess_gen.dataset.row import has_frames, patch_from_row, plan_from_row
 from unprocess_gen.dataset.shards import arrays_of
 from unprocess_gen.pipeline.pairs import PlannedImage, Targets, targets_of
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.plan import Plan, SourcePlan
+from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
-from unprocess_gen.sources.image.decode import Photograph
-from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.names import decode_name
-
-NO_LIMIT = 2**40
-"""Pixels that a replay accepts; ``source.max_pixels`` applied when the row was made."""
-
-ADVICE = "restore the file, or regenerate the dataset"
+from unprocess_gen.sources.recorded_photographs import RecordedPhotographs
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +60,6 @@ def check_root(folder: AnyPath, kind: str, root: str | None, verb: str = "") -> 
             f"{verb}source.root is missing: {folder} does not record the folder of its sources; expected that "
             "folder; give source.root=…"
         )
-
-
-def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
-    """Yield rows of pairs, evenly spaced over a manifest."""
-    pairs = (offset for offset, row in rows_with_offsets(manifest) if row["status"] == "ok")
-    places = np.fromiter(pairs, dtype=np.int64)  # 8 bytes a row; a list takes 40
-    return (read_row(manifest, int(places[number])) for number in evenly_spaced(range(len(places)), count))
 
 
 def replay(
@@ -115,13 +98,11 @@ def replay(
 class PairRegenerator:
     """Regenerate pairs from rows and the folder of their sources, ``root``; synthetic pictures need none.
 
-    ``dark_frames`` is the folder of the dark frames that rows name. The last photograph stays decoded, because rows of
-    one image are consecutive.
+    ``dark_frames`` is the folder of the dark frames that rows name.
     """
 
     def __init__(self, root: str | None, dark_frames: str | None = None) -> None:
-        self._root, self._dark_frames = root, dark_frames
-        self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
+        self._photographs, self._dark_frames = RecordedPhotographs(root), dark_frames
 
     def regenerate(self, row: Row) -> Targets:
         """Make the frames and targets of a row by name, without comparing their digests.
@@ -131,7 +112,7 @@ class PairRegenerator:
         """
         plan, names = plan_from_row(row), [LINEAR_RGB] if row["targets"] else []
         self_test.check([plan], names)
-        photograph = self.photograph(source_of(row), str(row["source_sha256"]), plan.source)
+        photograph = self._photographs.load(source_of(row), str(row["source_sha256"]), plan.source)
         patch = patch_from_row(row)
         height, width = photograph.srgb.shape[:2]
         if patch.patch_y + patch.height > height or patch.patch_x + patch.width > width:
@@ -143,39 +124,6 @@ class PairRegenerator:
         _, _, pair = next(image.pairs())
         targets = targets_of(names, photograph.srgb, plan, patch, pair)
         return {"clean": pair.clean, "noisy": pair.noisy, **targets}
-
-    def photograph(self, source: Source, recorded: str, prepared: SourcePlan) -> Photograph:
-        """Decode the source of a row with this SHA-256; raise as `regenerate`.
-
-        SourceChangedError unless the file can be read and used as when it was listed.
-        """
-        if self._root is None and source.size_bytes != 0:
-            raise ConfigError(
-                f"source.root is missing: row {source.index:08d} was generated from the file {source.name}; "
-                "expected its folder; give source.root=…"
-            )
-        config = recorded_source(self._root, source, prepared)
-        try:
-            if self._kept is None or self._kept[:2] != (config, source):
-                self._kept = None  # frees the last photograph first: two at a time would take twice the memory
-                self._kept = config, source, *load_source(config, source)
-        except SourceError as error:
-            if error.sha256 not in (None, recorded):
-                raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
-            text = f"its source cannot be used ({error})"
-            raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {ADVICE}")) from error
-        except MachineError as error:
-            raise SourceChangedError(f"{str(error).partition(';')[0]}; {ADVICE}") from error
-        _, _, sha256, photograph = self._kept
-        if sha256 != recorded:
-            raise SourceChangedError(_changed(sha256, recorded))
-        if photograph.raw is not None and photograph.raw.source.mosaic_xxh3 != prepared.mosaic_xxh3:
-            raise SourceChangedError(
-                f"its file is the same, but is decoded to another mosaic: XXH3-128 is "
-                f"{photograph.raw.source.mosaic_xxh3}, the row records {prepared.mosaic_xxh3}; expected the version of "
-                "LibRaw (rawpy) that dataset.json records"
-            )
-        return photograph
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
         """Give access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
@@ -199,28 +147,12 @@ class PairRegenerator:
         return arrays
 
 
-def recorded_source(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
-    """Settings with which the source of a row is decoded."""
-    place = None if source.size_bytes == 0 else root  # synthetic pictures have no bytes
-    config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
-    if not prepared.is_raw:
-        return config
-    pattern = None if PurePosixPath(source.path).suffix.lower() in RAW_FILES else prepared.raw_pattern
-    black = set(prepared.raw_black_dn)  # several are those of the file
-    raw = RawConfig(pattern, black.pop() if len(black) == 1 else None, prepared.raw_white_dn[0])
-    return replace(config, kind="raw", shrink=prepared.shrink, raw=raw)
-
-
 def _difference(arrays: Targets, row: Row) -> str:
     return "; ".join(
         f"the XXH3-128 of {name} is {digest}, the row records {stored.digest}"
         for name, stored in arrays_of(row).items()
         if (digest := array_xxh3(arrays[name])) != stored.digest
     )
-
-
-def _changed(sha256: str, recorded: str) -> str:
-    return f"its source has changed: SHA-256 is {sha256}, the row records {recorded}; {ADVICE}"
 
 
 def source_of(row: Row) -> Source:

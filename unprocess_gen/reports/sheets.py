@@ -29,13 +29,14 @@ from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.row import patch_from_row, plan_from_row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
-from unprocess_gen.pipeline.replay import PairRegenerator, source_of
+from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, Picture, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.sources.patches import crop_patch
+from unprocess_gen.sources.recorded_photographs import RecordedPhotographs
 
 PAIRS_SHOWN = 8
 """Number of pairs shown if no keys are given."""
@@ -72,12 +73,12 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
     pairs, manifest = RawPairs(folder), folder / "manifest.csv"
     if not len(pairs):
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
-    sources = PairRegenerator(recorded_places(folder, None if source is None else str(source)).root)
+    sources = RecordedPhotographs(recorded_places(folder, None if source is None else str(source)).root)
     for number in select_pairs(manifest, keys).rows if keys else evenly_spaced(range(len(pairs)), PAIRS_SHOWN):
         clean, noisy, row = pairs[number]
         plan, part, missing = plan_from_row(row), None, ""
         try:
-            photograph = sources.photograph(source_of(row), str(row["source_sha256"]), plan.source)
+            photograph = sources.load(source_of(row), str(row["source_sha256"]), plan.source)
             part = crop_patch(photograph.srgb, patch_from_row(row))
         except (SourceChangedError, DamageError, ConfigError) as error:  # the sheet is drawn without this photograph
             missing = str(error)

@@ -1,0 +1,75 @@
+"""Decode the photographs of a dataset again, as its rows record them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+from unprocess_gen.config.schema import RawConfig, SourceConfig
+from unprocess_gen.core.errors import RESTORE, ConfigError, DamageError, MachineError, SourceChangedError, SourceError
+from unprocess_gen.core.raw_files import RAW_FILES
+from unprocess_gen.core.source import Source
+from unprocess_gen.simulation.plan import SourcePlan
+from unprocess_gen.sources.image.decode import Photograph
+from unprocess_gen.sources.loader import load_source
+
+NO_LIMIT = 2**40
+"""Pixels that a replay accepts; ``source.max_pixels`` applied when the row was made."""
+
+
+class RecordedPhotographs:
+    """Decode sources below ``root``; the last one stays decoded, because rows of one image are consecutive."""
+
+    def __init__(self, root: str | None) -> None:
+        self._root = root
+        self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
+
+    def load(self, source: Source, recorded: str, prepared: SourcePlan) -> Photograph:
+        """Decode the source of a row with this SHA-256.
+
+        SourceChangedError unless the file can be read and used as when it was listed, DamageError if its bytes cannot
+        be a source, ConfigError if it is a file and there is no root.
+        """
+        if self._root is None and source.size_bytes != 0:
+            raise ConfigError(
+                f"source.root is missing: row {source.index:08d} was generated from the file {source.name}; "
+                "expected its folder; give source.root=…"
+            )
+        config = _settings_of(self._root, source, prepared)
+        try:
+            if self._kept is None or self._kept[:2] != (config, source):
+                self._kept = None  # frees the last photograph first: two at a time would take twice the memory
+                self._kept = config, source, *load_source(config, source)
+        except SourceError as error:
+            if error.sha256 not in (None, recorded):
+                raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
+            text = f"its source cannot be used ({error})"
+            raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {RESTORE}")) from error
+        except MachineError as error:
+            raise SourceChangedError(f"{str(error).partition(';')[0]}; {RESTORE}") from error
+        _, _, sha256, photograph = self._kept
+        if sha256 != recorded:
+            raise SourceChangedError(_changed(sha256, recorded))
+        if photograph.raw is not None and photograph.raw.source.mosaic_xxh3 != prepared.mosaic_xxh3:
+            raise SourceChangedError(
+                f"its file is the same, but is decoded to another mosaic: XXH3-128 is "
+                f"{photograph.raw.source.mosaic_xxh3}, the row records {prepared.mosaic_xxh3}; expected the version of "
+                "LibRaw (rawpy) that dataset.json records"
+            )
+        return photograph
+
+
+def _settings_of(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
+    """Settings with which the source of a row is decoded."""
+    place = None if source.size_bytes == 0 else root  # synthetic pictures have no bytes
+    config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
+    if not prepared.is_raw:
+        return config
+    pattern = None if PurePosixPath(source.path).suffix.lower() in RAW_FILES else prepared.raw_pattern
+    black = set(prepared.raw_black_dn)  # several are those of the file
+    raw = RawConfig(pattern, black.pop() if len(black) == 1 else None, prepared.raw_white_dn[0])
+    return replace(config, kind="raw", shrink=prepared.shrink, raw=raw)
+
+
+def _changed(sha256: str, recorded: str) -> str:
+    return f"its source has changed: SHA-256 is {sha256}, the row records {recorded}; {RESTORE}"
