@@ -36,27 +36,6 @@ def calibrated(run_main: RunMain, tmp_path: Path) -> Any:
 
 
 @pytest.mark.slow
-def test_simulated_camera_is_measured(calibrated: Any, tmp_path: Path) -> None:
-    """Tolerances: 4 standard errors of the numbers of frames and sites."""
-    camera = Camera("sony_a7s2", 3200, side=256)
-    folder = record(
-        tmp_path / "captures", camera, darks=6, long_s=(8.0,), levels=(0.02, 0.05, 0.09, 0.15, 0.2, 0.25, 0.3)
-    )
-    found, truth = estimates(calibrated(folder)), camera.truth
-
-    def relative(name: str, true: float, iso: float | None = 3200) -> float:
-        return abs(float(found[name, iso, None]["value"]) / true - 1)
-
-    assert relative("dn_per_e", truth["dn_per_e"]) <= 0.008
-    assert relative("read_std_dn", truth["read_std_dn"]) <= 0.005
-    assert relative("row_std_dn", truth["row_std_dn"]) <= 0.09
-    assert relative("prnu_std", truth["prnu_std"], None) <= 0.12
-    assert relative("dark_e_per_s", truth["dark_e"], None) <= 0.02
-    assert abs(found["read_shape", 3200, None]["value"] - truth["read_shape"]) <= 0.02
-    assert abs(found["black_error_dn", 3200, "R"]["value"] - truth["black_error_dn_00"]) <= 0.05
-
-
-@pytest.mark.slow
 def test_profile_is_used_as_it_was_written(calibrated: Any, run_main: RunMain, tmp_path: Path) -> None:
     """Noise of data made with it passes the check, and its captures agree with it."""
     folder, out = tmp_path / "captures", tmp_path / "ds"

@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 from helpers import object_store as servers
 from helpers.object_store import Proxy
-from helpers.processes import free_port
 
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, MachineError
@@ -181,14 +180,6 @@ def test_lasting_failure_ends_in_one_line(slow_proxy: Proxy, bucket: ObjectPath)
     with pytest.raises(MachineError, match=rf"^{bucket}/a: the object store failed \(503 .*; rerun when it answers$"):
         (bucket / "a").read_bytes()
     assert len(slow_proxy.requests) == object_store.MAX_RETRIES + 1
-
-
-def test_unreachable_server_ends_in_one_line(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(object_store, "MAX_RETRIES", 0)
-    servers.use(monkeypatch, f"http://127.0.0.1:{free_port()}")
-    with pytest.raises(MachineError, match=r"^s3://bucket/a: the object store failed \(.*\); rerun when it answers$"):
-        ObjectPath("s3://bucket/a").read_bytes()
-    object_store._store.cache_clear()
 
 
 def test_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

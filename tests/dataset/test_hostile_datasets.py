@@ -23,7 +23,7 @@ from unprocess_gen.dataset.row import MAX_DETAIL, detail_text, plan_from_row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.dataset.shards import read_index
 from unprocess_gen.pipeline.replay import replay
-from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.pipeline.verify import verify, verify_sweep
 
 KEY = "00000001"
 
@@ -187,8 +187,9 @@ ELSEWHERE = [f"{HEAD}{folder},a=1,3,0,0\n".encode() for folder in ("..", ".", ""
 def test_malformed_table_of_a_sweep_is_damage(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "sweep.csv").write_bytes(content)
     folder = "expected the name of a folder next to the table" if content in ELSEWHERE else ""
-    with pytest.raises(DamageError, match=f"not the table of a sweep.*{folder}"):
-        RawPairs(tmp_path)
+    for read in (RawPairs, lambda folder: list(verify_sweep(folder))):
+        with pytest.raises(DamageError, match=f"sweep.csv: not the table of a sweep.*{folder}"):
+            read(tmp_path)
 
 
 # Explanations of failures ---------------------------------------------------------------------------------------------

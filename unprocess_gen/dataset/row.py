@@ -22,6 +22,7 @@ from unprocess_gen.core.fields import (
     Numbers,
     Text,
 )
+from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.records import check_record, parse_record
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
@@ -65,7 +66,7 @@ def _is_relative(value: Any) -> bool:
     if not ANY_TEXT.allows(value) or not 0 < len(value) <= MAX_PATH:
         return False
     path = re.sub("%([0-9A-F]{2})", lambda match: chr(int(match[1], 16)), value)
-    return not path.startswith("/") and ".." not in path.split("/") and "\0" not in path
+    return not leads_outside(path) and "\0" not in path
 
 
 RELATIVE_PATH = Limit("a path below the source folder, relative and without .. segments", _is_relative)
