@@ -50,7 +50,7 @@ def override_text(value: Any) -> str:
         return repr(value)
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{override_text(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return "[" + ",".join(map(override_text, value)) + "]"
     text = str(value)
     is_word = re.fullmatch(r"[A-Za-z_]\w*", text, re.ASCII) and text.lower() not in WORDS_OF_HYDRA

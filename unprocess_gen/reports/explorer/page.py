@@ -54,10 +54,13 @@ SECTIONS = {
     ),
 }
 """Groups and keys by the title of their section."""
-SLIDERS = {"gains.red": (0.5, 4), "gains.blue": (0.5, 4), "gains.inverse_rgb": (0.3, 2.2), "gains.threshold": (0, 0.99)}
-"""Ends of sliders by key."""
-DRAWN = {"gains.red": "red_gain", "gains.blue": "blue_gain", "gains.inverse_rgb": "inverse_rgb_gain"}
-"""Keys of which sliders show the value in the plan, which may be drawn."""
+SLIDERS = {
+    "gains.red": (0.5, 4, "camera.red_gain"),
+    "gains.blue": (0.5, 4, "camera.blue_gain"),
+    "gains.inverse_rgb": (0.3, 2.2, "camera.inverse_rgb_gain"),
+    "gains.threshold": (0, 0.99, "isp.highlight_threshold"),
+}
+"""Ends of sliders by key, and the number of the plan that they show, which may be drawn."""
 NONE = "(none)"
 SETTINGS = all_settings(Config)
 TIPS = [
@@ -168,22 +171,19 @@ class Page:
         """Compute the pair, draw everything, and set the controls."""
         with self._reported():
             shown = self._state.shown()
-            self._draw(shown)
+            is_new = self._shown is None or shown.clean.shape != self._shown.clean.shape
+            self._shown = shown
+            if is_new:
+                height, width = shown.clean.shape
+                for drawn in self._pictures:
+                    drawn.aspect_ratio = width / height
+                self._x.update(start=0, end=width, reset_start=0, reset_end=width)
+                self._y.update(start=height, end=0, reset_start=height, reset_end=0)
+            self._draw_view()
+            self._draw_statistics(shown)
+            self._command.value = self._state.command
+            self._message.text = ""
             self._sync(shown)
-
-    def _draw(self, shown: Shown) -> None:
-        is_new = self._shown is None or shown.clean.shape != self._shown.clean.shape
-        self._shown = shown
-        if is_new:
-            height, width = shown.clean.shape
-            for drawn in self._pictures:
-                drawn.aspect_ratio = width / height
-            self._x.update(start=0, end=width, reset_start=0, reset_end=width)
-            self._y.update(start=height, end=0, reset_start=height, reset_end=0)
-        self._draw_view()
-        self._draw_statistics(shown)
-        self._command.value = self._state.command
-        self._message.text = ""
 
     def _draw_view(self) -> None:
         """Draw the sites in view, from even rows and columns."""
@@ -265,7 +265,7 @@ class Page:
 def _widget(name: str, folders: list[Any]) -> InputWidget:
     """The control of a group or key, without a value."""
     if name in SLIDERS:
-        start, end = SLIDERS[name]
+        start, end, _ = SLIDERS[name]
         return Slider(title=name, start=start, end=end, step=0.01, value=start)
     setting = SETTINGS.get(name)
     if setting is None:
@@ -280,16 +280,14 @@ def _widget(name: str, folders: list[Any]) -> InputWidget:
 
 def _shown_value(name: str, settings: dict[str, str], choices: dict[str, Any], config: Config, plan: Plan) -> Any:
     """The value of a control: an option, the number in the plan, or the text of a setting."""
-    if name in DRAWN:
-        return float(getattr(plan.camera, DRAWN[name]))
+    if name in SLIDERS:
+        return float(operator.attrgetter(SLIDERS[name][2])(plan))
     if name == "camera.weights":
         return override_text([round(weight, 4) for weight in plan.camera.weights])
     if name not in SETTINGS:
         return choices.get(name) or NONE
-    if name in settings and name not in SLIDERS:
-        return settings[name].strip("'\"")
-    value = operator.attrgetter(name)(config)
-    return float(value) if name in SLIDERS else override_text(value).strip("'")
+    text = settings[name] if name in settings else override_text(operator.attrgetter(name)(config))
+    return text.strip("'\"")
 
 
 def _text_box(name: str) -> Div:
