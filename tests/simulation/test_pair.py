@@ -11,8 +11,6 @@ from helpers.promise_report import Figure
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.clean import FLOAT32_CHANGED_SHARE, FLOAT32_CLEAN_DN, is_steep
@@ -29,9 +27,8 @@ INVERSE_GAINS = (0.5, 0.8, 1.0 - 2**-53, 1.0, 1.1, 2.05)
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
-    noise = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
-    return plan_image(Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise), "5" * 64)
+def plan(plan: Plan) -> Plan:
+    return plan.replace(red_gain=2.1, blue_gain=1.7, inverse_rgb_gain=0.8)
 
 
 @pytest.fixture(scope="module")

@@ -39,22 +39,6 @@ def tukey(tail: mpmath.mpf, shape: float) -> mpmath.mpf:
     return ((1 - tail) ** mpmath.mpf(shape) - tail ** mpmath.mpf(shape)) / mpmath.mpf(shape)
 
 
-def tukey_deviation(shape: float) -> mpmath.mpf:
-    """Return the standard deviation by numerical integration of the squared quantile function."""
-    halves = [mpmath.mpf(10) ** -power for power in (60, 30, 15, 8, 4, 2, 1)] + [mpmath.mpf(1) / 2]
-    beyond = 0
-    if shape < 0:  # contribution below 1e-60: the square is nearly u**(2·shape) / shape**2
-        beyond = mpmath.mpf(10) ** (-60 * (2 * mpmath.mpf(shape) + 1)) / (2 * mpmath.mpf(shape) + 1) / shape**2
-    return mpmath.sqrt(2 * (mpmath.quad(lambda u: tukey(u, shape) ** 2, halves) + beyond))
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_tukey_standard_deviation_matches_quantiles(shape: float) -> None:
-    with mpmath.workdps(30):
-        exact = tukey_deviation(shape)
-    assert float(tukey_std(shape)) == pytest.approx(float(exact), rel=1e-9)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_tukey_quantiles_match_closed_form(shape: float) -> None:
     rng = np.random.Generator(np.random.Philox(key=3))

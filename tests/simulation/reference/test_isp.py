@@ -16,8 +16,6 @@ from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import colour, unprocess
@@ -38,12 +36,6 @@ GAINS = {
 
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
 STEPS = [pytest.param(15, id="lattice"), pytest.param(1, id="all 2**24", marks=pytest.mark.slow)]
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    noise = NoiseConfig("none", "dn", "subtracted", 12, 240, 4095, 0.0, 0.0)
-    return plan_image(Config(gains=GainsConfig(1.0, 1.0, 1.0), noise=noise), "a" * 64)
 
 
 def colours(step: int) -> Iterator[np.ndarray]:

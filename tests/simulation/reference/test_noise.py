@@ -11,10 +11,8 @@ from helpers.moments import REACH, SAMPLER_ERROR
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.core import exact_distributions
 from unprocess_gen.core.random_streams import words
-from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects.heteroscedastic import STREAM
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.electrons import noisy
@@ -22,12 +20,6 @@ from unprocess_gen.simulation.reference.noise import normals
 
 LAST = 2**31 - 1
 """Last index, next to the centre of the distribution; index 0 is farthest in the tail."""
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    noise = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
-    return plan_image(Config(gains=GainsConfig(1.0, 1.0, 1.0), noise=noise), "e" * 64)
 
 
 def normal(index: int) -> float:
