@@ -87,7 +87,8 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
         regenerator = PairRegenerator(root, dark_frames)
         for number, rows in shard_rows(folder / MANIFEST):
             if tar_name(number) in damaged:
-                yield _regenerate_shard(place, number, [*filter(has_frames, rows)], regenerator)
+                sha256 = facts["shards"][number]["sha256"] if facts else None
+                yield _regenerate_shard(place, number, [*filter(has_frames, rows)], regenerator, sha256)
         if not facts:
             place.write(DATASET, _dataset_json(folder, {"kind": kind, "root": absolute_text(root)}).encode())
             yield RepairStep(f"{DATASET}: rewritten; host, time and versions of the run are lost")
@@ -170,8 +171,10 @@ def _made_rows(place: OutFolder, run: Run, number: int, stored: Sequence[Row]) -
     return sorted([*stored, *made.rows], key=lambda row: int(image_key(row)))
 
 
-def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regenerator: PairRegenerator) -> RepairStep:
-    """Regenerate a shard; an error becomes a step, so that other shards are repaired nevertheless."""
+def _regenerate_shard(
+    place: OutFolder, number: int, rows: Sequence[Row], regenerator: PairRegenerator, sha256: str | None
+) -> RepairStep:
+    """Regenerate a shard with a known digest; an error becomes a step, so that others are repaired nevertheless."""
     name, part = tar_name(number), place.scratch / shard_name(number)
     try:
         with ShardWriter(part) as writer:
@@ -179,6 +182,8 @@ def _regenerate_shard(place: OutFolder, number: int, rows: Sequence[Row], regene
                 for row in sample:
                     writer.add_pair(row, regenerator.regenerate_exactly(row), is_first=row is sample[0])
                 writer.add_rows(sample_key(sample[0]), row_json(sample))
+        if sha256 not in (None, writer.sha256):
+            raise DamageError(f"its SHA-256 is {writer.sha256}, {DATASET} records {sha256}")
     except UnprocessGenError as error:
         exit_code = error.exit_code if isinstance(error, MachineError) else DamageError.exit_code
         return RepairStep(f"{name}: cannot be regenerated: {error}", exit_code)
