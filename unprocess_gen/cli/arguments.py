@@ -133,13 +133,12 @@ class Call(argparse.Namespace):
     settings: dict[str, str]
     overrides: list[str]
 
-    @property
-    def local_place(self) -> Path:
-        """The place of a verb that needs a local one; ConfigError for a URL."""
+    def local_place(self, kind: str) -> Path:
+        """The place of a verb that needs a local file or folder (``kind``); ConfigError for a URL."""
         from unprocess_gen.core.paths import local_path
 
         assert self.place is not None
-        return local_path(self.place, f"{self.verb.name}: {self.place} is in an object store; expected a local path")
+        return local_path(self.place, f"{self.verb.name}: {self.place} is in an object store; expected a local {kind}")
 
 
 def verb(

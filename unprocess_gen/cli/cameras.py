@@ -23,12 +23,12 @@ def calibrate(call: Call) -> int:
     """Measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile."""
     from unprocess_gen.calibration.profile import check_outputs
 
-    folder, to, page = call.local_place, call.to, call.report
+    folder, to, page = call.local_place("folder"), call.to, call.report
     if call.origin and page is not None:
         raise ConfigError(f"calibrate: --report {page}: draws measured frames, not tags; leave it out")
     check_outputs(to)
     isos = _state(folder, to) if call.origin else _measure(folder, to, page)
-    print_results(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with scene.iso={isos[0]:g} {_usage(noise=to)}")
+    print_results(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with {_usage(noise=to)} scene.iso={isos[0]:g}")
     return 0
 
 
@@ -78,11 +78,11 @@ def _report_notes(notes: Iterable[str]) -> None:
 
 
 def _usage(**options: Path) -> str:
-    """Settings with which a run uses the option files of groups."""
+    """Settings with which a run uses the option files of groups; others may follow."""
     chosen = " ".join(f"{group}={path.stem}" for group, path in options.items())
     folders = {path.parent.parent if path.parent.name == group else None for group, path in options.items()}
     if len(folders) > 1 or None in folders:
-        return f"{chosen}, in a folder {' and a folder '.join(options)} of --config-dir"
+        return f"{chosen}, in a folder {' and a folder '.join(options)} of --config-dir, and"
     return f"--config-dir {shlex.quote(str(folders.pop()))} {chosen}"
 
 
@@ -97,7 +97,7 @@ def camera(call: Call) -> int:
     from unprocess_gen.core.paths import LocalPath
     from unprocess_gen.sources.raw.options import camera_options, check_options
 
-    file, to, sensor = call.local_place, call.to, call.sensor
+    file, to, sensor = call.local_place("file"), call.to, call.sensor
     if not file.is_file():
         raise ConfigError(f"camera {file}: no such file; expected a raw file")
     check_options(to, sensor)
@@ -106,5 +106,5 @@ def camera(call: Call) -> int:
     for group, path in paths.items():
         with machine_errors(path):
             LocalPath(path).write(options[group].encode(), str(path.parent))
-    print_results(*sources, f"{to}: use it with {_usage(**paths)}")
+    print_results(*sources, f"{to}: use it with {_usage(**paths).removesuffix(', and')}")
     return 0

@@ -101,7 +101,7 @@ def merge(call: Call) -> int:
     from unprocess_gen.pipeline.generate import merge
 
     code, lines = outcome(*merge(str(call.place)))
-    print_results(*lines)
+    print_results(*lines[:1])
     return code
 
 

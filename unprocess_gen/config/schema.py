@@ -131,7 +131,7 @@ class SourceConfig(Group):
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False)
     include: Optional[tuple[str, ...]] = key(
         ("*.jpg", "*.jpeg", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
-        Limit("a list of at least one pattern such as '*.jpg'", bool), null="the suffixes of files that kind reads")
+        Limit("a list of at least one pattern such as '*.jpg'"), null="the suffixes of files that kind reads")
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")

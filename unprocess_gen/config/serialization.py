@@ -42,6 +42,9 @@ def data_keys(group: Any) -> tuple[str, ...]:
     return tuple(name for name in names if (data_keys(inner[name]) if name in inner else settings[name].decides_data))
 
 
+TYPE_NAMES = {"array": "list", "object": "mapping", "Number out of range": "float"}
+"""Names of types in messages, by those of msgspec."""
+
 SOURCE_KINDS = ("folder", "synthetic", "raw")
 
 
@@ -108,7 +111,8 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
         value: Any = loaded
         for step in steps:
             value = value[step]
-        raise refusal(place, value, problem[0].lower() + problem[1:]) from None
+        wanted = problem.removeprefix("Expected `").partition("`")[0].partition(" | ")[0]
+        raise refusal(place, value, f"expected a value of type {TYPE_NAMES.get(wanted, wanted)}") from None
     given, known = flat(loaded).keys(), flat(recorded(config)).keys()
     for problem, keys in (("missing", known - given), ("unknown", given - known)):
         if keys:
