@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import re
 from collections.abc import Iterable
@@ -20,7 +19,7 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.fields import Choice, Field, Integers, Numbers
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.dataset.manifest import csv_lines, read_rows
 from unprocess_gen.dataset.row import (
     COLUMN_NAMES,
     COLUMNS,
@@ -71,9 +70,7 @@ FRAME = dataclasses.replace(SOURCE, clip="c")
 
 
 def csv_text(rows: Iterable[Row]) -> str:
-    stream = io.StringIO(newline="")
-    write_rows(stream, rows, COLUMN_NAMES)
-    return stream.getvalue()
+    return ",".join(COLUMN_NAMES) + "\n" + csv_lines(rows, COLUMN_NAMES).decode()
 
 
 def row_of(plan: Plan = PLAN, source: Source = SOURCE, key: str = "00000003", patch: Patch = PATCH) -> Row:

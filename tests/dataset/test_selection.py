@@ -11,7 +11,7 @@ from helpers.records import PAIR, PATCH, PLAN, SHA256, SOURCE
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.manifest import write_rows
+from unprocess_gen.dataset.manifest import csv_lines, write_manifest
 from unprocess_gen.dataset.row import COLUMN_NAMES, failed_row, pair_row
 from unprocess_gen.dataset.selection import parse_keys, select_pairs, select_rows
 
@@ -33,8 +33,7 @@ def rows() -> list[Row]:
 
 @pytest.fixture
 def manifest(tmp_path: Path) -> Path:
-    with (tmp_path / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, rows(), COLUMN_NAMES)
+    write_manifest(tmp_path / "manifest.csv", COLUMN_NAMES, [csv_lines(rows(), COLUMN_NAMES)])
     return tmp_path / "manifest.csv"
 
 

@@ -14,11 +14,10 @@ from helpers.datasets import Make
 from helpers.photographs import fill
 
 from unprocess_gen import RawPairs
-from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text
 from unprocess_gen.dataset.keys import key_text
-from unprocess_gen.dataset.manifest import read_columns, write_rows
+from unprocess_gen.dataset.manifest import csv_lines, read_columns, write_manifest
 from unprocess_gen.dataset.reader import Sample
 from unprocess_gen.dataset.row import row_json
 from unprocess_gen.dataset.shards import ShardWriter, member_of, shard_name
@@ -37,10 +36,10 @@ def write_copies(original: Path, folder: Path, pairs: int, per_shard: int) -> Pa
     config = (original / "config.yaml").read_text(encoding="utf-8")
     (folder / "config.yaml").write_text(config, encoding="utf-8")
     shards: list[dict[str, Any]] = []
-    with (folder / "manifest.csv").open("w", encoding="utf-8", newline="") as manifest:
-        write_rows(manifest, _rows(sample, folder, pairs, per_shard, shards), read_columns(original / "manifest.csv"))
+    names, rows = read_columns(original / "manifest.csv"), _rows(sample, folder, pairs, per_shard, shards)
+    digest = write_manifest(folder / "manifest.csv", names, (csv_lines([row], names) for row in rows))
     facts = {"pairs": pairs, "failed": {}, "sites": {}, "source": {"kind": "folder", "root": None}}
-    dataset = dataset_facts(config, file_sha256(folder / "manifest.csv"), shards, facts)
+    dataset = dataset_facts(config, digest, shards, facts)
     (folder / "dataset.json").write_text(dataset_text(dataset), encoding="ascii")
     return folder
 

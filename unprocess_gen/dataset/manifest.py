@@ -14,7 +14,7 @@ import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import BinaryIO
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.fields import ALWAYS
@@ -27,32 +27,21 @@ MAX_LINE_BYTES = 2**17
 """Longest line of a manifest that is read. Paths have at most 4096 bytes, three characters each if encoded."""
 
 
-def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> None:
-    r"""Write rows as CSV: ``\n`` line ends, quotes only if needed, empty cells for None."""
-    stream.write(header_text(names))
-    stream.writelines(rows_text([row], names) for row in rows)
-
-
 def write_manifest(path: Path, names: Sequence[str], texts: Iterable[bytes]) -> str:
-    """Write a manifest, given its lines in pieces; its SHA-256."""
+    """Write a manifest, given the lines of its rows in pieces (`csv_lines`); its SHA-256."""
     digest = hashlib.sha256()
     with path.open("wb", buffering=2**20) as stream:
-        for text in itertools.chain([header_text(names).encode()], texts):
+        for text in itertools.chain([",".join(names).encode() + b"\n"], texts):  # no name of a column needs quotes
             digest.update(text)
             stream.write(text)
     return digest.hexdigest()
 
 
-def rows_text(rows: Iterable[Row], names: Sequence[str]) -> str:
-    """Lines that `write_rows` writes for some rows, without the header."""
+def csv_lines(rows: Iterable[Row], names: Sequence[str]) -> bytes:
+    r"""Lines of rows as CSV: ``\n`` line ends, quotes only if needed, empty cells for None."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([_cell(row[name]) for name in names] for row in rows)
-    return stream.getvalue()
-
-
-def header_text(names: Sequence[str]) -> str:
-    """First line of a manifest; no name of a column needs quotes."""
-    return ",".join(names) + "\n"
+    return stream.getvalue().encode()
 
 
 def _cell(value: Value) -> str:

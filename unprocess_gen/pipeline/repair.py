@@ -30,7 +30,7 @@ from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text, fingerprint, read_dataset, recorded_places
 from unprocess_gen.dataset.keys import group_by_sample, image_key, key_text, sample_key
-from unprocess_gen.dataset.manifest import read_rows, rows_text, shard_rows, write_manifest
+from unprocess_gen.dataset.manifest import csv_lines, read_rows, shard_rows, write_manifest
 from unprocess_gen.dataset.row import columns_of, has_frames, row_json
 from unprocess_gen.dataset.shards import ShardWriter, shard_name, stored_rows
 from unprocess_gen.pipeline.folder import OutFolder
@@ -125,7 +125,7 @@ def _restore_manifest(place: OutFolder, folder: Path, facts: dict[str, Any], con
     as rows of failed sources, is regenerated.
     """
     columns, entries = columns_of(config), facts["shards"]
-    stored = (rows_text(_stored_rows(folder, entry), columns).encode() for entry in entries)
+    stored = (csv_lines(_stored_rows(folder, entry), columns) for entry in entries)
     recorded = (read[1] for read in read_records(place, range(len(entries))) if read is not None)
     for name, texts in (("the shards", stored), (ROWS, recorded)):
         if _is_manifest(place, columns, texts, facts):
@@ -133,7 +133,7 @@ def _restore_manifest(place: OutFolder, folder: Path, facts: dict[str, Any], con
     check_root(folder, kind, config.source.root or None)
     run = resolve(config)
     made = (
-        rows_text(_made_rows(place, run, number, _stored_rows(folder, entry)), columns).encode()
+        csv_lines(_made_rows(place, run, number, _stored_rows(folder, entry)), columns)
         for number, entry in enumerate(entries)
     )
     if run.shards != len(entries) or not _is_manifest(place, columns, made, facts):

@@ -23,7 +23,7 @@ from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import ShardFacts, check_shard
 from unprocess_gen.dataset.keys import group_by_image
-from unprocess_gen.dataset.manifest import rows_text
+from unprocess_gen.dataset.manifest import csv_lines
 from unprocess_gen.dataset.row import has_frames
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.folder import WORK, OutFolder
@@ -222,7 +222,7 @@ def commit_shard(folder: OutFolder, result: ShardResult, columns: Sequence[str])
     report = result.report
     if result.path is not None:
         (folder / tar_name(report.shard)).commit(Path(result.path))
-    csv = rows_text(result.rows, columns).encode()
+    csv = csv_lines(result.rows, columns)
     facts = {"entry": result.entry(), "counts": count_rows(result.rows), "csv_bytes": len(csv)}
     folder.write(_file(report.shard), json.dumps(facts, separators=(",", ":")).encode() + b"\n" + csv)
     images = [rows[0] for rows in group_by_image(result.rows)]
