@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Float
-from unprocess_gen.core.random_streams import BLOCK, purpose, words
+from unprocess_gen.core.random_streams import BLOCK, purpose
 from unprocess_gen.simulation.effects.dark_frame import dark_frame_offsets
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.kernels.electrons import FLOAT32_ERROR_DN, MAX_STEPS, PLACES, Electrons, FrameNumbers
@@ -34,6 +34,7 @@ from unprocess_gen.simulation.slots import (
     Slots,
     UniformCounts,
     UnitWords,
+    draw_words,
 )
 
 FARTHEST_NORMAL = 6.4
@@ -214,6 +215,4 @@ def _first_normals(stream: UnitWords | FrameWords, columns: int) -> Float:
 
 def _normals(stream: UnitWords | FrameWords, rows: int, columns: int) -> Float:
     """Return the normals of the first columns of one row, or of the first column of some rows."""
-    numbers = stream._asdict()
-    key, name = numbers.pop("key"), numbers.pop("stream")
-    return normals(words(key, name, (rows, columns), **numbers)).ravel()
+    return normals(draw_words(stream, (rows, columns))).ravel()

@@ -20,6 +20,7 @@ from unprocess_gen.core.arrays import Float, Frame
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import MONO, mosaic, tile
 from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, invert
+from unprocess_gen.simulation.reference.unprocess import gray_gains
 
 MAX_ITERATIONS = 200
 """Limit of the searches below, which need fewer: bisection ends after at most 64 steps, Newton's method at least halves
@@ -255,17 +256,10 @@ def apply_gains_gray_mean(y: Float, k: Float, threshold: float) -> Float:
         middle = (low + high) / 2
         if ((middle <= low) | (middle >= high)).all():
             break
-        above = middle > np.mean(part / _gray_gains(middle, k, threshold), axis=-1)
+        above = middle > np.mean(part / gray_gains(middle, k, threshold), axis=-1)
         low, high = np.where(above, low, middle), np.where(above, middle, high)
-    i[kept] = part / _gray_gains(high, k, threshold)
+    i[kept] = part / gray_gains(high, k, threshold)
     return np.asarray(i)
-
-
-def _gray_gains(gray: Float, k: Float, threshold: float) -> Float:
-    """Return the inverse gains that the highlight method ``gray_mean`` uses for a channel mean."""
-    m = np.maximum(gray - threshold, 0)[..., None] / (1 - threshold)
-    mask = m * m
-    return np.maximum(mask + (1 - mask) * k, k)
 
 
 def apply_gains_none(y: Float, k: Float, threshold: float) -> Float:

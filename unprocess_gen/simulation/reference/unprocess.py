@@ -159,9 +159,7 @@ def invert_gains_per_channel(i: Float, k: Float, threshold: float) -> Float:
 
 def invert_gains_gray_mean(i: Float, k: Float, threshold: float) -> Float:
     """Preserve highlights by the mean of the three channels (Brooks et al. 2019, safe_invert_gains())."""
-    gray = ((i[..., 0] + i[..., 1]) + i[..., 2]) / 3
-    mask = highlight_mask(gray, threshold)[..., None]
-    return i * np.maximum(mask + (1 - mask) * k, k)
+    return i * gray_gains(((i[..., 0] + i[..., 1]) + i[..., 2]) / 3, k, threshold)
 
 
 def invert_gains_none(i: Float, k: Float, threshold: float) -> Float:
@@ -174,6 +172,12 @@ INVERSE_HIGHLIGHTS = {
     "gray_mean": invert_gains_gray_mean,
     "none": invert_gains_none,
 }
+
+
+def gray_gains(gray: Float, k: Float, threshold: float) -> Float:
+    """Return the inverse gains of the highlight method ``gray_mean``, [..., 3], for a mean of the channels."""
+    mask = highlight_mask(gray, threshold)[..., None]
+    return np.asarray(np.maximum(mask + (1 - mask) * k, k))
 
 
 def highlight_mask(i: Float, threshold: float) -> Float:
