@@ -30,7 +30,6 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
 from PIL import Image
 
 from unprocess_gen.cli import main as entry_point
@@ -96,29 +95,6 @@ def _pictures_drawn_once() -> Iterator[None]:
     drawn = functools.cache(synthetic.picture)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "picture", lambda name: drawn(name).copy())
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _options_parsed_once() -> Iterator[None]:
-    """Let Hydra parse each file of options once: parsing takes a fifth of a composition, and tests compose 800 times.
-
-    The files of the package and of Hydra do not change in a run of the tests; other files are parsed each time.
-    """
-    load = OmegaConf.load
-    kept: dict[str, bytes] = {}
-    constant = tuple(f"{folder}{os.sep}" for folder in (conf_dir(), Path(hydra.__file__).parent))
-
-    def loaded(file: Any) -> Any:
-        name = str(getattr(file, "name", file))
-        if not name.startswith(constant):
-            return load(file)
-        if name not in kept:
-            kept[name] = pickle.dumps(load(file))
-        return pickle.loads(kept[name])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OmegaConf, "load", staticmethod(loaded))
         yield
 
 

@@ -309,7 +309,11 @@ def away(folder: str) -> None:
 
 
 FAULTS: dict[str, tuple[tuple[int, ...], Callable[[pytest.MonkeyPatch], Any], str]] = {
-    "full disk": ((1, COUNT), lambda patch: failing_disk(errno.ENOSPC, patch), "No space left on device"),
+    "full disk": (
+        (1, COUNT),
+        lambda patch: failing_disk(errno.ENOSPC, patch),
+        r"No space left on device \(.* bytes free\)",
+    ),
     "read-only disk": ((1, COUNT), lambda patch: failing_disk(errno.EROFS, patch), "Read-only file system"),
     "no folder": ((1, COUNT), lambda _: away("ds"), "ds"),
     "no sources": ((2,), lambda _: away("p"), "source.root=p: 002.png was deleted or moved"),

@@ -21,8 +21,7 @@ from helpers.processes import ONE
 
 from unprocess_gen.cli.messages import logging_to_stderr
 from unprocess_gen.cli.process_limits import LEAST_ADDRESS_SPACE
-from unprocess_gen.core.errors import RESUME, MachineError
-from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.paths import LocalPath
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import progress as progress_module
@@ -75,12 +74,6 @@ def test_out_inside_an_unfinished_dataset_is_refused(run_main: RunMain, tmp_path
 
 
 # Reasons --------------------------------------------------------------------------------------------------------------
-
-
-def test_file_error_reports_free_space_on_a_full_disk(tmp_path: Path) -> None:
-    text = str(machine_error(OSError(errno.ENOSPC, "No space left on device"), tmp_path / "a/b", RESUME))
-    assert text.startswith(f"{tmp_path}/a/b: No space left on device (")
-    assert text.endswith(" bytes free); finished shards are kept; run the same command again to resume")
 
 
 def test_unreadable_shard_is_a_system_error(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from helpers import object_store as servers
 from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import TreeHash
 from helpers.kinds import KINDS, Kind
 
 import unprocess_gen as ug
-from unprocess_gen.core.object_store import ObjectPath
 
 QUICK = ("patches, levels and draws", "clips", "scenes", "dark frames", "filtered", "raw clips", "targets")
 RAW = "raw clips"
@@ -66,15 +64,3 @@ def test_commands_accept_datasets_of_raw_frames(
     (words, expected), given = USES[use], {"DS": (str(made_kind(RAW)),), "SETTINGS": kind_settings(RAW)}
     done = run_main(*(word for name in words for word in given.get(name, (name,))))
     assert (done.code, expected in done.out) == (0, True), done
-
-
-@pytest.mark.slow
-def test_raw_frames_in_a_store_give_the_bytes_of_local_ones(
-    kind_settings: Callable[[str], tuple[str, ...]], made_kind: Kind, bucket: ObjectPath, run_main: RunMain
-) -> None:
-    (root,) = (Path(word.partition("=")[2]) for word in kind_settings(RAW) if word.startswith("source.root="))
-    servers.upload(root, bucket / "clips")
-    done = run_main(*kind_settings(RAW), f"source.root={bucket / 'clips'}", f"out={bucket / 'ds'}", "n_jobs=1")
-    assert done.code == 0, done.err
-    servers.assert_same(bucket / "ds", made_kind(RAW))
-    assert not ug.verify(str(bucket / "ds"))
