@@ -92,15 +92,10 @@ def test_recorded_split_is_verified_replayed_regenerated_and_repaired(
     assert tree_hash(tmp_path / "again") == tree_hash(made)
 
 
-def test_pairs_of_a_split_are_read(made: Path) -> None:
-    expected = Counter(row["split"] for row in text_rows(made))
-    assert len(expected) == 3
-    for name, count in expected.items():
+def test_pairs_of_a_split_are_read_and_an_unknown_one_names_those_there_are(made: Path, dataset: Path) -> None:
+    for name, count in Counter(row["split"] for row in text_rows(made)).items():
         pairs = pickle.loads(pickle.dumps(ug.RawPairs(made, split=name)))
         assert [pair.row["split"] for pair in pairs] == [name] * count
-
-
-def test_unknown_split_names_those_there_are(made: Path, dataset: Path) -> None:
     with pytest.raises(ConfigError, match=r"split='vel': no pair is in it; expected one of test, train, val$"):
         ug.RawPairs(made, split="vel")
     with pytest.raises(ConfigError, match=r"split='val': no pair is in it; there are no splits; generate with split="):
