@@ -132,10 +132,20 @@ class EffectRules:
         self.temporal = [effect for effect in free if effect not in FIXED]
         self.tolerance, self.black_level_dn = config.effects.tolerance, float(sensor.black_level_dn)
         self.assumed = {effect: interpretation.assumed_numbers(noise, effect) for effect in effects}
+        self._named: dict[frozenset[str], tuple[tuple[str, ...], tuple[str, ...]]] = {}
         self.dark_frames = interpretation.uses_dark_frames(noise)  # in place of `read`, whose variance they have
         unclipped = sensor.clip == interpretation.UNCLIPPED
         self.converter_dn = math.inf if unclipped else 2.0**sensor.bits - 1 - sensor.black_level_dn  # above black
         self.body_light_dn = min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn)  # most of the scene
+
+    def named(self, on: frozenset[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names of simulated effects, in the order of image formation, and of the assumed numbers that they use."""
+        if on not in self._named:
+            replaced = {"read": "dark_frame"} if self.dark_frames else {}
+            names = [replaced.get(effect, effect) for effect in PHYSICAL_EFFECTS if effect in on]
+            used = dict.fromkeys(key for effect in names for key in self.assumed.get(effect, ()))
+            self._named[on] = (*names,), (*used,)
+        return self._named[on]
 
     def frame(self, physics: Physics, facts: Facts, signals: SignalRange, at_dark: AtLevel | None = None) -> FrameModel:
         """Model of a frame of the sensor."""
@@ -186,16 +196,12 @@ class Selection(NamedTuple):
     @property
     def effects(self) -> tuple[str, ...]:
         """The simulated effects, in the order of image formation."""
-        on = [effect for effect in PHYSICAL_EFFECTS if effect in self.on]
-        return (
-            tuple("dark_frame" if effect == "read" else effect for effect in on) if self.rules.dark_frames else (*on,)
-        )
+        return self.rules.named(self.on)[0]
 
     @property
     def assumed(self) -> tuple[str, ...]:
         """The assumed numbers that the simulated effects use."""
-        used = (key for effect in self.effects for key in self.rules.assumed.get(effect, ()))
-        return tuple(dict.fromkeys(used))
+        return self.rules.named(self.on)[1]
 
     @property
     def skipped(self) -> tuple[str, ...]:

@@ -313,14 +313,21 @@ class TwoNumberLevel:
         return noise_in_dn(a, b, **meaning, profile_levels_dn=levels_dn, sensor_levels_dn=sensor_dn)
 
 
+class Sensor(NamedTuple):
+    """Numbers of a sensor unit in a scene, its fixed patterns, and predictions at the darkest signal by frame size."""
+
+    physics: Physics
+    patterns: BodySelection | None
+    at_dark: Recent[tuple[int, int, int], AtLevel]
+
+
 class PhysicalLevel:
     """One noise level of a physical profile; the config has the profile of this level."""
 
     def __init__(self, config: Config) -> None:
         self._noise, self._rules = PhysicalNoise(config), EffectRules(config)
         self.distributions = self._noise.distributions
-        self._sensors: Recent[tuple[Any, ...], tuple[Physics, BodySelection | None]] = Recent(1024)
-        self._at_dark: Recent[tuple[Any, ...], AtLevel] = Recent(1024)  # 10 kB each
+        self._sensors: Recent[tuple[Any, ...], Sensor] = Recent(1024)
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:
         """Draw the numbers of the sensor and select the effects of an image at this level."""
@@ -336,10 +343,11 @@ class PhysicalLevel:
                 physics = physics.replace(read_law="gaussian", read_shape=0.0, read_std_dn=read_std_dn)
             if lens:
                 physics = physics.replace(frame_size=(facts.height, facts.width))
-            known = self._sensors.keep(key, (physics, self._rules.select_patterns(physics, facts.frames > 1)))
-        physics, patterns = known
-        frame = *key, facts.width, facts.height, facts.frames
-        at_dark = self._at_dark.get(frame) or self._at_dark.keep(frame, AtLevel())
+            patterns = self._rules.select_patterns(physics, facts.frames > 1)
+            known = self._sensors.keep(key, Sensor(physics, patterns, Recent(16)))
+        physics, patterns, known_at_dark = known
+        frame = facts.width, facts.height, facts.frames
+        at_dark = known_at_dark.get(frame) or known_at_dark.keep(frame, AtLevel())
         selection = self._rules.select_effects(physics, facts, image.signals, patterns, at_dark)
         name, law, b_dn2 = self._noise.noise.name, self._noise.noise.law, physics.read_std_dn * physics.read_std_dn
         chosen = selection.effects, selection.skipped, selection.assumed
