@@ -23,13 +23,21 @@ from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.planning.effect_selection import EffectRules, Prediction, Selection, facts_of, omit_weakest
-from unprocess_gen.planning.frame_model import SignalRange, signal_range
-from unprocess_gen.planning.plan import plan_image, plan_levels
+from unprocess_gen.planning.effect_selection import (
+    MIN_OUTLIERS,
+    EffectRules,
+    Prediction,
+    Selection,
+    facts_of,
+    omit_weakest,
+    weakest_first,
+)
+from unprocess_gen.planning.frame_model import FrameModel, SignalRange, signal_range
+from unprocess_gen.planning.plan import Planner, plan_image, plan_levels
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.facts import Facts
-from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, Plan
+from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, Place, Plan
 from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.poisson import poisson
@@ -260,6 +268,29 @@ def all_predictions(config: Config, physics: Physics, facts: Facts, light: Signa
     frame = rules.frame(physics, facts, light)
     on = omit_weakest(rules.tolerance, frame, rules.on, [*rules.patterns, *rules.temporal])
     return Selection(rules, frame, on).predictions()
+
+
+@pytest.mark.parametrize("profile", ["sony_a7s2", "canon_70d"])
+@pytest.mark.parametrize("scene", ["daylight", "night"])
+def test_redrawn_plans_are_those_of_a_new_planner(settings: Settings, profile: str, scene: str) -> None:
+    """A planner keeps what plans of a sensor share, and predicts effects in bright light only if they may be next."""
+    config = settings(f"noise={profile}", f"scene={scene}", "effects.all=auto", "effects.tolerance=0.3")
+    kept = Planner(config)
+    for epoch in range(6):
+        facts = Facts(256, 128 + epoch // 3, 256, epoch % 2, 250)
+        own, shared = (
+            planner.plan(planner.image(0, 5, "", facts, None, epoch), Place()) for planner in (Planner(config), kept)
+        )
+        assert shared[0] == own[0]
+        selection = own[1]
+        assert selection is not None
+        frame, on = selection.frame, selection.rules.on
+
+        def strength(effect: str, frame: FrameModel = frame, on: frozenset[str] = on) -> tuple[bool, float, str]:
+            ratios = [frame.ratio((effect,), level_dn, on - {effect}) for level_dn in frame.levels(on - {effect})]
+            return frame.outliers(effect, on) >= MIN_OUTLIERS, max(ratios), effect
+
+        assert list(weakest_first(frame, on, EFFECTS)) == sorted(EFFECTS, key=strength)
 
 
 def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[str, ...]:

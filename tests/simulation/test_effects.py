@@ -27,10 +27,12 @@ from helpers.flats import (
 )
 from helpers.moments import REACH, bernstein
 
+from unprocess_gen.simulation import plan_slots
 from unprocess_gen.simulation.effects import EFFECTS, PHYSICAL_EFFECTS
 from unprocess_gen.simulation.effects.dsnu import Dsnu
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.effects.prnu import Prnu
+from unprocess_gen.simulation.kernels import readout
 from unprocess_gen.simulation.lookup_tables import exponential_levels
 from unprocess_gen.simulation.pair import crop_maker, make_pair
 from unprocess_gen.simulation.plan import DarkFramePlan
@@ -79,6 +81,31 @@ def test_crops_in_each_epoch_are_those_of_the_pair(effects: tuple[str, ...], cha
         np.testing.assert_array_equal(clean, pair.clean[6:14, 10:74])
         np.testing.assert_array_equal(noisy, pair.noisy[6:14, 10:74])
     assert slots_of(plan).depends_on_epoch == (slots_of(plan) != slots_of(plan.replace(epoch=1)))
+
+
+OTHER_SENSORS = [
+    GOLDEN_PLAN.sensor.replace(**{name: value})
+    for name, value in (
+        ("pattern", "BGGR"), ("bits", 12), ("black_level_dn", 65), ("white_level_dn", 1000), ("sensor_clip", "black"),
+        ("saturated_as", "white"),
+    )
+]  # fmt: skip
+CHANGES: list[dict[str, Any]] = [
+    {}, {"seed": 1}, {"stream_key": 5}, {"frame": 3}, {"level": 2}, {"draw": 1}, {"epoch": 4}, {"a_dn": 7.0},
+    {"dtype": "float32"}, {"clean_dtype": "float32"}, {"layout": "packed"}, {"exposure_ratio": 3.0},
+    {"inverse_rgb_gain": 0.5}, *({"sensor": sensor} for sensor in OTHER_SENSORS),
+    *({"physics": EVERY.replace(**numbers), "effects": PHYSICAL_EFFECTS}
+      for numbers in ({}, {"full_well_e": 200.0}, {"body_key": 3}, {"fixed_pattern_in_clean": True})),
+]  # fmt: skip
+
+
+def test_plans_share_slots_and_read_outs_only_if_theirs_are_equal() -> None:
+    plans = [GOLDEN_PLAN.replace(**before).replace(**after) for before in CHANGES for after in CHANGES]
+    for plan in plans:
+        assert slots_of(plan) == plan_slots._slots_of(plan)
+        given = (plan,), (4, 6), (0, 1), plan.accuracy == "fast"
+        for shared, own in zip(readout.readout_of(*given), readout._readout_of(*given), strict=True):
+            np.testing.assert_array_equal(shared, own)
 
 
 # Shot noise -----------------------------------------------------------------------------------------------------------

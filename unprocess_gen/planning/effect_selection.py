@@ -14,8 +14,9 @@ body has its pattern in all images or in none.
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -236,20 +237,35 @@ def omit_weakest(
     that exceeds the tolerance, or drops `MIN_OUTLIERS` outliers, ends the search; so a larger tolerance never simulates
     more.
     """
-
-    def strength(effect: str) -> tuple[bool, float, str]:
-        return frame.outliers(effect, on) >= MIN_OUTLIERS, frame.ratio((effect,), on - {effect}), effect
-
     omitted = list(before)
-    for effect in sorted(free, key=strength):
+    for effect in weakest_first(frame, on, free):
         omitted.append(effect)
         rest = on - {effect}
         if any(frame.outliers(rare, rest) >= MIN_OUTLIERS for rare in omitted if rare in RARE):
             break
-        if frame.ratio(tuple(omitted), rest) > tolerance:
+        if any(frame.ratio(tuple(omitted), level_dn, rest) > tolerance for level_dn in frame.levels(rest)):
             break
         on = rest
     return on
+
+
+def weakest_first(frame: FrameModel, on: frozenset[str], effects: Sequence[str]) -> Iterator[str]:
+    """Yield effects from weakest to strongest: by outliers, then by the larger ratio at the two signals, then by name.
+
+    The ratio at the bright signal, which differs between images, is predicted only for an effect that can be the next.
+    """
+
+    def ratio(effect: str, is_bright: bool) -> float:
+        return frame.ratio((effect,), frame.levels(on - {effect})[is_bright], on - {effect})
+
+    found = [(frame.outliers(effect, on) >= MIN_OUTLIERS, ratio(effect, False), effect, False) for effect in effects]
+    heapq.heapify(found)
+    while found:
+        has_outliers, least, effect, is_known = heapq.heappop(found)
+        if is_known:
+            yield effect
+        else:
+            heapq.heappush(found, (has_outliers, max(least, ratio(effect, True)), effect, True))
 
 
 def _prediction(

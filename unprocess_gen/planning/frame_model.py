@@ -172,10 +172,9 @@ class FrameModel(FrameFacts):
                 other += effect_dn2
         return MEAN_ABS_NORMAL / 2 * (math.sqrt(other + variance) - math.sqrt(other))
 
-    def ratio(self, effects: Sequence[str], on: frozenset[str]) -> float:
-        """Largest ratio of several effects together, over all statistics and both signals."""
-        dark_dn, bright_dn = self.levels(on)
-        return math.sqrt(max(*self.squares(effects, dark_dn, on), *self.squares(effects, bright_dn, on)))
+    def ratio(self, effects: Sequence[str], level_dn: float, on: frozenset[str]) -> float:
+        """Largest ratio of several effects together at a signal, over all statistics."""
+        return math.sqrt(max(self.squares(effects, level_dn, on)))
 
     def outliers(self, effect: str, on: frozenset[str]) -> float:
         """Expected number of pixels per frame that an effect moves by more than one standard deviation."""
