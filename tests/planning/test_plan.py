@@ -154,30 +154,25 @@ def test_choice_is_the_quarter_that_contains_the_uniform(settings: Settings, uni
     assert weights.index(1.0) == camera
 
 
-@pytest.mark.parametrize("name", colour.CAMERAS)
-def test_fixed_camera_has_weight_1(settings: Settings, name: str) -> None:
-    plan = plan_of(settings, f"camera={name}")
-    assert plan.camera.camera == name
-    assert plan.camera.weights == tuple(float(name == other) for other in colour.CAMERAS)
-    assert plan.camera.rgb2cam == colour.rgb2cam(colour.CAMERAS[name])
+SONY = colour.rgb2cam(colour.CAMERAS["sony_a7r"])
+MIXED = colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), (0.25, 0.5, 0, 0.25)))
 
 
-def test_chosen_weights_are_divided_by_their_sum(settings: Settings) -> None:
-    plan = plan_of(settings, "camera.weights=[1,2,0,1]")
-    assert plan.camera.weights == (0.25, 0.5, 0, 0.25)
-    assert plan.camera.rgb2cam == colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), plan.camera.weights))
-
-
-def test_identity_has_no_weights_and_changes_nothing(settings: Settings) -> None:
-    plan = plan_of(settings, "camera=identity")
-    assert (plan.camera.camera, plan.camera.weights, plan.camera.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)
-
-
-def test_custom_matrix_has_no_weights(settings: Settings) -> None:
-    own = list(colour.CAMERAS["sony_a7r"])
-    plan = plan_of(settings, "camera=custom", f"camera.xyz2cam={own}")
-    assert (plan.camera.camera, plan.camera.weights) == ("custom", (0.0,) * 4)
-    assert plan.camera.rgb2cam == colour.rgb2cam(colour.CAMERAS["sony_a7r"])
+@pytest.mark.parametrize(
+    ("overrides", "name", "weights", "rgb2cam"),
+    [
+        *(([f"camera={name}"], name, [name == other for other in colour.CAMERAS], colour.rgb2cam(matrix))
+          for name, matrix in colour.CAMERAS.items()),
+        (["camera.weights=[1,2,0,1]"], "convex", [0.25, 0.5, 0, 0.25], MIXED),
+        (["camera=identity"], "identity", [0] * 4, colour.IDENTITY),
+        (["camera=custom", f"camera.xyz2cam={[*colour.CAMERAS['sony_a7r']]}"], "custom", [0] * 4, SONY),
+    ],
+)  # fmt: skip
+def test_camera_has_the_weights_and_the_matrix_of_its_option(
+    settings: Settings, overrides: list[str], name: str, weights: list[float], rgb2cam: colour.Matrix
+) -> None:
+    camera = plan_of(settings, *overrides).camera
+    assert (camera.camera, [*camera.weights], camera.rgb2cam) == (name, weights, rgb2cam)
 
 
 # Draws and names ------------------------------------------------------------------------------------------------------
