@@ -48,11 +48,12 @@ def electron_noise(
     dark_pixels: DarkPixels | None,
     shape: tuple[int, int],
     origin: tuple[int, int],
+    reach: int = 0,
 ) -> Electrons:
-    """Return the noise of frames of one sensor unit."""
+    """Return the noise of frames of one sensor unit; columns are drawn up to ``reach`` at least."""
     columns, left = padded_width(origin[1], shape[1]), origin[1] // BLOCK * BLOCK
     has_columns = any(slots.columns or slots.fixed_columns for slots in frames)
-    end = -(-(left + columns) // _COLUMNS) * _COLUMNS if has_columns else columns
+    end = -(-max(left + columns, reach) // _COLUMNS) * _COLUMNS if has_columns else columns
     noise = _electron_noise(frames, end, origin[0] % 2)
     members: dict[str, Any] = {"patterns": patterns, "padded_width": columns}
     if has_columns:

@@ -120,7 +120,8 @@ class Renderer:
             inverse = with_response(inverse, factor)
         if first.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
             patterns = patterns._replace(response=EQUAL_RESPONSE)
-        return inverse, electron_noise(self._plans, frames, patterns, dark_pixels, self._shape, origin)
+        reach = frame[1] if frame and frames is self._slots else 0  # of live crops: the columns of all are drawn once
+        return inverse, electron_noise(self._plans, frames, patterns, dark_pixels, self._shape, origin, reach)
 
     def fill(
         self, srgb: Srgb, inverse: Unprocessing, noise: Noise, keys: NDArray[np.uint64], origin: tuple[int, int]
