@@ -70,7 +70,7 @@ ONLY_IN = {
     },
     "PIL": {"reports.pictures", "sources.image.decode", "sources.image.headers"},
     "tarfile": {"dataset.shards"},
-    "tifffile": {"dataset.dng", "sources.raw.decode"},
+    "tifffile": {"dataset.dng", "sources.raw.tags"},
     "rawpy": {"sources.raw.decode"},
     "scipy": {"calibration.calibrate", "calibration.frame_sums", "calibration.shape"},
     "torch": {"torch"},

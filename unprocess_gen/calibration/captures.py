@@ -72,7 +72,7 @@ class Capture:
 
     def pixels(self) -> NDArray[np.uint16]:
         """Decode the mosaic, uint16 [H, W] with even sides; ConfigError or MachineError."""
-        mosaic = read_mosaic(self.path, "calibrate", numbers=True).pixels
+        mosaic = read_mosaic(self.path, "calibrate", numbers=True, white_dn=self.white_level_dn).pixels
         if mosaic.dtype not in (np.uint16, np.uint8) or min(mosaic.shape) < LEAST_SIDE:
             actual = f"is {mosaic.dtype} {list(mosaic.shape)}"
             raise ConfigError(
@@ -229,7 +229,8 @@ def _metadata(file: Path) -> dict[str, Any]:
     stated = {name: getattr(facts, name) for name in ("iso", "exposure_s", "pattern", "bits")}
     black = None if facts.black_dn is None else sum(facts.black_dn) / len(facts.black_dn)
     stated |= {"black_level_dn": black, "white_level_dn": facts.white_dn}
-    return {name: value for name, value in stated.items() if value is not None}
+    assumed = ("bits", "white_level_dn") if any("no WhiteLevel" in note for note in facts.notes) else ()
+    return {name: value for name, value in stated.items() if value is not None and name not in assumed}
 
 
 def _from_emva(folder: Path) -> Iterator[Capture]:

@@ -30,7 +30,8 @@ from unprocess_gen.calibration.profile import (
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
-from unprocess_gen.sources.raw.decode import RawMetadata, read_metadata
+from unprocess_gen.sources.raw.decode import read_metadata
+from unprocess_gen.sources.raw.tags import RawMetadata
 
 FORM = "calibrate --from noise_profile"
 DIGITS = 12
@@ -74,7 +75,7 @@ def read_stated_noise(folder: Path) -> StatedNoise:
     if not stated:
         problem = f"none of {len(files)} raw files has a NoiseProfile tag"
         raise ConfigError(f"calibrate: {folder}: {problem}; expected DNG files, such as those of Adobe's DNG Converter")
-    notes = []
+    notes = [f"{path}: {note}" for path, tags in stated.items() for note in tags.notes]
     if without := [path for path in files if path not in stated]:
         notes.append(f"{without[0]}: has no NoiseProfile tag; left out ({len(without)} of {len(files)} raw files)")
     model, blacks, white = (common(stated, name) for name in ("model", "black_dn", "white_dn"))

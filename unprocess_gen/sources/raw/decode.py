@@ -1,15 +1,16 @@
 """Decode raw files of cameras: the mosaic, and what the file states about it.
 
-LibRaw (rawpy) decodes the pixels. Facts come from the tags of files with the structure of TIFF (DNG, ARW, CR2, NEF,
-PEF), which take precedence because LibRaw rounds black levels, and from LibRaw. A fact that neither gives is None.
+LibRaw (rawpy) decodes the pixels. Facts come from the tags of files with the structure of TIFF, which take precedence
+because LibRaw rounds black levels, and from LibRaw. A fact that neither gives is None. All raw files of sources, dark
+frames, captures and cameras are read here, so that all are checked for damage.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,52 +21,23 @@ from numpy.typing import NDArray
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.libraries import require
-from unprocess_gen.simulation.reference.colour import IDENTITY, Matrix, matrix
-from unprocess_gen.sources.raw.colour import LIGHT_K, DngColour
+from unprocess_gen.simulation.reference.colour import matrix
+from unprocess_gen.sources.image.codec_messages import captured
+from unprocess_gen.sources.image.headers import probe
+from unprocess_gen.sources.raw.levels import with_one_black
+from unprocess_gen.sources.raw.tags import TO_ARRAY, RawMetadata, tags_of
 
-CFA, LINEAR = 32803, 34892
-"""Values of PhotometricInterpretation: mosaics (TIFF/EP), and demosaicked pixels (DNG)."""
-FLOATING_POINT = 3
-"""Value of SampleFormat."""
-RATIONALS = (5, 10)
-"""Types of fractions (TIFF 6.0, section 2)."""
-LOSSY_JPEG, JPEG_XL = 34892, 52546
-"""Values of Compression: a DNG without its finest noise, and one that is refused."""
-
-
-@dataclass(frozen=True, slots=True)
-class RawMetadata:
-    """Facts of a raw file; None for those that it does not state.
-
-    ``pattern`` and ``black_dn`` (row by row) are of the top-left 2x2 sites of the visible part, ``area`` (ActiveArea of
-    DNG) is its first row and column and the ends of its rows and columns. ``noise_profile`` (NoiseProfile of DNG) is S
-    and O of each plane: variance S·x + O with x = 0 at black and 1 at white. ``colour`` are colour tags of a DNG,
-    ``xyz2cam`` the matrix in LibRaw's table, ``gains`` those of red and blue as LibRaw reads them, ``compression`` the
-    value of the TIFF tag.
-    """
-
-    pattern: str | None = None
-    black_dn: tuple[float, ...] | None = None
-    white_dn: float | None = None
-    iso: float | None = None
-    exposure_s: float | None = None
-    model: str | None = None
-    noise_profile: tuple[float, ...] | None = None
-    colour: DngColour | None = None
-    xyz2cam: Matrix | None = None
-    gains: tuple[float, float] | None = None
-    compression: int | None = None
-    area: tuple[int, int, int, int] | None = None
-
-    def completed(self, other: RawMetadata) -> RawMetadata:
-        """Add the facts of another reader that these lack."""
-        stated = {field.name: value for field in fields(self) if (value := getattr(self, field.name)) is not None}
-        return replace(other, **stated)
-
-    @property
-    def bits(self) -> int | None:
-        """Bits that hold the white level."""
-        return None if self.white_dn is None else int(self.white_dn).bit_length()
+ABOVE_WHITE, MOST_ABOVE = 0.01, 0.001
+"""Distance above white, relative to the range, at which sites are damaged if a larger part of them is there."""
+FAR_BELOW_WHITE = 0.25
+"""Part of the range below which the brightest site raises doubts about the white level."""
+OTHERS = {
+    b"\xff\xd8\xff": "JPEG",
+    b"ftyp": "HEIF",
+    b"JXL ": "JPEG XL",
+    b"version ": "Git LFS pointer",
+}
+"""Files with a wrong suffix, by words in their first bytes; other pictures have headers that are read."""
 
 
 class RawFrame(NamedTuple):
@@ -82,29 +54,50 @@ def decoder_versions() -> dict[str, str]:
     return {"rawpy": version("rawpy"), "libraw": ".".join(map(str, rawpy.libraw_version))}
 
 
-def decode_raw(content: bytes, max_pixels: int = 2**40) -> RawFrame:
-    """Decode the bytes of a raw file.
+def decode_raw(content: bytes, suffix: str, max_pixels: int = 2**40, white_dn: float | None = None) -> RawFrame:
+    """Decode the bytes of a raw file, whose sites may reach ``white_dn`` if that is above its white level.
 
     Raises SourceError if they are damaged or no mosaic, and ConfigError if a library is missing.
     """
     for library in ("tifffile", "rawpy"):
         require(library, f"raw files need {library}", "raw", ", or convert the frames to NPY")
     facts = tags_of(content)
-    if facts.compression == JPEG_XL:
-        raise SourceError("unsupported", "is compressed with JPEG XL; convert it to a DNG with lossless JPEG")
-    with opened_by_libraw(content) as raw:
+    with opened_by_libraw(content, suffix) as raw:
         if raw.sizes.width * raw.sizes.height > max_pixels:
             size = f"{raw.sizes.width} x {raw.sizes.height}"
             raise SourceError("too_large", f"has {size} pixels; expected source.max_pixels={max_pixels}")
+        if facts.size != raw.raw_image.shape and (facts.size or suffix.lower() == ".dng"):
+            problem = "has another mosaic than LibRaw decodes" if facts.size else "is a TIFF without DNGVersion"
+            raise SourceError("unsupported", f"{problem}; {TO_ARRAY}")
         pixels = raw.raw_image_visible
-        if facts.area is not None and facts.pattern is not None:
+        if facts.area is not None:
             # LibRaw moves odd margins to even ones, and then confuses the black levels of the sites
-            (top, left, bottom, right), (height, width) = facts.area, raw.raw_image.shape
-            if not (0 <= top < bottom <= height and 0 <= left < right <= width):
-                problem = f"its ActiveArea {facts.area} is not inside of its {width} x {height} sites"
-                raise SourceError("corrupt", problem)
+            top, left, bottom, right = facts.area
             pixels = raw.raw_image[top:bottom, left:right]
-        return RawFrame(pixels.copy(), facts.completed(_decoder_facts(raw)))
+        all_facts = facts.completed(_decoder_facts(raw))
+        notes = *facts.notes, *_white_notes(pixels, all_facts, facts.white_dn, white_dn)
+        if facts.black_by_site is not None:
+            pixels = with_one_black(pixels, facts.black_by_site, all_facts.white_dn or 0.0)
+        return RawFrame(pixels.copy(), replace(all_facts, notes=notes))
+
+
+def _white_notes(
+    pixels: NDArray[np.uint16], facts: RawMetadata, tag_dn: float | None, given_dn: float | None
+) -> Iterator[str]:
+    """Yield doubts about a white level; SourceError if the file is damaged by it. LibRaw's levels are not exact."""
+    white = max(given_dn or 0.0, facts.white_dn or 0.0)
+    black, brightest = min(facts.black_dn or (0.0,)), int(pixels.max())
+    share = np.count_nonzero(pixels > white + ABOVE_WHITE * (white - black)) / pixels.size
+    is_known = tag_dn is not None or white == given_dn
+    if is_known and (share > MOST_ABOVE or brightest >> int(white).bit_length()):
+        problem = f"has sites of up to {brightest} DN, {share:.2%} of them far above the white level {white:g}"
+        raise SourceError("corrupt", f"{problem}; restore it, or state the white level of an intact file")
+    if black > 0 and not pixels.any(axis=1).all():
+        raise SourceError("corrupt", "has rows of zeros only, far below its black level; restore it")
+    if share > MOST_ABOVE:
+        yield f"has {share:.2%} of its sites above the white level of LibRaw, {white:g} DN"
+    if given_dn is None and brightest - black < FAR_BELOW_WHITE * (white - black):
+        yield f"has sites of at most {brightest} DN, far below the white level {white:g}"
 
 
 def read_metadata(path: Path, key: str, with_libraw: bool = True) -> RawMetadata:
@@ -116,115 +109,29 @@ def read_metadata(path: Path, key: str, with_libraw: bool = True) -> RawMetadata
         require(library, f"{key}: {path} is a raw file, which needs {library}", "raw", ", or convert the frames to NPY")
     with machine_errors(path):
         content = path.read_bytes()
-    tags = tags_of(content, check=False)
-    if not with_libraw:
-        return tags
     try:
-        with opened_by_libraw(content) as raw:
+        tags = tags_of(content, check=False)
+        if not with_libraw:
+            return tags
+        with opened_by_libraw(content, path.suffix) as raw:
             return tags.completed(_decoder_facts(raw))
     except SourceError as error:
         raise ConfigError(f"{key}: {path} {error.text}") from error
 
 
-def tags_of(content: bytes, check: bool = True) -> RawMetadata:
-    """Read the facts that tags state, whatever the compression; none if the file is no TIFF.
-
-    With ``check``, SourceError unless a TIFF is complete and its raw image is a mosaic of integers.
-    """
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(io.BytesIO(content)) as file:
-            pages = [page for first in file.pages for page in (first, *(getattr(first, "pages", ()) or ()))]
-            raw = next((page for page in pages if page.tags.valueof(262) in (CFA, LINEAR)), pages[0])
-            if check:
-                _check_mosaic(raw, len(content))
-            exif = pages[0].tags.valueof(34665)
-            tags = {tag.code: _tag_values(tag) for page in (pages[0], raw) for tag in page.tags}
-            text = pages[0].tags.valueof(50708) or pages[0].tags.valueof(272) or ""
-            return _tag_facts(tags, exif if isinstance(exif, Mapping) else {}, str(text).strip("\0 "))
-    except (tifffile.TiffFileError, ValueError, KeyError, IndexError, TypeError, ZeroDivisionError):
-        return RawMetadata()
-
-
-def _check_mosaic(page: Any, size: int) -> None:
-    """Raise SourceError unless a page is a complete mosaic of integers."""
-    end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=False)), default=0)
-    if end > size:
-        raise SourceError("truncated", f"its pixels end at byte {end}, the file at byte {size}")
-    photometric = page.tags.valueof(262)
-    refusals = {
-        "is a linear DNG, whose pixels are demosaicked": photometric == LINEAR,
-        "has floating-point pixels": photometric == CFA and page.tags.valueof(339) == FLOATING_POINT,
-        "is monochrome": photometric == 1 and 50706 in page.parent.pages[0].tags,
-    }
-    for what, is_refused in refusals.items():
-        if is_refused:
-            raise SourceError("unsupported", f"{what}; expected a mosaic of integers")
-
-
-def _tag_facts(tags: Mapping[int, tuple[float, ...]], exif: Mapping[str, Any], model: str) -> RawMetadata:
-    """Collect facts from the tags of TIFF and DNG by code, and from the tags of EXIF by name."""
-    black, white = tags.get(50714, ()), tags.get(50717)
-    names = ("ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed", "RecommendedExposureIndex")
-    stated = [exif[name] for name in names if name in exif] + [*tags.get(34855, ()), *tags.get(34867, ())]
-    isos = [max(iso) if isinstance(iso, tuple) else iso for iso in stated]
-    seconds = exif.get("ExposureTime", tags.get(33434))
-    if isinstance(seconds, tuple):
-        seconds = seconds[0] / seconds[1] if len(seconds) == 2 else seconds[0]
-    is_tile = len(black) == 4 and tags.get(50713, (2, 2)) == (2, 2)
-    filters, area = tags.get(33422, ()) if 50706 in tags else (), tags.get(50829, ())
-    has_bayer = len(filters) == 4 and tags.get(33421, (2, 2)) == (2, 2) and set(filters) <= {0.0, 1.0, 2.0}
-    return RawMetadata(
-        # CFAPattern and BlackLevel begin at the corner of ActiveArea
-        pattern="".join("RGB"[int(code)] for code in filters) if has_bayer else None,
-        area=(int(area[0]), int(area[1]), int(area[2]), int(area[3])) if len(area) == 4 else None,
-        black_dn=(black * 4)[:4] if black and len(set(black)) == 1 else black if is_tile else None,
-        white_dn=max(white) if 50706 in tags and white else None,
-        # the largest of 16 bits means that another tag has the ISO
-        iso=next((float(iso) for iso in isos if 0 < iso != 65535), None),
-        exposure_s=float(seconds) if seconds else None,
-        model=model or None,
-        noise_profile=tags.get(51041),
-        colour=_dng_colour(tags) if 50721 in tags else None,
-        compression=int(tags[259][0]) if tags.get(259) else None,
-    )
-
-
-def _dng_colour(tags: Mapping[int, tuple[float, ...]]) -> DngColour:
-    """Collect the colour tags of a DNG; ValueError if one has another number of values."""
-    codes = [code for code in (50721, 50722) if code in tags]
-    lights = (tags.get(code, (0.0,))[0] for code in (50778, 50779))
-    red, green, blue = tags.get(50727, (1.0, 1.0, 1.0))
-    neutral, white = tags.get(50728), tags.get(50729)
-    return DngColour(
-        tuple(matrix(tags[code]) for code in codes),
-        tuple(LIGHT_K.get(int(light), 0.0) for light in lights)[: len(codes)],
-        (matrix(tags.get(50723, IDENTITY)), matrix(tags.get(50724, IDENTITY))),
-        (red, green, blue),
-        None if neutral is None else (neutral[0], neutral[1], neutral[2]),
-        None if white is None else (white[0], white[1]),
-        52531 in tags,
-    )
-
-
-def _tag_values(tag: Any) -> tuple[float, ...]:
-    """Values of a tag as numbers, rationals divided; none for text."""
-    values = tuple(tag.value) if isinstance(tag.value, tuple | bytes) else (tag.value,)
-    if not all(isinstance(value, int | float) for value in values):
-        return ()
-    if tag.dtype in RATIONALS:
-        return tuple(top / bottom if bottom else 0.0 for top, bottom in zip(values[::2], values[1::2], strict=True))
-    return tuple(map(float, values))
-
-
 @contextmanager
-def opened_by_libraw(content: bytes) -> Iterator[Any]:
+def opened_by_libraw(content: bytes, suffix: str) -> Iterator[Any]:
     """Open the bytes of a raw file with LibRaw; SourceError unless they are one, and contain a Bayer mosaic."""
     import rawpy
 
     try:
-        with rawpy.imread(io.BytesIO(content)) as raw:
+        with captured() as messages:
+            opened = rawpy.imread(io.BytesIO(content))
+            opened.unpack()
+        with opened as raw:
+            if messages:
+                text = messages.decode(errors="replace").removeprefix("unknown file: ").splitlines()[0]
+                raise SourceError("corrupt", f"is damaged (LibRaw reports: {text})")
             if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
                 raise SourceError("unsupported", "contains no mosaic (LibRaw); expected red, green and blue sites")
             if raw.raw_pattern.shape != (2, 2) or raw.num_colors != 3:
@@ -232,8 +139,26 @@ def opened_by_libraw(content: bytes) -> Iterator[Any]:
                 raise SourceError("unsupported", f"has {kind}; expected a Bayer mosaic")
             yield raw
     except rawpy.LibRawError as error:
-        message = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
-        raise SourceError("corrupt", f"cannot be decoded by LibRaw ({message})") from error
+        raise _refusal(content, suffix, error) from error
+
+
+def _refusal(content: bytes, suffix: str, error: Exception) -> SourceError:
+    """The reason why LibRaw does not open a file."""
+    import rawpy
+
+    text = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
+    problem, is_cr3 = f"cannot be decoded by LibRaw ({text})", content[4:11] == b"ftypcrx"
+    kind = next((kind for word, kind in OTHERS.items() if word in content[:8] and not is_cr3), "")
+    if isinstance(error, rawpy.LibRawFileUnsupportedError):
+        if tags_of(content, check=False).size:
+            return SourceError("unsupported", f"{problem}; {TO_ARRAY}")
+        with suppress(SourceError):
+            kind = kind or probe(content).format.upper()
+        if not kind and suffix.lower() == ".raw" and not content.startswith((b"II", b"MM")):
+            return SourceError("unsupported", f"has no header that states its size and levels; {TO_ARRAY}")
+    if kind:
+        return SourceError("unsupported", f"contains no raw data: {kind}; expected a raw file")
+    return SourceError("corrupt", problem)
 
 
 def _decoder_facts(raw: Any) -> RawMetadata:

@@ -23,8 +23,9 @@ from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Levels, SensorPla
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, plane_sites
 from unprocess_gen.sources.image.decode import Photograph
-from unprocess_gen.sources.raw.decode import LOSSY_JPEG, RawFrame, RawMetadata, decode_raw
+from unprocess_gen.sources.raw.decode import RawFrame, decode_raw
 from unprocess_gen.sources.raw.mosaics import mosaic_pixels
+from unprocess_gen.sources.raw.tags import RawMetadata
 
 LONGEST_CAMERA_NAME = 64
 """Characters of the name of a camera in a row."""
@@ -38,7 +39,10 @@ def read_raw_source(config: SourceConfig, content: bytes, name: str) -> Photogra
     suffix = PurePosixPath(name).suffix.lower()
     if not content:
         raise SourceError("empty", f"{name} has 0 bytes")
-    frame = decode_raw(content, config.max_pixels) if suffix in RAW_FILES else _mosaic(config, content, suffix)
+    if suffix in RAW_FILES:
+        frame = decode_raw(content, suffix, config.max_pixels, config.raw.white_dn)
+    else:
+        frame = _mosaic(config, content, suffix)
     try:
         return _photograph(config, frame)
     except SourceError as error:
@@ -53,8 +57,11 @@ def _photograph(config: SourceConfig, frame: RawFrame) -> Photograph:
         codes, noise = np.repeat(frame.pixels[..., None], 3, axis=2), _own_noise(facts, config.raw, white[1] - black[1])
     else:
         codes, noise = _cell_means(frame.pixels, source), None
-    note = "is compressed with lossy JPEG, which removes noise and detail" if facts.compression == LOSSY_JPEG else ""
-    return Photograph(codes, 1, RawParts(source, _camera(facts), IspPlan("none", "srgb"), sensor, noise), note)
+    if config.own_noise == "subtract" and noise is None:
+        problem = "states no noise that source.own_noise=subtract could use (NoiseProfile)"
+        raise SourceError("unsupported", f"{problem}; give source.raw.a_dn and source.raw.b_dn2, or keep its noise")
+    parts = RawParts(source, _camera(facts), IspPlan("none", "srgb"), sensor, noise)
+    return Photograph(codes, 1, parts, "; ".join(facts.notes))
 
 
 def _mosaic(config: SourceConfig, content: bytes, suffix: str) -> RawFrame:
@@ -112,10 +119,10 @@ def _own_noise(facts: RawMetadata, raw: RawConfig, span_dn: float) -> tuple[floa
     if raw.a_dn is not None and raw.b_dn2 is not None:
         return raw.a_dn / span_dn, raw.b_dn2 / (span_dn * span_dn)
     shares = {2: (1.0,), 6: (0.25, 0.5, 0.25), 8: (0.25,) * 4}.get(len(stated))
-    if shares is None:
+    if shares is None or not any(stated) or not all(0 <= number < 1 for number in stated):
         return None
     scale, offset = (sum(map(operator.mul, shares, stated[first::2])) for first in (0, 1))
-    return (scale, offset) if scale >= 0 and offset >= 0 else None
+    return scale, offset
 
 
 def _camera(facts: RawMetadata) -> CameraPlan:

@@ -1,8 +1,9 @@
-"""Read mosaics that a camera recorded: NPY, 16-bit PNG and TIFF, and raw files (extra ``raw``)."""
+"""Read mosaics that a camera recorded: NPY, 16-bit PGM, PNG and TIFF, and raw files (extra ``raw``)."""
 
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,8 @@ def mosaic_pixels(content: bytes, suffix: str, max_pixels: int = 2**30) -> NDArr
         except (ValueError, EOFError, AttributeError) as error:
             text = str(error).splitlines()[0] if str(error) else "no array"
             raise SourceError("corrupt", f"cannot be decoded ({text})") from error
+    if suffix == ".pgm":
+        return _pgm_pixels(content)
     picture = decode(content, max_pixels=max_pixels, icc="ignore")
     gray = picture.srgb[..., 0]
     if picture.orientation != 1 or (picture.srgb != gray[..., None]).any():
@@ -44,8 +47,24 @@ def mosaic_pixels(content: bytes, suffix: str, max_pixels: int = 2**30) -> NDArr
     return np.ascontiguousarray(gray)
 
 
-def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
+def _pgm_pixels(content: bytes) -> NDArray[Any]:
+    """Decode a binary PGM, as ``dcraw -4 -D`` writes it."""
+    header = re.match(rb"P5(?:\s|#.*\n)+(\d+)(?:\s|#.*\n)+(\d+)(?:\s|#.*\n)+(\d+)\s", content)
+    if header is None:
+        raise SourceError("unsupported", "is no binary PGM (P5); expected 16 bits, as of dcraw -4 -D")
+    width, height, largest = map(int, header.groups())
+    dtype = np.dtype(">u2" if largest > 255 else "u1")
+    if len(content) - header.end() < width * height * dtype.itemsize:
+        raise SourceError("truncated", f"ends before its {width} x {height} pixels")
+    pixels = np.frombuffer(content, dtype, width * height, header.end()).reshape(height, width)
+    if pixels.max(initial=0) > largest:
+        raise SourceError("corrupt", f"has values above {largest}, the largest that its header declares")
+    return pixels.astype(dtype.newbyteorder("="))
+
+
+def read_mosaic(path: Path, key: str, numbers: bool = False, white_dn: float | None = None) -> Mosaic:
     """Read a mosaic of 16-bit integers, or with ``numbers`` of integers or floats; ``key`` begins messages.
+    ``white_dn`` is as for `decode_raw`.
 
     Raises ConfigError or MachineError.
     """
@@ -55,7 +74,7 @@ def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
     try:
         if suffix not in RAW_FILES:
             return Mosaic(checked_mosaic(mosaic_pixels(content, suffix), path, key, numbers))
-        frame = decode_raw(content)
+        frame = decode_raw(content, suffix, white_dn=white_dn)
     except SourceError as error:
         raise ConfigError(f"{key}: {path} {error.text}") from error
     blacks = set(frame.metadata.black_dn or ())

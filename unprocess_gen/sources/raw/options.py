@@ -12,8 +12,9 @@ from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.sources.raw.colour import temperature
-from unprocess_gen.sources.raw.decode import RawMetadata, decode_raw, tags_of
+from unprocess_gen.sources.raw.decode import decode_raw
 from unprocess_gen.sources.raw.frames import camera_colours, file_sensor
+from unprocess_gen.sources.raw.tags import RawMetadata, tags_of
 
 MARK = "Written by gen-dataset camera"
 """Text in the first line of each file, by which an earlier one is known."""
@@ -41,7 +42,7 @@ def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ..
     with machine_errors(file):
         content = file.read_bytes()
     try:
-        frame, tags = decode_raw(content), tags_of(content)
+        frame, tags = decode_raw(content, file.suffix), tags_of(content, check=False)
         matrix, gains = camera_colours(frame.metadata)
         sensor, black, _ = file_sensor(frame, RawConfig())
     except SourceError as error:
@@ -55,6 +56,7 @@ def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ..
         f"gains: {_gains_source(tags, gains)}",
         f"levels: black {levels} ({black_tag}), white {sensor.white_level_dn} ({white_tag}); mean of black",
         f"pattern: {sensor.pattern} at the corner of the visible part",
+        *(f"note: the file {note}" for note in frame.metadata.notes),
     )
     model = " ".join((frame.metadata.model or "a camera without a name").split())
     head = f"# {model}. {MARK}.\n# {file.name}, SHA-256 {file_sha256(file)}.\n# " + "\n# ".join(facts)
