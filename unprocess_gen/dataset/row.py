@@ -89,7 +89,9 @@ class Origin(PlanRecord, frozen=True, kw_only=True):
         "then as for failed)", Choice("ok", "failed", "filtered"), empty_if="")] = "ok"
     reason: Annotated[str, Field(
         "reason of the status", Text("[a-z0-9_]*", "a reason such as corrupt"), empty_if="the status is ok")] = ""
-    detail: Annotated[str, Field("explanation of the reason, one line", ANY_TEXT, empty_if="the status is ok")] = ""
+    detail: Annotated[str, Field(
+        "explanation of the reason, one line; with status ok, what the user should know about the source", ANY_TEXT,
+        empty_if="there is nothing to explain")] = ""
     patch: Patch | None = None
     orientation: Annotated[int | None, Field(
         "EXIF orientation that was applied to the source, 1 to 8", Integers(1, 8))] = None
@@ -158,8 +160,9 @@ def pair_row(
     digests: tuple[str, str],
     patch: Patch,
     source_noise_dn: float | None = None,
+    note: str = "",
 ) -> Row:
-    """Row of a pair.
+    """Row of a pair; ``note`` is about the source.
 
     ``sha256`` is that of the source's bytes, ``orientation`` the EXIF orientation that was applied, ``digests`` the
     XXH3-128 of the clean and of the noisy array. A manifest without frames has no pair and empty digests.
@@ -170,6 +173,7 @@ def pair_row(
         source=source.name,
         source_sha256=sha256,
         source_bytes=source.size_bytes,
+        detail=detail_text(note),
         patch=patch,
         orientation=orientation,
         shard=shard,

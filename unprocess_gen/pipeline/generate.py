@@ -66,6 +66,8 @@ class Summary:
         Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`tasks.COUNTS`).
     filtered : int
         Rows of images that ``source.min_side`` leaves out.
+    noted : int
+        Rows of pairs with a note about their source (column ``detail``).
     shards, bytes : int
         Number of shards and the sum of their sizes.
     seconds : float
@@ -89,6 +91,7 @@ class Summary:
     unmatched: dict[str, int] = field(default_factory=dict)
     times: StageTimes = field(default_factory=StageTimes)
     filtered: int = 0
+    noted: int = 0
 
     @classmethod
     def of(cls, out: AnyPath, facts: dict[str, Any], started: float, **made: Any) -> Summary:
@@ -102,6 +105,7 @@ class Summary:
             bytes=sum(entry["bytes"] for entry in facts["shards"]),
             seconds=time.monotonic() - started,
             filtered=facts.get("filtered", 0),
+            noted=facts.get("noted", 0),
             **made,
         )
 
@@ -126,6 +130,8 @@ class Summary:
             failures += f", more than source.max_failed={max_failed}"
         if self.filtered:
             failures += f", {self.filtered} filtered (source.min_side)"
+        if self.noted:
+            failures += f", {self.noted} noted (column detail)"
         if not self.made:
             return f"{self.out} is complete: {size}, {failures}; nothing to do"
         look = f"gen-dataset preview {self.out} --to {self.out.name}_sheets"

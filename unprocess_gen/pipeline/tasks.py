@@ -184,10 +184,11 @@ COUNTS = Counts.__struct_fields__
 
 
 def count_rows(rows: Iterable[Row]) -> Counter[str]:
-    """Count pairs and filtered images, failures by reason, and over all pairs sites and what `COUNTS` count."""
+    """Count pairs, notes and filtered images, failures by reason, and over all pairs sites and what `COUNTS` count."""
     counts = Counter[str]()
     for row in rows:
         counts[f"failed.{row['reason']}" if row["status"] == "failed" else str(row["status"])] += 1
+        counts["noted"] += row["status"] == "ok" and row["detail"] != ""
         if has_frames(row):
             counts["sites.all"] += int(row["width"] or 0) * int(row["height"] or 0)
             counts.update({f"sites.{name}": int(row[name] or 0) for name in COUNTS})
@@ -197,9 +198,9 @@ def count_rows(rows: Iterable[Row]) -> Counter[str]:
 def count_facts(counts: Counter[str]) -> dict[str, Any]:
     """Counts of `count_rows` as ``dataset.json`` has them."""
     failed = {name.removeprefix("failed."): counts[name] for name in sorted(counts) if name.startswith("failed.")}
-    filtered = {"filtered": counts["filtered"]} if counts["filtered"] else {}
+    others = {name: counts[name] for name in ("filtered", "noted") if counts[name]}
     sites = {name: counts[f"sites.{name}"] for name in ("all", *COUNTS)}
-    return {"pairs": counts["ok"], "failed": failed, **filtered, "sites": sites}
+    return {"pairs": counts["ok"], "failed": failed, **others, "sites": sites}
 
 
 ROWS = f"{WORK}/rows"

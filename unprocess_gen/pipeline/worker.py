@@ -122,13 +122,15 @@ def make_image(
             with timed("simulate_s"):
                 pair = next(pairs)
             if pair is None:
-                sample.append(pair_row(row_key, *identity, plan, None, ("", ""), patch, noise_dn))
+                sample.append(pair_row(row_key, *identity, plan, None, ("", ""), patch, noise_dn, photograph.note))
                 continue
             if not sample:
                 with timed("simulate_s"):
                     targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
                 clean_xxh3, stored_targets = array_xxh3(pair.clean), targets_cell(targets)
-            row = pair_row(row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn)
+            row = pair_row(
+                row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn, photograph.note
+            )
             row = {**row, "targets": stored_targets}
             writer.add_pair(row, {"clean": pair.clean, "noisy": pair.noisy, **targets}, is_first=not sample)
             sample.append(row)

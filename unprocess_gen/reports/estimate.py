@@ -39,7 +39,7 @@ class SourceEstimate:
     """The pairs of a source, or why it has none; ``levels`` has a plan with its predictions for each noise level.
 
     ``bytes`` is their size in a shard, ``seconds`` the time it took to make them, ``noise_ratio`` the noise of the
-    source over the simulated noise, if it is known.
+    source over the simulated noise, if it is known. ``note`` is about the source.
     """
 
     source: Source
@@ -50,6 +50,7 @@ class SourceEstimate:
     patches: int = 0
     pairs: int = 0
     noise_ratio: float | None = None
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +133,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         patches=len(image.patches),
         pairs=len(image.patches) * len(image.plans),
         noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, image.plans[0]),
+        note=photograph.note,
     )
 
 

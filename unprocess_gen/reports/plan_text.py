@@ -45,6 +45,7 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
             *_labelled("bytes", [size + (": NOT ENOUGH" if estimate.free_bytes < estimate.bytes else "")]),
             f"time      about {total} with {counted(estimate.n_jobs, 'worker')}: start-up {start}, pairs {pairs}",
             *_failure_lines(config, read),
+            *_labelled("note", (f"{source.source.name} {source.note}" for source in read if source.note)),
             *noise_lines(config, levels, run.settings.dark_frames, [s.noise_ratio for s in read], with_numbers),
         ]
     )
