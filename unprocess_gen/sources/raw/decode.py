@@ -67,7 +67,7 @@ def decode_raw(content: bytes, suffix: str, max_pixels: int = 2**40, white_dn: f
             size = f"{raw.sizes.width} x {raw.sizes.height}"
             raise SourceError("too_large", f"has {size} pixels; expected source.max_pixels={max_pixels}")
         if facts.size != raw.raw_image.shape and (facts.size or suffix.lower() == ".dng"):
-            problem = "has another mosaic than LibRaw decodes" if facts.size else "is a TIFF without DNGVersion"
+            problem = "has another mosaic than LibRaw decodes" if facts.size else "has no DNGVersion that can be read"
             raise SourceError("unsupported", f"{problem}; {TO_ARRAY}")
         pixels = raw.raw_image_visible
         if facts.area is not None:
