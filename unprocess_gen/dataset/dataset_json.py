@@ -72,7 +72,6 @@ class DatasetFacts(msgspec.Struct, frozen=True):
     config: str
     self_test: str
     filtered: Count = 0
-    noted: Count = 0
     not_matched: Count | None = None
     skipped_links: Count | None = None
     run: RunFacts | None = None
