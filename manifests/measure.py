@@ -13,7 +13,7 @@ import argparse
 import csv
 import math
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from unprocess_gen.cli.runs import make_build
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.manifest import read_columns, read_rows, write_rows
+from unprocess_gen.dataset.manifest import csv_lines, read_columns, read_rows
 from unprocess_gen.dataset.row import COLUMN_NAMES
 from unprocess_gen.reports.builds import MANIFEST, Build, build_names, read_build
 from unprocess_gen.simulation.reference.cfa import unpack
@@ -116,17 +116,20 @@ def make(build: Build, folder: Path, pin: bool) -> None:
         if code := run(["build", build.name, "--to", str(folder)]):
             raise SystemExit(code)
         return
-    with rows.open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, [], COLUMN_NAMES)  # no photograph is compared
+    _write_rows(rows, [], COLUMN_NAMES)  # no photograph is compared
     if code := make_build(build, folder):
         raise SystemExit(code)
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in UNRECORDED)
     digests.write_text("".join(f"{file_sha256(path)}  {path.relative_to(folder).as_posix()}\n" for path in files))
-    with rows.open("w", encoding="utf-8", newline="") as stream:
-        manifests = [path for path in files if path.name == MANIFEST]
-        used = set().union(*map(read_columns, manifests))
-        columns = [name for name in COLUMN_NAMES if name in used]
-        write_rows(stream, (row for path in manifests for row in read_rows(path)), columns)
+    manifests = [path for path in files if path.name == MANIFEST]
+    used = set().union(*map(read_columns, manifests))
+    columns = [name for name in COLUMN_NAMES if name in used]
+    _write_rows(rows, (row for path in manifests for row in read_rows(path)), columns)
+
+
+def _write_rows(file: Path, rows: Iterable[Row], columns: Sequence[str]) -> None:
+    """Write rows as CSV with their header."""
+    file.write_bytes(f"{','.join(columns)}\n".encode() + csv_lines(rows, columns))
 
 
 def scores_of(build: Build, folder: Path) -> list[dict[str, str]]:
