@@ -18,8 +18,8 @@ from unprocess_gen.sources.names import decode_name
 from unprocess_gen.sources.reading import read_bytes
 
 
-def listed(root: Path, *include: str, recursive: bool = True, limit: int | None = None) -> Listing:
-    return list_folder(str(root), include or ("*.jpg",), recursive, limit)
+def listed(root: Path, *include: str, recursive: bool = True, limit: int | None = None, exclude: str = "") -> Listing:
+    return list_folder(str(root), include or ("*.jpg",), recursive, limit, exclude.split())
 
 
 def paths(listing: Listing) -> list[str]:
@@ -46,6 +46,40 @@ def test_order_is_by_the_bytes_of_the_relative_path(tmp_path: Path) -> None:
     assert [(source.index, source.path) for source in listed(tmp_path).sources] == list(enumerate(in_order))
     assert paths(listed(tmp_path, limit=2)) == in_order[:2]
     assert paths(listed(tmp_path, "A/*.JPG")) == ["a/z.jpg"]  # with a slash: of the path
+
+
+HIDDEN = ("._a.jpg", "sub/._b.jpg", ".x.jpg", ".thumbnails/a.jpg", "sub/@eaDir/a.jpg/t.jpg", "__MACOSX/sub/._a.jpg")
+
+
+def test_hidden_files_and_folders_are_left_out_and_counted(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "sub/b.jpg", *HIDDEN)
+    found = listed(tmp_path)
+    assert (paths(found), found.unmatched) == (["a.jpg", "sub/b.jpg"], {})
+    counts = {"2 ._*", "1 .x.jpg", "1 .thumbnails", "1 @eaDir", "1 __MACOSX"}
+    (warning,) = found.warnings
+    assert set(warning.removeprefix("source.root: hidden files and folders are left out: ").split(", ")) == counts
+    assert paths(listed(tmp_path / ".thumbnails")) == ["a.jpg"]  # a root is named
+    assert paths(listed(tmp_path / "._a.jpg")) == ["._a.jpg"]
+    fill(tmp_path / "only", ".a.jpg")
+    with pytest.raises(
+        ConfigError, match=r"no file matches .* hidden files and folders are left out: 1 \.a\.jpg; choose"
+    ):
+        listed(tmp_path / "only")
+
+
+def test_excluded_files_are_no_sources_nor_unmatched(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "a_thumb.jpg", "small/b.jpg", "small/deep/c.jpg", "d.txt")
+    found = listed(tmp_path, exclude="*_THUMB.jpg small/* *.txt")
+    assert (paths(found), found.unmatched) == (["a.jpg"], {})
+    with pytest.raises(ConfigError, match=r"and not source\.exclude=\['\*\.jpg'\]"):
+        listed(tmp_path, exclude="*.jpg")
+
+
+def test_folder_with_the_name_of_a_photograph_is_no_source(tmp_path: Path) -> None:
+    fill(tmp_path, "x.jpg/a.jpg", "b.jpg")
+    (tmp_path / "b.jpg").unlink()
+    (tmp_path / "y.jpg").symlink_to("x.jpg")
+    assert paths(listed(tmp_path)) == ["x.jpg/a.jpg", "y.jpg/a.jpg"]
 
 
 def test_unmatched_files_are_counted_by_suffix_with_advice(tmp_path: Path) -> None:

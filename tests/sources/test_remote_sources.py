@@ -43,7 +43,15 @@ def without_etag(found: Listing) -> Listing:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"recursive": False}, {"limit": 3}, {"include": "[*.PNG]"}, {"include": "[sub/*]"}, {"clips": True}],
+    [
+        {},
+        {"recursive": False},
+        {"limit": 3},
+        {"include": "[*.PNG]"},
+        {"include": "[sub/*]"},
+        {"exclude": "[sub/*]"},
+        {"clips": True},
+    ],
     ids=str,
 )
 def test_bucket_is_listed_like_the_folder(options: dict[str, object], photos: Path, remote: ObjectPath) -> None:

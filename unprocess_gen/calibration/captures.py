@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,8 +23,9 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
-from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES
+from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES, list_raw_files
 from unprocess_gen.core.records import check_record
+from unprocess_gen.core.tables import delimiter_of
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 from unprocess_gen.sources.raw.decode import read_metadata
 from unprocess_gen.sources.raw.mosaics import even_sides, read_mosaic
@@ -31,6 +33,7 @@ from unprocess_gen.sources.raw.mosaics import even_sides, read_mosaic
 TABLE, EMVA = "captures.csv", "EMVA1288_Data.txt"
 REQUIRED = ("file", "kind", "iso")
 OPTIONAL = ("exposure_s", "level", "temperature_c", "black_level_dn", "white_level_dn", "bits", "pattern")
+NUMBERS = ("iso", "exposure_s", "temperature_c", "black_level_dn", "white_level_dn", "bits")
 SENSOR_FACTS = ("bits", "black_level_dn", "white_level_dn", "pattern")
 KIND_NAMES = {"dark": ("dark", "bias"), "flat": ("flat",)}
 """Kinds of frames, and the words by which names state them."""
@@ -139,19 +142,21 @@ def read_captures(folder: Path, default: Sensor | None = None) -> CaptureSet:
     """List the frames of a folder; ``default`` has the levels that no file states. ConfigError or MachineError."""
     if not folder.is_dir():
         raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of raw frames, darks and flats")
+    notes: list[str] = []
     with machine_errors(folder):
         if (folder / TABLE).is_file():
             captures = list(_from_list(folder))
         elif (folder / EMVA).is_file():
             captures = list(_from_emva(folder))
         else:
-            captures = list(_from_names(folder))
+            files, hidden = list_raw_files(folder, SUFFIXES)
+            captures = [_named(folder, file) for file in files]
+            notes += [f"{folder}: {hidden}"] if hidden else []
         if not captures:
             expected = f"expected darks and flats as {', '.join(SUFFIXES)}"
             raise ConfigError(f"calibrate: {folder}: contains no raw frame; {expected}")
         digests = [file_sha256(capture.path) for capture in captures]
     _check_twins(captures, digests)
-    notes: list[str] = []
     return CaptureSet(captures, _sensor(captures, notes, default), joined_sha256(digests), notes)
 
 
@@ -177,7 +182,9 @@ def _from_list(folder: Path) -> Iterator[Capture]:
     path = folder / TABLE
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
+            text = file.read()
+            delimiter = delimiter_of(text.partition("\n")[0], "file") or ","
+            reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=delimiter)
             names = list(reader.fieldnames or ())
             wrong = [name for name in REQUIRED if name not in names]
             wrong += [name for name in names if name not in (*REQUIRED, *OPTIONAL) or names.count(name) > 1]
@@ -188,15 +195,17 @@ def _from_list(folder: Path) -> Iterator[Capture]:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not text in UTF-8 ({error.reason}); save it as UTF-8") from error
     for number, row in rows:
-        yield _listed(folder, f"{path}, line {number}", {name: value or "" for name, value in row.items() if name})
+        cells = {name: value or "" for name, value in row.items() if name}
+        if delimiter == ";":  # the spreadsheets that write it also write 0,5 for 0.5
+            cells |= {name: text.replace(",", ".") for name, text in cells.items() if name in NUMBERS}
+        yield _listed(folder, f"{path}, line {number}", cells)
 
 
-def _from_names(folder: Path) -> Iterator[Capture]:
-    """Yield the raw files of a folder; their names, or the names of their folders, state the kind."""
-    for file in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
-        name = str(file.relative_to(folder))
-        kinds = [kind for kind, words in KIND_NAMES.items() if any(word in name.lower() for word in words)]
-        yield _listed(folder, f"calibrate: {file}", {"file": name, "kind": kinds[0] if len(kinds) == 1 else ""})
+def _named(folder: Path, file: Path) -> Capture:
+    """The frame of a raw file; its name, or the name of its folder, states the kind."""
+    name = str(file.relative_to(folder))
+    kinds = [kind for kind, words in KIND_NAMES.items() if any(word in name.lower() for word in words)]
+    return _listed(folder, f"calibrate: {file}", {"file": name, "kind": kinds[0] if len(kinds) == 1 else ""})
 
 
 def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:

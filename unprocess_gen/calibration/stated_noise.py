@@ -29,7 +29,7 @@ from unprocess_gen.calibration.profile import (
 )
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
-from unprocess_gen.core.raw_files import RAW_FILES
+from unprocess_gen.core.raw_files import RAW_FILES, list_raw_files
 from unprocess_gen.sources.raw.decode import read_metadata
 from unprocess_gen.sources.raw.tags import RawMetadata
 
@@ -67,15 +67,15 @@ class StatedNoise(NamedTuple):
 def read_stated_noise(folder: Path) -> StatedNoise:
     """Read the NoiseProfile tags of the DNG files below a folder, or of one file; ConfigError or MachineError."""
     with machine_errors(folder):
-        is_raw = [path for path in folder.rglob("*") if path.suffix.lower() in RAW_FILES]
-        files = [folder] if folder.is_file() else sorted(is_raw)
+        files, hidden = ([folder], "") if folder.is_file() else list_raw_files(folder, RAW_FILES)
         facts = {path: read_metadata(path, "calibrate", with_libraw=False) for path in files}
         stated = {path: tags for path, tags in facts.items() if tags.noise_profile is not None}
         sha256 = joined_sha256(map(file_sha256, stated))
     if not stated:
         problem = f"none of {len(files)} raw files has a NoiseProfile tag"
         raise ConfigError(f"calibrate: {folder}: {problem}; expected DNG files, such as those of Adobe's DNG Converter")
-    notes = [f"{path}: {note}" for path, tags in stated.items() for note in tags.notes]
+    notes = [f"{folder}: {hidden}"] if hidden else []
+    notes += [f"{path}: {note}" for path, tags in stated.items() for note in tags.notes]
     if without := [path for path in files if path not in stated]:
         notes.append(f"{without[0]}: has no NoiseProfile tag; left out ({len(without)} of {len(files)} raw files)")
     model, blacks, white = (common(stated, name) for name in ("model", "black_dn", "white_dn"))

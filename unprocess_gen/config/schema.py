@@ -99,7 +99,10 @@ class SourceConfig(Group):
         text file with the path of an image in each line, or CSV file with paths in the column file, else in the first
         one; relative paths are below root, without it below the folder of the list; include is not applied
     include
-        glob patterns of images; one with a slash matches the path below root, others the file name, in any case
+        glob patterns of images; one with a slash matches the path below root, others the file name, in any case;
+        hidden files and folders are left out
+    exclude
+        glob patterns of images to leave out, as in include
     recursive
         descend into folders
     limit
@@ -130,8 +133,9 @@ class SourceConfig(Group):
     list: Optional[str] = key(
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False)
     include: Optional[tuple[str, ...]] = key(
-        ("*.jpg", "*.jpeg", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
+        ("*.jpg", "*.jpeg", "*.jpe", "*.jfif", "*.mpo", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
         Limit("a list of at least one pattern such as '*.jpg'"), null="the suffixes of files that kind reads")
+    exclude: tuple[str, ...] = key((), Limit("a list of patterns such as '*_thumb.jpg'"))
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
@@ -12,11 +12,28 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+KINDS_SHOWN = 5
+"""Names of hidden files that `hidden_sentence` counts."""
+
+SYSTEM_NAMES = {"@eaDir", "@Recycle", "#recycle", "$RECYCLE.BIN", "System Volume Information", "__MACOSX"}
+"""Names of folders in which systems keep thumbnails, companions of files, and deleted files."""
+
+
+def hidden_part(path: str) -> str:
+    """Path of the first hidden file or folder in a path, such as ``.thumbnails`` or ``@eaDir``; empty without any."""
+    parts = path.split("/")
+    for number, name in enumerate(parts, start=1):
+        if name.startswith(".") or name in SYSTEM_NAMES:
+            return "/".join(parts[:number])
+    return ""
+
+
 class EntryKind(enum.Enum):
     """Kind of an entry of a folder."""
 
     FILE = "regular file or object"
     FOLDER = "folder or prefix"
+    HIDDEN = "hidden file or folder, which is not entered"
     LOOP = "link to a folder that contains the link"
     OTHER = "pipe or device"
     BROKEN_LINK = "link to nothing"
@@ -45,6 +62,14 @@ class Entry(NamedTuple):
     kind: EntryKind = EntryKind.FILE
     etag: str | None = None
     problem: str = ""
+
+
+def hidden_sentence(paths: Iterable[str]) -> str:
+    """Sentence that counts hidden files and folders by name; empty without any."""
+    names = (path.rpartition("/")[2] for path in paths)
+    kinds = Counter("._*" if name.startswith("._") else name for name in names).most_common()
+    shown = [f"{count} {name}" for name, count in kinds[:KINDS_SHOWN]] + ["…"] * (len(kinds) > KINDS_SHOWN)
+    return f"hidden files and folders are left out: {', '.join(shown)}" if kinds else ""
 
 
 def started_ahead(

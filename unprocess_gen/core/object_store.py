@@ -23,7 +23,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from unprocess_gen.core.entries import Entry, EntryKind, Item, Result, started_ahead
+from unprocess_gen.core.entries import Entry, EntryKind, Item, Result, hidden_part, started_ahead
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.libraries import require
 
@@ -135,9 +135,13 @@ class ObjectPath:
 
     # -------------------------------------------------------------------------------------------------- as a folder
 
-    def walk_entries(self, recursive: bool = True) -> Iterator[Entry]:
-        """Yield the objects below this prefix in the order of the store, without holding the listing in memory."""
+    def walk_entries(self, recursive: bool = True, enters_hidden: bool = True) -> Iterator[Entry]:
+        """Yield the objects below this prefix in the order of the store, without holding the listing in memory.
+
+        A hidden prefix is yielded instead of its objects, on request.
+        """
         prefix = f"{self.key}/" if self.key else ""
+        hidden = ""
         with _request(self) as (obstore, store):
             if recursive:
                 chunks = obstore.list(store, self.key or None, chunk_size=1000)
@@ -145,8 +149,13 @@ class ObjectPath:
                 chunks = iter([obstore.list_with_delimiter(store, self.key or None)["objects"]])
             for chunk in chunks:
                 for facts in chunk:
-                    if facts["path"] != self.key:
-                        yield Entry(facts["path"].removeprefix(prefix), facts["size"], etag=facts["e_tag"])
+                    path = facts["path"].removeprefix(prefix)
+                    if facts["path"] == self.key:
+                        continue
+                    if enters_hidden or not (part := hidden_part(path)):
+                        yield Entry(path, facts["size"], etag=facts["e_tag"])
+                    elif part != hidden:
+                        yield Entry(hidden := part, None, EntryKind.HIDDEN)
 
     def entries(self) -> dict[str, int]:
         """Names one level below this prefix: sizes in bytes of objects, -1 for prefixes."""

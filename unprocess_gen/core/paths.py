@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from unprocess_gen.core.entries import Entry, EntryKind, Item, Result
+from unprocess_gen.core.entries import Entry, EntryKind, Item, Result, hidden_part
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import sync, sync_folder
 from unprocess_gen.core.object_store import ObjectPath, is_url
@@ -71,17 +71,19 @@ class LocalPath(_NativePath):
         except (FileNotFoundError, NotADirectoryError):
             return {}
 
-    def walk_entries(self, recursive: bool = True) -> Iterator[Entry]:
+    def walk_entries(self, recursive: bool = True, enters_hidden: bool = True) -> Iterator[Entry]:
         """Yield every file and folder below this folder, also through links; open no file.
 
-        A folder that contains itself through a link is not entered. Raises OSError, whose ``filename`` is the folder,
-        for a folder that cannot be read.
+        A folder that contains itself through a link is not entered, nor a hidden one on request. Raises OSError, whose
+        ``filename`` is the folder, for a folder that cannot be read.
         """
         # a stack instead of recursion: folders may be nested deeper than Python's call stack
         waiting = [("", frozenset((_identity(self.stat()),)))]
         while waiting:
             folder, ancestors = waiting.pop()
             for entry, identity in _scan(str(self), folder):
+                if not enters_hidden and hidden_part(entry.path):
+                    entry, identity = Entry(entry.path, None, EntryKind.HIDDEN), None
                 if identity in ancestors:
                     yield entry._replace(kind=EntryKind.LOOP)
                     continue

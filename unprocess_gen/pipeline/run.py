@@ -17,7 +17,7 @@ import math
 import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.metadata import version
 from typing import Any
@@ -138,8 +138,10 @@ def resolve(config: Config) -> Run:
 
     ConfigError if sources or dark frames cannot be used, SourceChangedError if recorded dark frames changed.
     """
-    listing = list_photographs(config.source)
-    return Run(PairSettings.read(config), listing)
+    listing, settings = list_photographs(config.source), PairSettings.read(config)
+    if settings.dark_folder is not None and settings.dark_folder.warning:
+        listing = replace(listing, warnings=(*listing.warnings, settings.dark_folder.warning))
+    return Run(settings, listing)
 
 
 def resolve_part(folder: OutFolder, config: Config) -> Run:

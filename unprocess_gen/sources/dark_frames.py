@@ -23,7 +23,7 @@ from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.core.arrays import Raw
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.files import file_sha256, machine_errors
-from unprocess_gen.core.raw_files import SUFFIXES
+from unprocess_gen.core.raw_files import SUFFIXES, list_raw_files
 from unprocess_gen.simulation.facts import DarkFrame, DarkFrames
 from unprocess_gen.sources.raw.mosaics import Mosaic, checked_mosaic, even_sides, read_mosaic
 
@@ -49,11 +49,12 @@ of normal noise by 0.3 %."""
 class DarkFolder:
     """Read the dark frames of a folder by their digests.
 
-    ``files`` has the name of each file by its SHA-256; of twins the last by name.
+    ``files`` has the name of each file by its SHA-256; of twins the last by name. ``warning`` is for the user.
     """
 
     folder: str
     files: Mapping[str, str] = field(hash=False, default_factory=dict)
+    warning: str = field(compare=False, default="")
 
     @property
     def sha256(self) -> str:
@@ -81,8 +82,8 @@ class DarkFolder:
 def dark_folder(folder: str) -> DarkFolder:
     """Hash the dark frames of a folder; raise ConfigError or MachineError."""
     try:
-        names = sorted(path.name for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES)
-        files = {_file_sha256(Path(folder) / name): name for name in names}
+        paths, hidden = list_raw_files(Path(folder), SUFFIXES, recursive=False)
+        files = {_file_sha256(path): path.name for path in paths}
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(f"{KEY}={folder}: no such folder; expected a folder of dark frames") from None
     except OSError as error:
@@ -91,7 +92,7 @@ def dark_folder(folder: str) -> DarkFolder:
         raise ConfigError(
             f"{KEY}={folder}: contains no dark frame; expected files with a suffix of {', '.join(SUFFIXES)}"
         )
-    return DarkFolder(folder, files)
+    return DarkFolder(folder, files, f"{KEY}: {hidden}" if hidden else "")
 
 
 def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFolder | None]:

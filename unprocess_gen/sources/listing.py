@@ -26,13 +26,14 @@ from functools import partial
 from pathlib import PurePosixPath
 
 from unprocess_gen.config.schema import SourceConfig
-from unprocess_gen.core.entries import Entry, EntryKind
+from unprocess_gen.core.entries import Entry, EntryKind, hidden_sentence
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import absolute_text, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.source import Source
+from unprocess_gen.core.tables import delimiter_of
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.names import encode_name
 from unprocess_gen.sources.reading import opened, read_bytes
@@ -41,7 +42,7 @@ NAMED_SUFFIXES = 5
 """Suffixes of unmatched files that `unmatched_sentence` names; the others are summed."""
 
 ADVICE = {
-    "extend source.include to read {}": {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"},
+    "extend source.include to read {}": {glob.removeprefix("*") for glob in SourceConfig.include or ()},
     "convert {} to JPEG, PNG or TIFF": {".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"},
     "source.kind=raw reads {}": {".pgm", *RAW_FILES},
 }
@@ -85,7 +86,7 @@ def list_photographs(config: SourceConfig) -> Listing:
         pictures = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
         return Listing(number_clips(None, pictures) if config.clips else pictures)
     if config.list is None:
-        listed = list_folder(place, config.include or (), config.recursive, config.limit)
+        listed = list_folder(place, config.include or (), config.recursive, config.limit, config.exclude)
     else:
         listed = list_file(place, config.list, config.limit)
     listed = replace(listed, sources=number_twins(place, listed.sources))
@@ -97,24 +98,31 @@ def list_photographs(config: SourceConfig) -> Listing:
         "expected one folder for each clip; set source.clips=false if they are different photographs"
     )
     is_suspicious = len(numbered) > 1 and len({source.clip for source in numbered}) == 1
-    return replace(listed, sources=numbered, warnings=(warning,) if is_suspicious else ())
+    return replace(listed, sources=numbered, warnings=(*listed.warnings, *[warning] * is_suspicious))
 
 
-def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int | None) -> Listing:
+def list_folder(
+    root: str, include: Sequence[str], recursive: bool, limit: int | None, exclude: Sequence[str] = ()
+) -> Listing:
     """List the files below ``root`` that the globs match, ordered by the bytes of their relative paths.
 
-    A single file is listed whatever the globs are. ConfigError if the root does not exist, a sub-folder cannot be read,
-    or no file matches.
+    Hidden files and folders are left out, with a warning. A single file is listed whatever the globs are. ConfigError
+    if the root does not exist, a sub-folder cannot be read, or no file matches.
     """
     single = single_file(root)
     if single is not None:
         return Listing((_source(0, single),))
-    matches = _matcher(include)
+    is_included, is_excluded = _matcher(include), _matcher(exclude)
     matched: list[Entry] = []
+    hidden: list[str] = []
     suffixes, skipped_links = Counter[str](), 0
     try:
-        for entry in any_path(root).walk_entries(recursive):
-            if matches(entry.path):
+        for entry in any_path(root).walk_entries(recursive, enters_hidden=False):
+            if entry.kind is EntryKind.HIDDEN:
+                hidden.append(entry.path)
+            elif is_excluded(entry.path):
+                continue
+            elif entry.kind not in (EntryKind.FOLDER, EntryKind.LOOP) and is_included(entry.path):
                 matched.append(entry)
             elif entry.kind is EntryKind.FILE:
                 suffixes[PurePosixPath(encode_name(entry.path)).suffix.lower()] += 1
@@ -132,14 +140,15 @@ def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int |
         ) from None
     unmatched = dict(sorted(suffixes.items(), key=lambda item: (-item[1], item[0])))
     if not matched:
-        advice = f"{unmatched_sentence(unmatched)}; " if unmatched else ""
-        advice += "choose a folder of photographs or other globs"
-        raise ConfigError(
-            f"source.root={root}: no file matches source.include={list(include)} "
-            f"({'with' if recursive else 'without'} sub-folders); {advice}"
-        )
+        facts = (unmatched_sentence(unmatched), hidden_sentence(hidden))
+        advice = "; ".join([*filter(None, facts), "choose a folder of photographs or other globs"])
+        globs = f"source.include={list(include)}" + (f" and not source.exclude={list(exclude)}" if exclude else "")
+        folders = f"{'with' if recursive else 'without'} sub-folders"
+        raise ConfigError(f"source.root={root}: no file matches {globs} ({folders}); {advice}")
     matched.sort(key=lambda entry: os.fsencode(entry.path))
-    return Listing(tuple(map(_source, itertools.count(), matched[:limit])), skipped_links, unmatched)
+    sources = tuple(map(_source, itertools.count(), matched[:limit]))
+    warnings = (f"source.root: {hidden_sentence(hidden)}",) if hidden else ()
+    return Listing(sources, skipped_links, unmatched, warnings)
 
 
 def list_file(root: str, file: str, limit: int | None) -> Listing:
@@ -171,7 +180,10 @@ def _listed_paths(file: str) -> Iterator[tuple[int, str]]:
         if not file.lower().endswith(".csv"):
             yield from ((number, line.rstrip("\r")) for number, line in enumerate(lines, start=1) if line.strip())
             return
-        table = csv.reader(lines, strict=True)
+        delimiter = delimiter_of(lines[0], "file")
+        if delimiter is None and ";" in lines[0] and "," not in lines[0]:
+            raise ConfigError(f"source.list={file}: line 1: has a semicolon and no comma; expected a header with file")
+        table = csv.reader(lines, strict=True, delimiter=delimiter or ",")
         header = next(table, [])
         column = header.index("file") if "file" in header else 0
         yield from ((table.line_num, row[column]) for row in table if row)

@@ -61,9 +61,9 @@ def probe(data: bytes) -> Header:
     if not data:
         raise SourceError("empty", "the file has 0 bytes")
     name = next((name for name, (magic, _) in _FORMATS.items() if data.startswith(magic)), None)
-    if name is None and (heif := _HEIF.match(data)):
-        raise SourceError("unsupported", f"{'AVIF' if heif['avif'] else 'HEIC'}; convert it to JPEG, PNG or TIFF")
     if name is None:
+        if other := next((other for other, magic in _OTHER_FORMATS.items() if re.match(magic, data, re.DOTALL)), None):
+            raise SourceError("unsupported", f"{other}; convert it to JPEG, PNG or TIFF")
         raise _unsupported(f"a file that begins with {data[:8].hex(' ')}")
     try:
         header = _FORMATS[name][1](data)
@@ -398,5 +398,11 @@ _FORMATS: dict[str, tuple[tuple[bytes, ...], Callable[[bytes], Header]]] = {
 }
 """First bytes and reader of each format."""
 
-_HEIF = re.compile(rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1|(?P<avif>avi[fs]))", re.DOTALL)
-"""First bytes of photographs of telephones, which often have the suffix of a JPEG."""
+_OTHER_FORMATS = {
+    "AVIF": rb"....ftypavi[fs]",
+    "HEIC": rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1)",
+    "JPEG XL": rb"\xff\x0a|\0\0\0\x0cJXL ",
+    "JPEG 2000": rb"\xff\x4f\xff\x51|\0\0\0\x0cjP  ",
+    "GIF": rb"GIF8",
+}
+"""First bytes of pictures that are named when they are refused; those of telephones often have the suffix .jpg."""
