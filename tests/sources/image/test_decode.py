@@ -302,7 +302,9 @@ OTHER_FORMATS = {
 }
 
 
-@pytest.mark.parametrize(("name", "start"), [(name, start) for name, all in OTHER_FORMATS.items() for start in all])
+@pytest.mark.parametrize(
+    ("name", "start"), [(name, start) for name, starts in OTHER_FORMATS.items() for start in starts]
+)
 def test_other_formats_are_named_with_advice(name: str, start: bytes) -> None:
     with pytest.raises(SourceError) as caught:
         decode(start + bytes(16), max_pixels=2**26, icc="ignore")
