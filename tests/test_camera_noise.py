@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import multiprocessing
 import pickle
+import warnings
+from typing import Any
 
 import cv2
 import numpy as np
@@ -91,6 +94,31 @@ def test_calls_without_index_count(picture: np.ndarray) -> None:
     noise = ug.CameraNoise(["noise=imx385_iso12800"])
     calls = [noise(picture)[1] for _ in range(2)]
     assert all((call == noise(picture, index=n)[1]).all() for n, call in enumerate(calls))
+
+
+def warnings_in_a_fork(noise: ug.CameraNoise, picture: np.ndarray, index: int | None) -> int:
+    """Number of warnings of two calls in a fork, like a worker of a DataLoader in one epoch."""
+    context = multiprocessing.get_context("fork")
+    counts: Any = context.SimpleQueue()
+
+    def work() -> None:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            noise(picture, index)
+            noise(picture, index)
+        counts.put(sum("pass the index" in str(warning.message) for warning in caught))
+
+    process = context.Process(target=work)
+    process.start()
+    process.join()
+    return int(counts.get())
+
+
+@pytest.mark.parametrize(("index", "expected"), [(None, [1, 0]), (3, [0, 0])])
+def test_forks_without_index_warn_once(index: int | None, expected: list[int], picture: np.ndarray) -> None:
+    noise = ug.CameraNoise(["noise=imx385_iso12800"])
+    noise(picture)  # in the process that made it, calls are counted
+    assert [warnings_in_a_fork(noise, picture, index) for _ in range(2)] == expected
 
 
 def test_raw_pair_is_that_of_make_pair(picture: np.ndarray) -> None:

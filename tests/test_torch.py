@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from unprocess_gen.simulation.reference import isp
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed; it is no dependency")
-from torch.utils.data import default_collate  # noqa: E402
+from torch.utils.data import DataLoader, default_collate  # noqa: E402
 
 from unprocess_gen.torch import develop, development_parameters  # noqa: E402
 
@@ -140,3 +141,8 @@ def test_row_of_no_pair_is_refused(pair: ug.RawPair) -> None:
     with pytest.raises(ug.DamageError):
         develop(torch.zeros(1, 4, 4), {**pair.row, "gamma": "steep"})
     assert plan_from_row(pair.row).camera == pair.plan.camera
+
+
+def test_data_loader_stacks_pairs_with_rows(dataset: Path) -> None:
+    (batch,) = DataLoader(ug.RawPairs(dataset), batch_size=len(ug.RawPairs(dataset)))
+    assert batch.noisy.dtype == torch.uint16 and batch.noisy.shape[0] == len(batch.row["key"])

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 import operator
+import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -22,6 +24,7 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import refusal
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
@@ -100,7 +103,7 @@ class CameraNoise:
             config = load_config(config)
         self._settings = array_settings(_config_of_pictures(config, seed))
         self._demosaic, self._jpeg, self._clean, self._seed = demosaic, jpeg, clean, seed
-        self._calls = 0
+        self._calls, self._process, self._told = 0, os.getpid(), SharedCount()
 
     def __repr__(self) -> str:
         name = self._settings.config.noise.name
@@ -115,7 +118,7 @@ class CameraNoise:
             Display-referred codes, R, G, B; at least 2 x 2.
         index : int, optional
             Number that selects the random values; by default the number of the call: 0, 1, … Copies of an instance,
-            such as in the workers of a DataLoader, count their calls separately, so state it there.
+            such as in the workers of a DataLoader, count their calls separately, so state it there; they warn once.
 
         Returns
         -------
@@ -128,6 +131,9 @@ class CameraNoise:
         if self._jpeg is not None and pixels.dtype != np.uint8:
             raise ValueError(f"picture is {pixels.dtype}; expected uint8 with jpeg={self._jpeg}, or jpeg=None")
         if index is None:
+            if os.getpid() != self._process and self._told.next() == 1:
+                problem = "without index, copies in several processes make the same noise"
+                warnings.warn(f"CameraNoise: {problem}; pass the index of the picture", stacklevel=2)
             index, self._calls = self._calls, self._calls + 1
         _, image = plan_array(pixels, self._settings, operator.index(index))
         if self._settings.config.self_test == "stop":

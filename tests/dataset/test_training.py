@@ -62,6 +62,18 @@ def test_arrays_only_gives_the_frames_without_the_row(dataset: Path) -> None:
     assert np.array_equal(noisy, expected.noisy)
 
 
+def test_batches_have_one_type_in_each_column(dataset: Path) -> None:
+    """As PyTorch's ``default_collate`` needs it."""
+    pairs = ug.RawPairs(dataset)
+    batch = pairs.__getitems__([1, 0])
+    assert [item.row["key"] for item in batch] == [pairs[1].row["key"], pairs[0].row["key"]]
+    assert all((item.noisy == pairs[number].noisy).all() for item, number in zip(batch, (1, 0), strict=True))
+    for name in batch[0].row:
+        kinds = {type(item.row[name]) for item in batch}
+        assert len(kinds) == 1 and kinds <= {int, float, str, bool}, name
+    assert [*map(len, ug.RawPairs(dataset, arrays_only=True).__getitems__([0]))] == [2]
+
+
 @pytest.mark.parametrize(
     "overrides",
     [

@@ -80,6 +80,19 @@ def test_all_redraws_parameters_and_patches_and_keeps_the_body(night: Path) -> N
     assert [row.get("epoch") for row in rows] == [None, 1, 2]
 
 
+def test_second_epoch_without_numbers_warns_once(night: Path) -> None:
+    live, repeated = ug.LivePairs(night), ug.LivePairs(night, redraw="none")
+    for number in range(len(live)):
+        live[0, number], live[number], repeated[number]
+    repeated[0]
+    with pytest.warns(UserWarning, match="sampler=EpochSampler") as warned:
+        live[0]
+    live[1]
+    assert len(warned) == 1
+    with pytest.warns(UserWarning, match="sampler=EpochSampler"):  # a worker process knows nothing of other epochs
+        pickle.loads(pickle.dumps(live))[0]
+
+
 def test_fixed_patterns_are_the_same_in_every_epoch() -> None:
     plan = _PHYSICAL.replace(effects=("prnu", "column", "dsnu", "dead_pixels", "quantise"))
     first, later = (make_pair(_codes(), plan.replace(epoch=epoch)) for epoch in (0, 5))
@@ -157,7 +170,7 @@ def test_pixels_are_decoded_once_up_to_the_bound(tmp_path: Path, make: Make) -> 
     assert 1 <= len(files) <= 2
     assert sum(file.stat().st_size for file in files) <= 2 * size
     files[0].write_bytes(files[0].read_bytes()[:-99])
-    unbounded = ug.LivePairs(tmp_path / "ds", cache=tmp_path / "cache")
+    unbounded = ug.LivePairs(tmp_path / "ds", redraw="none", cache=tmp_path / "cache")
     assert_same(unbounded, stored)
     for photograph in (tmp_path / "photos").iterdir():
         photograph.unlink()

@@ -6,6 +6,7 @@ import errno
 import functools
 import multiprocessing
 import os
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,30 @@ def test_a_full_disk_ends_the_caching(tmp_path: Path, monkeypatch: pytest.Monkey
 def _fail(stream: Any, _: Pixels) -> None:
     stream.write(b"some bytes")
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_write_that_numpy_cuts_short_ends_the_caching(tmp_path: Path) -> None:
+    """NumPy raises an OSError without a number, as in the 64 MB of a container's shared memory."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.warns(UserWarning, match="the disk is full") as warned:
+            made = fill(tmp_path, [0, 1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert len(warned) == 1 and not list(tmp_path.iterdir())
+    np.testing.assert_array_equal(made[1], photograph(1))
+
+
+def test_a_folder_that_a_full_disk_refuses_ends_the_caching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse_folder(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "mkdir", refuse_folder)
+    with pytest.warns(UserWarning, match="the disk is full") as warned:
+        cache = PixelCache("memory", MOST_BYTES)
+        np.testing.assert_array_equal(cache.get("1", functools.partial(photograph, 1)), photograph(1))
+    assert len(warned) == 1
 
 
 def test_processes_that_fill_a_cache_at_once_see_complete_files(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import bisect
 import copy
 import csv
 import itertools
+import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,13 +18,14 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import FLOAT32, PACKED, UINT16, Float, Frame
 from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
-from unprocess_gen.dataset.row import has_frames
+from unprocess_gen.dataset.row import COLUMNS, has_frames
 from unprocess_gen.dataset.shards import (
     Member,
     arrays_of,
@@ -86,6 +88,26 @@ class Sample(_Frames):
         return sample
 
 
+class _FramesAndTargets(NamedTuple):
+    clean: Frame
+    noisy: Frame
+    row: dict[str, Any]
+    targets: Mapping[str, NDArray[Any]]
+
+
+def stackable(sample: Sample, **cells: Value) -> tuple[Any, ...]:
+    """Frames, row and targets, if there are any, so that PyTorch's default ``collate_fn`` stacks them.
+
+    Columns have one type in every pair: NaN instead of None, text where some pairs have text. ``cells`` are those of
+    columns that some rows lack.
+    """
+    texts = {column.name for column in COLUMNS if column.type is number_or_text}
+    row = cells | {name: math.nan if value is None else value for name, value in sample.row.items()}
+    row = {name: str(value) if name in texts else value for name, value in row.items()}
+    frames = sample.clean, sample.noisy, row
+    return _FramesAndTargets(*frames, sample.targets) if sample.targets else _Frames(*frames)
+
+
 def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
     """Mosaic [H, W] of a frame in DN: uint16 values unchanged, float32 values scaled from 0 at black and 1 at white."""
     mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
@@ -105,6 +127,8 @@ class RawPairs:
     No file stays open and only the position of each row is kept (8 bytes), so an instance can be pickled, forked and
     shared between threads. Needs neither Numba nor OpenCV nor Hydra.
 
+    A DataLoader receives rows with NaN instead of None. Its default ``collate_fn`` stacks frames of one size.
+
     A pair of an object store takes three requests, and more for the first pair of each shard. Such an instance cannot
     be used in a forked process: give a DataLoader ``multiprocessing_context="spawn"`` or ``"forkserver"``.
 
@@ -115,8 +139,7 @@ class RawPairs:
         sweep's datasets follow each other as in its ``sweep.csv``; jobs that left no dataset are omitted. The pairs of
         a list follow each other in its order.
     arrays_only : bool
-        Items are tuples ``(clean, noisy)`` and stored targets, without the row, which PyTorch's default ``collate_fn``
-        stacks if all frames have one size. It cannot stack rows, because cells without a value are None.
+        Items are tuples ``(clean, noisy)`` and stored targets, without the row.
     split : str, optional
         Only pairs of this split (key ``split`` of the settings), by default all.
 
@@ -188,6 +211,14 @@ class RawPairs:
         dataset, place = self._place(self._numbers[operator.index(number)])
         sample = dataset.read(place)
         return (*sample[:2], *sample.targets.values()) if self.arrays_only else sample
+
+    def __getitems__(self, numbers: Sequence[int]) -> list[Any]:
+        """Read a batch as PyTorch's DataLoader asks for it, in items that its default ``collate_fn`` stacks.
+
+        Items are named tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets
+        if there are any; with ``arrays_only`` tuples of arrays.
+        """
+        return [self[number] if self.arrays_only else stackable(self[number]) for number in numbers]
 
     def _place(self, number: int) -> tuple[_Dataset, int]:
         """Dataset of a pair, and the number of the pair in it."""

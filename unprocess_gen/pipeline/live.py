@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import bisect
 import itertools
-import math
 import operator
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -21,8 +21,8 @@ from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
@@ -32,8 +32,8 @@ from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.keys import pair_key, patch_key
-from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, open_datasets
-from unprocess_gen.dataset.row import COLUMNS, pair_row, patch_from_row, plan_from_row
+from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, open_datasets, stackable
+from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.pairs import PairSettings, levels_of, plan_pixels, targets_of
 from unprocess_gen.pipeline.replay import source_of
@@ -170,6 +170,7 @@ class LivePairs:
         most = (NEW_CROPS if redraw == "all" else KEPT_CROPS), NEW_CROPS
         self._kept: list[Recent[tuple[Any, ...], tuple[Plan, CropMaker]]] = [*map(Recent, most)]
         self._facts: Recent[int, Facts | None] = Recent(KEPT)  # they read all pixels of a photograph
+        self._reads_of_epoch_0 = SharedCount()
 
     def __len__(self) -> int:
         return (self._ends[-1] if self._ends else 0) * self._patches
@@ -179,6 +180,8 @@ class LivePairs:
         return f"LivePairs({names}, length={len(self)}, redraw={self._redraw!r})"
 
     def __getitem__(self, item: int | tuple[int, int]) -> Any:  # arrays instead of a LiveSample with arrays_only
+        if not isinstance(item, tuple) and self._redraw != "none":
+            self._warn_of_repetition()
         epoch, number = map(operator.index, item if isinstance(item, tuple) else (0, item))
         if not 0 <= epoch < EPOCHS:
             raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
@@ -212,16 +215,20 @@ class LivePairs:
     def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
         """Make a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
 
-        Items are tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets if
-        there are any; with ``arrays_only`` of arrays.
+        Items are named tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets
+        if there are any; with ``arrays_only`` tuples of arrays.
         """
-        samples = [self[item] for item in items]
-        if self._arrays_only:
-            return samples
-        return [
-            (sample.clean, sample.noisy, _without_none(sample.row), *filter(None, [sample.targets]))
-            for sample in samples
-        ]
+        return [self[item] if self._arrays_only else stackable(self[item], epoch=0) for item in items]
+
+    def _warn_of_repetition(self) -> None:
+        """Warn when a second epoch begins without a number; a copy in a worker process does not see other epochs."""
+        count = self._reads_of_epoch_0
+        if count.next() == (1 if count.is_copy else len(self) + 1):
+            warnings.warn(
+                "LivePairs: items without an epoch have the noise of epoch 0 each time; give the DataLoader "
+                "sampler=EpochSampler(len(live)), or LivePairs redraw='none'",
+                stacklevel=3,
+            )
 
     def _prepared(
         self, place: int, image: LiveImage, srgb: Srgb, epoch: int, number: int
@@ -282,13 +289,6 @@ class LiveRow(Mapping[str, Value]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (self._row,)
-
-
-def _without_none(row: Mapping[str, Value]) -> dict[str, Value]:
-    """Give the columns of a row one type in every pair: NaN instead of None, text where some pairs have text."""
-    texts = {column.name for column in COLUMNS if column.type is number_or_text}
-    cells = {"epoch": 0} | {name: math.nan if value is None else value for name, value in row.items()}
-    return {name: str(value) if name in texts else value for name, value in cells.items()}
 
 
 def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[LiveSource]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+import uuid
 import warnings
 import weakref
 from collections.abc import Callable
@@ -41,18 +42,21 @@ class PixelCache:
 
     def __init__(self, folder: str | os.PathLike[str], most_bytes: int) -> None:
         self._most_bytes = most_bytes
-        if folder == "memory":
-            folder = tempfile.mkdtemp(prefix="unprocess_gen_", dir=SHARED_MEMORY if SHARED_MEMORY.is_dir() else None)
-            weakref.finalize(self, _delete, folder, os.getpid())
         self._maps: Recent[str, Srgb] = Recent(MAPS)
         self._compared: set[str] = set()
+        is_temporary = folder == "memory"
+        if is_temporary:
+            parent = SHARED_MEMORY if SHARED_MEMORY.is_dir() else Path(tempfile.gettempdir())
+            folder = parent / f"unprocess_gen_{uuid.uuid4().hex}"
+            weakref.finalize(self, _delete, folder, os.getpid())
         self._folder = Path(folder).absolute()
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(mode=0o700 if is_temporary else 0o777, parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(
-                f"cache={folder}: cannot be created ({error.strerror}); expected a folder; choose another one"
-            ) from None
+            if error.errno not in NO_SPACE:
+                problem = f"cannot be created ({error.strerror}); expected a folder; choose another one"
+                raise ConfigError(f"cache={folder}: {problem}") from None
+            self._end()
 
     def get(self, name: str, decode: Callable[[], Srgb]) -> Srgb:
         """Pixels of a name, decoded if they are not in the cache, and then added if there is space."""
@@ -65,7 +69,7 @@ class PixelCache:
         if pixels is not None:
             return self._maps.keep(name, pixels)
         pixels = decode()
-        if self._bytes() + HEADER_BYTES + pixels.nbytes + DIGEST_BYTES <= self._most_bytes:
+        if self._most_bytes and self._bytes() + HEADER_BYTES + pixels.nbytes + DIGEST_BYTES <= self._most_bytes:
             self._add(path, pixels)
         return pixels
 
@@ -105,13 +109,17 @@ class PixelCache:
                 raise
         except OSError as error:
             with machine_errors(self._folder):
-                if error.errno not in NO_SPACE:
+                if error.errno not in (*NO_SPACE, None):  # NumPy's error for a short write has no number
                     raise
-            self._most_bytes = 0
-            warnings.warn(f"cache={self._folder}: the disk is full; other pixels are decoded each time", stacklevel=2)
+            self._end()
+
+    def _end(self) -> None:
+        """Add no more pixels, because the disk is full."""
+        self._most_bytes = 0
+        warnings.warn(f"cache={self._folder}: the disk is full; other pixels are decoded each time", stacklevel=2)
 
 
-def _delete(folder: str, pid: int) -> None:
+def _delete(folder: Path, pid: int) -> None:
     """Delete a temporary folder at the end of the process that created it, not of its forks."""
     if os.getpid() == pid:
         shutil.rmtree(folder, ignore_errors=True)

@@ -148,6 +148,38 @@ def test_no_place_for_a_cache_compiles_without_one(tmp_path: Path, monkeypatch: 
     assert double(2.0) == 4.0 and cast(Any, double).stats.cache_path is None
 
 
+@pytest.mark.parametrize("part", ["nbi", "nbc"])
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.99], ids="{:.0%}".format)
+def test_damaged_machine_code_is_compiled_again(
+    part: str, kept: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(jit, "kernel_cache_folder", lambda: tmp_path)
+    assert kernel(_double)(2.0) == 4.0
+    (file,) = tmp_path.rglob(f"*.{part}")
+    content = file.read_bytes()
+    file.write_bytes(content[: int(kept * len(content))])
+
+    again, third = kernel(_double), kernel(_double)
+
+    assert again(2.0) == 4.0
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "compiling it again" in caplog.text
+    assert third(2.0) == 4.0 and cast(Any, third).stats.cache_hits
+    assert len(caplog.records) == 1
+
+
+def test_machine_code_that_cannot_be_kept_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A disk that is full: the index would be a file where a folder is."""
+    monkeypatch.setattr(jit, "kernel_cache_folder", lambda: tmp_path)
+    double = kernel(_double)
+    shutil.rmtree(tmp_path)
+    tmp_path.touch()
+    assert double(2.0) == 4.0 and double(2) == 4
+    assert caplog.text.count("cannot be written") == 1
+
+
 def test_a_numba_that_ignores_the_folder_gets_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     """The user's setting is restored."""
 

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.pipeline.deaths import count_death, deadly_sources, read_deaths, shards_with_deaths, write_deaths
+from unprocess_gen.pipeline.executors.cores import own_cores, usable_cores
 from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
@@ -148,15 +149,4 @@ def start_tracker() -> None:
 
 def effective_jobs(n_jobs: int, tasks: int) -> int:
     """Number of workers to start: -1 means all cores that this process may use, and there are no more than tasks."""
-    if tasks <= 1:
-        return 1  # without joblib, whose import takes 0.15 s
-    if n_jobs == -1:
-        from joblib import cpu_count
-
-        n_jobs = cpu_count()
-    return min(n_jobs, tasks)
-
-
-def own_cores() -> int:
-    """Number of cores this process may use, regardless of its container's share of CPU time."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(usable_cores() if n_jobs == -1 else n_jobs, tasks))

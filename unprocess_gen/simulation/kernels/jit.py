@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import logging
 import os
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,6 +27,8 @@ from numba.extending import overload
 
 numba_config: Any = numba.config
 """Numba's settings: public names without types, assigned when Numba is imported."""
+
+_LOGGER = logging.getLogger(__name__)
 
 KERNEL_PACKAGES = ("core", "simulation")
 """The packages whose files determine the machine code of kernels."""
@@ -138,4 +142,38 @@ def _compile(function: Callable[..., Any], **options: bool) -> Callable[..., Any
     if hasattr(dispatcher, "stats") and not Path(dispatcher.stats.cache_path).is_relative_to(folder):
         # a Numba that ignores CACHE_DIR could return machine code of other sources
         return cast(Callable[..., Any], compiler()(function))
+    if hasattr(dispatcher, "_cache"):
+        _survive_damage(dispatcher._cache, folder)
     return cast(Callable[..., Any], dispatcher)
+
+
+def _survive_damage(cache: Any, folder: Path) -> None:
+    """Compile again what a cache cannot read, and do without what it cannot write."""
+    read, write = cache.load_overload, cache.save_overload
+
+    def load_overload(*arguments: Any) -> Any:
+        try:
+            return read(*arguments)
+        except MemoryError:
+            raise
+        except Exception as error:  # a pickle that was cut raises errors of many classes
+            _LOGGER.warning("%s: the machine code is damaged (%s); compiling it again", folder, type(error).__name__)
+            for path in [*folder.rglob("*.nbi"), *folder.rglob("*.nbc"), *folder.glob("*.run")]:
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
+
+    def save_overload(*arguments: Any) -> None:
+        try:
+            write(*arguments)
+        except MemoryError:
+            raise
+        except Exception as error:  # those of reading too, where a damaged file cannot be deleted
+            _tell_once(folder, getattr(error, "strerror", None) or type(error).__name__)
+
+    cache.load_overload, cache.save_overload = load_overload, save_overload
+
+
+@functools.cache
+def _tell_once(folder: Path, reason: str) -> None:
+    """Say once in a process that machine code cannot be kept."""
+    _LOGGER.warning("%s: cannot be written (%s); kernels are compiled in each process", folder, reason)
