@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import re
 import shlex
 import subprocess
@@ -10,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -107,6 +109,24 @@ def address(photos: Path) -> Iterator[str]:
         yield process.stdout.readline().split()[0]
         process.terminate()
         assert process.wait(30) == 143
+
+
+def answer_to(address: str, origin: str) -> int:
+    """Status with which the server answers a page of an origin that opens the socket."""
+    place = urlsplit(address)
+    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13", "Origin": origin}
+    connection = http.client.HTTPConnection(place.netloc, timeout=30)
+    connection.request("GET", "/ws", headers=headers | {"Sec-WebSocket-Key": "MDEyMzQ1Njc4OWFiY2RlZg=="})
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+def test_page_of_a_tunnel_works_and_other_names_do_not(address: str) -> None:
+    for name in ("127.0.0.1", "localhost"):
+        assert answer_to(address, f"http://{name}:9000") == 101
+    for name in ("evil.example:9000", "localhost.evil.example", "192.168.0.1:9000"):
+        assert answer_to(address, f"http://{name}") == 403
 
 
 def model(browser: Any, name: str, code: str) -> Any:

@@ -29,13 +29,9 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
         reason = getattr(error, "strerror", None) or error
         problem = f"cannot be used ({reason}); expected a free port; choose another, or leave --port out"
         raise ConfigError(f"--port {port}: {problem}") from None
-    origins = [f"{name}:{port}" for name in (HOST, "localhost")]  # no other name that leads to this machine
-    server = Server(
-        {"/": lambda document: Page(choices, document).fill()},
-        port=port,
-        address=HOST,
-        allow_websocket_origin=origins,
-    )
+    server = Server({"/": lambda document: Page(choices, document).fill()}, port=port, address=HOST)
+    # any port, for tunnels, but no other name that leads to this machine; the argument of Server takes no such pattern
+    server._tornado.websocket_origins.update(f"{name}:*" for name in (HOST, "localhost"))
     server.start()
     thread = threading.Thread(target=server.io_loop.start, daemon=True)
     thread.start()
