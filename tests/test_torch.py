@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.cases import slow_except
+from helpers.datasets import Make
 
 import unprocess_gen as ug
 from unprocess_gen.dataset.row import plan_from_row
@@ -143,6 +144,10 @@ def test_row_of_no_pair_is_refused(pair: ug.RawPair) -> None:
     assert plan_from_row(pair.row).camera == pair.plan.camera
 
 
-def test_data_loader_stacks_pairs_with_rows(dataset: Path) -> None:
-    (batch,) = DataLoader(ug.RawPairs(dataset), batch_size=len(ug.RawPairs(dataset)))
-    assert batch.noisy.dtype == torch.uint16 and batch.noisy.shape[0] == len(batch.row["key"])
+def test_data_loader_stacks_pairs_with_rows(make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "ds", "source.patch=64", "source.limit=2", "output.targets=[linear_rgb]")
+    pairs = ug.RawPairs(tmp_path / "ds")
+    (batch,) = DataLoader(pairs, batch_size=len(pairs))
+    assert batch.noisy.dtype == torch.uint16 and tuple(batch.noisy.shape) == (len(pairs), 64, 64)
+    assert batch.row["key"] == [pair.row["key"] for pair in pairs]
+    assert tuple(batch.targets["linear_rgb"].shape) == (len(pairs), 64, 64, 3)
