@@ -118,7 +118,7 @@ def test_folder_without_list_is_read_by_metadata(calibrated: Any, tmp_path: Path
     folder = record(tmp_path / "captures", Camera("sony_a7s2", 3200, side=64), darks=3, flats=3, levels=levels)
     listed = estimates(calibrated(folder))
     (folder / "captures.csv").unlink()
-    (folder / "._dark_0.dng").write_bytes(b"\0\5\x16\7")  # as a Mac writes it beside each file of a memory card
+    (folder / "._dark_0.dng").write_bytes(b"\0\5\x16\7")  # as a Mac writes it next to each file of a memory card
     (folder / "@eaDir" / "flat.dng").mkdir(parents=True)
     assert estimates(calibrated(folder)) == listed
 

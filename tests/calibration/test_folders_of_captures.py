@@ -43,5 +43,6 @@ def test_each_series_of_an_emva_description_is_its_own(tmp_path: Path) -> None:
         *(line for head, places in series for line in (head, *(f"i {n}.npy" for n in places))),
     ]
     (folder / "EMVA1288_Data.txt").write_text("\n".join(lines) + "\n")
-    assert sorted(map(len, read_captures(folder).groups("flat", EMVA_ISO))) == [2, 2, 2, 2, 4]
-    assert calibrate(folder).isos[0].iso == EMVA_ISO
+    found = read_captures(folder)
+    assert sorted(map(len, found.groups("flat", EMVA_ISO))) == [2, 2, 2, 2, 4]
+    assert calibrate(found).isos[0].iso == EMVA_ISO

@@ -1,4 +1,4 @@
-"""Quotas of control groups limit the cores, wherever they stand."""
+"""Quotas of control groups limit the cores, of whichever group they are."""
 
 from __future__ import annotations
 

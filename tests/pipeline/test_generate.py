@@ -163,7 +163,7 @@ def broken(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (source / "003.png").write_bytes(b"")
     (source / "005.png").write_bytes(b"not a photograph")
     (source / "006.png").unlink()
-    (source / "006.png").mkdir()
+    os.mkfifo(source / "006.png")
     (source / "008.png").unlink()
     (source / "008.png").symlink_to("nowhere")
     make(source, source.parent / "ds", "output.pairs_per_shard=2")

@@ -201,7 +201,6 @@ def bind_socket(path: Path) -> None:
 ENTRIES: dict[str, tuple[Callable[[Path], object], str]] = {
     "socket.jpg": (bind_socket, "not_a_file"),
     "pipe.jpg": (os.mkfifo, "not_a_file"),
-    "folder.jpg": (Path.mkdir, "not_a_file"),
     "endless.jpg": (lambda path: path.symlink_to("/dev/zero"), "not_a_file"),
     "terminal.jpg": (lambda path: path.symlink_to("/dev/tty"), "not_a_file"),
     "memory.jpg": (lambda path: path.symlink_to("/proc/self/mem"), "empty"),

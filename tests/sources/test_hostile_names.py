@@ -43,7 +43,7 @@ NAMES: tuple[bytes, ...] = (
     *(b"=1+1.jpg", b"@SUM(1).jpg", b"\t=1.jpg", b"=cmd|' C'!A0.jpg", b"-.jpg", b"--help.jpg", b"${x}.jpg"),
     *(b"[x]*.jpg", b"{a,b}.jpg", b"back\\slash.jpg", b"a&b.jpg", b"#.jpg", b"null.jpg", b"a=b.jpg", b"<a>.jpg"),
     # dots, blanks, percent signs
-    *(b"..jpg", b". .jpg", b" lead.jpg", b"trail .jpg", b"%.jpg", b"%25.jpg", b"%2F.jpg", b"..%2f..%2fb.jpg"),
+    *(b"x..jpg", b"x. .jpg", b" lead.jpg", b"trail .jpg", b"%.jpg", b"%25.jpg", b"%2F.jpg", b"x..%2f..%2fb.jpg"),
     *(b"%0A.jpg", b"$(id).jpg"),
     # bytes that are not UTF-8, directions, widths
     *(b"\xff.jpg", b"\xc3(.jpg", b"\xed\xa0\x80.jpg", b"\xc0\xaf.jpg", b"\x80=.jpg", "\u202egpj.jpg".encode()),
@@ -55,7 +55,7 @@ NAMES: tuple[bytes, ...] = (
     *(b"\x1b[31m.jpg", b"\x1b]0;title\x07.jpg", b"\x7f.jpg", b"x" * 251 + b".jpg", b"\xff" * 251 + b".jpg"),
 )
 LONGEST = b"\xff" * 255 + b"/" + b"\xfe" * 255
-FOLDERS: tuple[bytes, ...] = (b"=dir", b"new\nline", b"\xff", b"...", b"  ", b"%2e%2e", LONGEST)
+FOLDERS: tuple[bytes, ...] = (b"=dir", b"new\nline", b"\xff", b"x...", b"  ", b"%2e%2e", LONGEST)
 
 
 def photograph(number: int) -> bytes:
