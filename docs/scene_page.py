@@ -81,8 +81,8 @@ def predictions_of(scene: str, profile: str) -> tuple[Prediction, ...] | None:
     assert noise.bits is not None
     sensor = read_option("sensor", SENSORS[noise.bits])
     config = replace(_base(), noise=noise, scene=_scene(scene), sensor=sensor)
-    ((_, predictions),) = plan_levels(config, "0" * 64, facts=FACTS)
-    return predictions
+    ((_, selection),) = plan_levels(config, "0" * 64, facts=FACTS)
+    return None if selection is None else selection.predictions()
 
 
 def _entry(profile: str, one: Prediction) -> str:

@@ -549,7 +549,9 @@ def test_equal_images_of_8_and_16_bits_have_equal_effects(settings: Settings, pi
 def test_smallest_images_have_a_plan(settings: Settings, shape: tuple[int, int], code: int) -> None:
     config = configured(settings, "noise=canon_70d", "scene=night", "noise.assumed=[]", "noise.full_well_e=3000")
     srgb = np.full((*shape, 3), code, dtype=np.uint8)
-    ((_, predictions),) = plan_levels(config, "0" * 64, 0, facts_of(srgb))
+    ((_, selection),) = plan_levels(config, "0" * 64, 0, facts_of(srgb))
+    assert selection is not None
+    predictions = selection.predictions()
     assert [one.effect for one in predictions] == list(EFFECTS)
     assert all(math.isfinite(one.predicted_dn) and one.ratio >= 0 for one in predictions)
 
@@ -606,8 +608,9 @@ def test_effect_above_tolerance_alone_is_simulated_and_reasons_fit_a_row(
 
 def predictions_of(settings: Settings, *overrides: str) -> dict[str, Prediction]:
     config = configured(settings, "noise=sony_a7s2", "scene=indoor", *overrides)
-    ((_, predictions),) = plan_levels(config, "0" * 64, 0, facts_of(cut("highlights-0", 40, 56)))
-    return {one.effect: one for one in predictions}
+    ((_, selection),) = plan_levels(config, "0" * 64, 0, facts_of(cut("highlights-0", 40, 56)))
+    assert selection is not None
+    return {one.effect: one for one in selection.predictions()}
 
 
 @pytest.mark.parametrize("switch", ["auto", "on", "off"])

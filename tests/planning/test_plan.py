@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 from unprocess_gen.config.distributions import Distribution
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import fixed_point
-from unprocess_gen.core.random_streams import stream_key
+from unprocess_gen.core.random_streams import PARAMETERS, purpose, stream_key
 from unprocess_gen.planning import noise_profile, parameters
 from unprocess_gen.planning import plan as planning
 from unprocess_gen.planning.draws import DRAW_COUNT, Draw
 from unprocess_gen.planning.parameters import draw_parameter as draw
 from unprocess_gen.planning.plan import TwoNumberLevel, plan_camera, plan_image, plan_pairs
 from unprocess_gen.simulation.facts import Facts
-from unprocess_gen.simulation.kernels.draws import parameter_uniforms
+from unprocess_gen.simulation.kernels.draws import draws
 from unprocess_gen.simulation.plan import NUMBERS, Plan
 from unprocess_gen.simulation.reference import colour
 
@@ -35,7 +35,7 @@ SHA = hashlib.sha256(b"a photograph").hexdigest()
 FIRST, LAST = 2.0**-53, 1 - 2.0**-53
 """Smallest and largest uniform of a stream."""
 
-UNIFORMS = [FIRST, 1e-9, 0.25, 0.5, LAST, *parameter_uniforms(12345, 200)]
+UNIFORMS = [FIRST, 1e-9, 0.25, 0.5, LAST, *draws(12345, 200, purpose(PARAMETERS))[1].tolist()]
 uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) / 2**52)
 
 
@@ -190,7 +190,7 @@ def test_counters_of_draws_never_change() -> None:
 
 def test_each_parameter_uses_the_uniform_of_its_name(settings: Settings) -> None:
     plan = plan_of(settings, "noise=brooks2019")
-    u = parameter_uniforms(plan.stream_key, DRAW_COUNT)
+    u = draws(plan.stream_key, DRAW_COUNT, purpose(PARAMETERS))[1].tolist()
     assert plan.camera.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u[Draw.RED])
     assert plan.camera.blue_gain == draw(Distribution("uniform", (1.5, 1.9)), u[Draw.BLUE])
     assert plan.camera.inverse_rgb_gain == draw(GAIN, u[Draw.INVERSE_RGB])

@@ -15,6 +15,7 @@ from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
+from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.plan import noisy_frames
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.headers import probe
@@ -32,7 +33,11 @@ OTHER_BYTES = 8000
 def source_bytes(config: Config, height: int, width: int) -> int:
     """Bytes of the pairs of a source with these sides after ``source.downscale``: arrays, and 8 kB a pair."""
     output, pairs = config.output, noisy_frames(config)
-    patches = list_patches(patch_rule(config.source), 0, height, width, output.layout)
+    rule = patch_rule(config.source)
+    if rule is not None and rule.kind == "random":  # places change no size
+        patches: Sequence[Patch] = [Patch(rule.side, rule.side)] * rule.count
+    else:
+        patches = list_patches(rule, 0, height, width, output.layout)
     clean, noisy = (np.dtype(name).itemsize for name in (output.clean_dtype or output.dtype, output.dtype))
     site = clean + pairs * noisy + len(output.targets) * 3 * np.dtype(np.float32).itemsize
     sites = sum(patch.height * patch.width for patch in patches)

@@ -18,10 +18,10 @@ from unprocess_gen.config.limits import EXPOSURE_S, ISO, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile
-from unprocess_gen.core.random_streams import body_key
+from unprocess_gen.core.random_streams import SCATTER, body_key, purpose
 from unprocess_gen.planning.draws import Draw
 from unprocess_gen.planning.parameters import draw_parameter
-from unprocess_gen.simulation.kernels.draws import scatter_uniforms
+from unprocess_gen.simulation.kernels.draws import draws
 from unprocess_gen.simulation.numbers import DN, RATE, SHAPE, SITES, Number
 from unprocess_gen.simulation.plan import NUMBERS, Physics
 from unprocess_gen.simulation.reference import cfa
@@ -187,9 +187,10 @@ def _share(iso: float, low: float, high: float) -> Decimal:
 
 
 @functools.lru_cache(maxsize=256)
-def _scatter_of_body(body: int) -> list[float]:
+def _scatter_of_body(body: int) -> Any:
     """Return the uniforms at which the numbers of a body are drawn, by `Number.counter`."""
-    return scatter_uniforms(body, max(declared.counter for declared in NUMBERS.values()) + 1)
+    _, uniforms = draws(body, max(declared.counter for declared in NUMBERS.values()) + 1, purpose(SCATTER))
+    return uniforms.tolist()
 
 
 @functools.lru_cache(maxsize=256)

@@ -18,16 +18,16 @@ from unprocess_gen.config import interpretation
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.arrays import FLOAT32
-from unprocess_gen.core.random_streams import split_uniform, stream_key
+from unprocess_gen.core.random_streams import DARK_FRAME, PARAMETERS, frame_word, purpose, split_uniform, stream_key
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
-from unprocess_gen.planning.effect_selection import NOT_ROUNDED, BodySelection, EffectRules, Prediction, Selection
+from unprocess_gen.planning.effect_selection import NOT_ROUNDED, BodySelection, EffectRules, Selection
 from unprocess_gen.planning.frame_model import AtLevel, SignalRange, raw_signal_range, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.parameters import draw_parameter
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
 from unprocess_gen.simulation.facts import DarkFrames, Facts
-from unprocess_gen.simulation.kernels.draws import dark_frame_words, mixed_rgb2cam, parameter_uniforms
+from unprocess_gen.simulation.kernels.draws import draws, mixed_rgb2cam
 from unprocess_gen.simulation.plan import (
     CameraPlan,
     DarkFramePlan,
@@ -74,10 +74,9 @@ def plan_pairs(
     The first dark frame is chosen at random for each image, and the frames of a clip, the levels and the draws take the
     next ones in turn. All use the same part of the frames, so that the fixed pattern of the camera does not move.
     """
-    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
     plans = [
         plan.replace(place=Place(frame, plan.place.level, draw)) if draw or frame else plan
-        for plan, _ in levels
+        for plan, _ in plan_levels(config, source_sha256, occurrence, facts, dark_frames)
         for draw in range(config.noise.draws)
     ]
     if dark_frames is not None and facts is not None:
@@ -103,7 +102,8 @@ def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
 
 def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int) -> Plan:
     """Choose the dark frame of one pair."""
-    chosen, row, column, _ = dark_frame_words(plan.stream_key)
+    words, _ = draws(plan.stream_key, 1, purpose(DARK_FRAME))
+    chosen, row, column, _ = words[0].tolist()
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
@@ -116,20 +116,18 @@ def _even_place(word: int, available: int, needed: int) -> int:
     return 2 * (word * places >> 32)
 
 
-PlanAndPredictions = tuple[Plan, tuple[Prediction, ...]]
-"""A plan, and a prediction for every effect of a physical profile; no predictions for a profile with two numbers."""
-
-
 def plan_levels(
     config: Config,
     source_sha256: str,
     occurrence: int = 0,
     facts: Facts | None = None,
     dark_frames: DarkFrames | None = None,
-) -> tuple[PlanAndPredictions, ...]:
-    """Draw the parameters of one image at every noise level, with the predictions behind the selected effects."""
-    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
-    return tuple((plan, () if selection is None else selection.predictions()) for plan, selection in levels)
+) -> Iterator[tuple[Plan, Selection | None]]:
+    """Yield the plan of one image at each noise level, and the selection of effects of a physical profile."""
+    planner, key = _planner(config), stream_key(config.seed, source_sha256, occurrence)
+    split = planner.draw_split(config.seed, source_sha256)
+    image = planner.image(config.seed, key, split, facts, dark_frames)
+    return (planner.plan(image, Place(level=number)) for number in range(len(planner.levels)))
 
 
 def _planner(config: Config) -> Planner:
@@ -163,7 +161,7 @@ class Planner:
         self._exposure_ratio = EXPOSURE_RATIO.parse("scene.exposure_ratio", config.scene.exposure_ratio)
         self._is_physical = interpretation.is_physical(config.noise)
         kind, levels = PhysicalLevel if self._is_physical else TwoNumberLevel, interpretation.noise_levels(config.noise)
-        self._levels = [kind(replace(config, noise=noise)) for noise in levels]
+        self.levels = [kind(replace(config, noise=noise)) for noise in levels]
         self._accuracy, self._scene_name = config.accuracy, config.scene.name
         self._source = SourcePlan(config.source.downscale, config.source.dequantize)
         isp, gains, sensor = config.isp, config.gains, config.sensor
@@ -175,19 +173,6 @@ class Planner:
         clean_dtype = FLOAT32 if interpretation.has_float_clean(config) else ""
         self._output = OutputPlan(config.output.dtype, config.output.layout, clean_dtype)
 
-    def levels(
-        self,
-        seed: int,
-        source_sha256: str,
-        occurrence: int = 0,
-        facts: Facts | None = None,
-        dark_frames: DarkFrames | None = None,
-    ) -> Iterator[tuple[Plan, Selection | None]]:
-        """Yield the plan of one image at each noise level, and the selection of effects of a physical profile."""
-        key, split = stream_key(seed, source_sha256, occurrence), self._draw_split(seed, source_sha256)
-        image = self.image(seed, key, split, facts, dark_frames)
-        return (self.plan(image, Place(level=number)) for number in range(len(self._levels)))
-
     def image(
         self, seed: int, key: int, split: str, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int = 0
     ) -> Image:
@@ -196,17 +181,25 @@ class Planner:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
-        uniforms = parameter_uniforms(key, DRAW_COUNT, 0, epoch)
+        uniforms = draws(key, DRAW_COUNT, purpose(PARAMETERS), frame_word(0, epoch))[1].tolist()
         scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
-        raw, span_dn = None if facts is None else facts.raw, float(self._sensor.span_dn)
-        source, isp = self._source, self._isp
+        raw, light = None if facts is None else facts.raw, (scene.exposure, float(self._sensor.span_dn))
         if raw is None:
-            camera = self.draw_camera(uniforms)
+            name, weights, rgb2cam = plan_camera(self._camera, uniforms)
+            red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
+            lamp, cct_k = "", 0.0
+            if self._lights:
+                lamp, cct_k, (red, blue) = draw_light(self._lights, xyz2cam(self._camera, weights), uniforms)
+            camera = CameraPlan(
+                camera=name, weights=weights, rgb2cam=rgb2cam, light=lamp, cct_k=cct_k, red_gain=red, blue_gain=blue,
+                inverse_rgb_gain=draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB]),
+            )  # fmt: skip
+            camera = without_filters(camera) if self._sensor.pattern == MONO else camera
+            source, isp = self._source, self._isp
         else:
-            source, camera, isp = own_noise(raw, scene.exposure, span_dn), raw.camera, raw.isp
+            source, isp, camera = own_noise(raw, *light), raw.isp, raw.camera
         signals = None
         if self._is_physical and facts is not None:
-            light = scene.exposure, span_dn
             signals = raw_signal_range(facts, source, *light) if raw else signal_range(facts, isp, camera, *light)
         return Image(seed, key, split, epoch, uniforms, scene, source, camera, isp, facts, signals, dark_frames)
 
@@ -214,35 +207,22 @@ class Planner:
         """Draw the noise of an image at the level of a place."""
         uniforms = image.uniforms
         if place.level:
-            own = parameter_uniforms(image.stream_key, DRAW_COUNT, place.level, image.epoch)
+            words = purpose(PARAMETERS, place.level), frame_word(0, image.epoch)
+            own = draws(image.stream_key, DRAW_COUNT, *words)[1].tolist()
             uniforms = [own[n] if n in NOISE_COUNTERS else shared for n, shared in enumerate(uniforms)]
-        noise, physics, selection = self._levels[place.level].draw(image, uniforms)
+        noise, physics, selection = self.levels[place.level].draw(image, uniforms)
         return Plan(
             seed=image.seed, stream_key=image.stream_key, split=image.split, place=place, camera=image.camera,
             isp=image.isp, source=image.source, sensor=self._sensor, scene=image.scene, noise=noise,
             accuracy=self._accuracy, physics=physics, dark=dark, output=self._output,
         ), selection  # fmt: skip
 
-    def _draw_split(self, seed: int, source_sha256: str) -> str:
+    def draw_split(self, seed: int, source_sha256: str) -> str:
         """Name the split of an image, empty without splits; the last one takes what the others leave."""
         if not self._splits:
             return ""
         names, ends = list(self._splits), list(itertools.accumulate(self._splits.values()))
         return names[bisect.bisect_right(ends[:-1], split_uniform(seed, source_sha256))]
-
-    def draw_camera(self, uniforms: Sequence[float]) -> CameraPlan:
-        """Draw colours and gains."""
-        name, weights, rgb2cam = plan_camera(self._camera, uniforms)
-        red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
-        light, cct_k = "", 0.0
-        if self._lights:
-            light, cct_k, (red, blue) = draw_light(self._lights, xyz2cam(self._camera, weights), uniforms)
-        inverse_rgb = draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB])
-        camera = CameraPlan(
-            camera=name, weights=weights, rgb2cam=rgb2cam, light=light, cct_k=cct_k, red_gain=red, blue_gain=blue,
-            inverse_rgb_gain=inverse_rgb,
-        )  # fmt: skip
-        return without_filters(camera) if self._sensor.pattern == MONO else camera
 
 
 def without_filters(camera: CameraPlan) -> CameraPlan:

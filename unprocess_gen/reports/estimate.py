@@ -22,7 +22,8 @@ from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import source_bytes
-from unprocess_gen.planning.plan import PlanAndPredictions, plan_levels
+from unprocess_gen.planning.effect_selection import Prediction
+from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan
@@ -32,6 +33,9 @@ LOGGER = logging.getLogger("unprocess_gen")
 
 SAMPLE = 8
 """Number of sources of which pairs are made, unless all are asked for."""
+
+PlanAndPredictions = tuple[Plan, tuple[Prediction, ...]]
+"""A plan, and a prediction for every effect of a physical profile; no predictions for a profile with two numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +146,9 @@ def predicted_levels(
 ) -> tuple[PlanAndPredictions, ...]:
     """The plan of an image at each noise level, with what decided its effects."""
     assert image.config is not None
-    return plan_levels(image.config, *source.stream_identity(sha256), image.facts, settings.dark_frames)
+    identity = source.stream_identity(sha256)
+    levels = plan_levels(image.config, *identity, image.facts, settings.dark_frames)
+    return tuple((plan, () if selection is None else selection.predictions()) for plan, selection in levels)
 
 
 def _compile_kernels(plans: Sequence[Plan]) -> None:

@@ -13,8 +13,7 @@ from unprocess_gen.config.values import value_range
 from unprocess_gen.core.fields import value_text
 from unprocess_gen.planning.advice import body_sentence, dark_scene_warning, sensor_warning
 from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
-from unprocess_gen.planning.plan import PlanAndPredictions
-from unprocess_gen.reports.estimate import RunEstimate, SourceEstimate
+from unprocess_gen.reports.estimate import PlanAndPredictions, RunEstimate, SourceEstimate
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.facts import DarkFrames

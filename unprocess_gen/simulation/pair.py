@@ -10,17 +10,20 @@ clip and round both frames.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, Float, Frame, Normalised, Srgb
+from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Counts, Pair
-from unprocess_gen.simulation.kernels.render import CODES, Renderer, pass_key, render_clean, render_pairs
+from unprocess_gen.simulation.kernels.render import CODES, Renderer, render_clean, renderer_of
 from unprocess_gen.simulation.plan import EXACT, REFERENCE, Plan
+from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
 from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
@@ -75,21 +78,40 @@ def make_pairs(
     return _pairs(srgb, plans, origin, dark_pixels)
 
 
+FRAMES_PER_PASS = 5
+"""Noisy frames simulated in one pass over the image: 10 bytes per pixel, and 5 for the image and the clean frame."""
+
+
 def _pairs(
     srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int], dark_pixels: DarkPixels | None
 ) -> Iterator[Pair]:
-    """Yield the pair of each plan, several from each pass over the image."""
+    """Yield the pair of each plan, several from each pass over the image, with one kind of noise and one sensor unit.
+
+    Each pass recomputes the clean frame, which costs less than storing it unrounded.
+    """
     if not plans:
         return
     srgb = dequantise(srgb, plans[0], origin)
+    if plans[0].accuracy == REFERENCE:
+        yield from (reference_pair(srgb, plan, origin, dark_pixels) for plan in plans)
+        return
     clean: Frame | None = None
-    for group in _passes(plans):
-        if plans[0].accuracy == REFERENCE:
-            yield from (reference_pair(srgb, plan, origin, dark_pixels) for plan in group)
-            continue
-        for pair in render_pairs(srgb, group, origin, dark_pixels):
-            clean = pair.clean if clean is None else clean
-            yield pair if clean is pair.clean else replace(pair, clean=clean)
+    for _, group in itertools.groupby(plans, lambda plan: (plan.counts_electrons, slots_of(plan).patterns)):
+        while alike := tuple(itertools.islice(group, FRAMES_PER_PASS)):
+            renderer = renderer_of(srgb, alike, origin)
+            own, noisy, numbers = renderer.render(srgb, origin, renderer.keys, dark_pixels)
+            clean = own if clean is None else clean
+            yield from map(functools.partial(Pair, clean), noisy, _counts_of(numbers, plans[0]))
+
+
+def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
+    """Counts of frames that share the clean frame."""
+    clean_low, clean_high, _, _, saturated, _, light_high = numbers[0].tolist()
+    light = None if plan.scene.exposure == 1 else light_high
+    return [
+        Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, light)
+        for _, _, noisy_low, noisy_high, _, zero_variance, _ in numbers.tolist()
+    ]
 
 
 CropMaker = Callable[[Srgb, tuple[int, int], int], tuple[Frame, Frame, Callable[[], Counts]]]
@@ -119,7 +141,15 @@ def crop_maker(
         return make
     is_dithered = plan.source.dequantize != "off" and codes == CODES[0]
     renderer = Renderer((plan,), shape, (corner[0] % 2, corner[1] % 2), CODES[1] if is_dithered else codes)
-    return lambda srgb, origin, epoch: renderer.crop(dequantise(srgb, plan, origin), origin, epoch, frame)
+
+    def make_crop(srgb: Srgb, origin: tuple[int, int], epoch: int) -> tuple[Frame, Frame, Callable[[], Counts]]:
+        keys = renderer.keys.copy()
+        keys[0, 3] = frame_word(plan.place.frame, epoch)
+        srgb = dequantise(srgb, plan, origin)
+        clean, noisy, numbers = renderer.render(srgb, origin, keys, epoch=epoch, frame=frame)
+        return clean, noisy[0], lambda: _counts_of(numbers, plan)[0]  # counted in 5 µs, if at all
+
+    return make_crop
 
 
 def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:
@@ -143,20 +173,6 @@ def linear_rgb(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Norm
             light[wrong] = np.nextafter(light[wrong], towards)
         channels.append(light)
     return np.stack(channels, axis=-1)
-
-
-FRAMES_PER_PASS = 5
-"""Noisy frames simulated in one pass over the image: 10 bytes per pixel, and 5 for the image and the clean frame."""
-
-
-def _passes(plans: Sequence[Plan]) -> Iterator[list[Plan]]:
-    """Divide plans into consecutive passes, each with one kind of noise and one body.
-
-    Each pass recomputes the clean frame, which costs less than storing it unrounded.
-    """
-    for _, group in itertools.groupby(plans, pass_key):
-        alike = list(group)
-        yield from (alike[n : n + FRAMES_PER_PASS] for n in range(0, len(alike), FRAMES_PER_PASS))
 
 
 def reference_pair(

@@ -15,8 +15,9 @@ from collections.abc import Iterable, Sequence
 
 from unprocess_gen.config.interpretation import PatchRule
 from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb
+from unprocess_gen.core.random_streams import PATCH, frame_word, purpose
 from unprocess_gen.simulation.frames import Patch
-from unprocess_gen.simulation.kernels.draws import patch_words
+from unprocess_gen.simulation.kernels.draws import draws
 
 
 def list_patches(
@@ -31,8 +32,8 @@ def list_patches(
         rows, columns = (range(0, length - rule.side + 1, rule.stride) for length in (height, width))
         corners = itertools.product(rows, columns)
     else:
-        words = patch_words(stream_key, rule.count, epoch)
-        corners = (even_corner(place, rule.side, height, width) for place in words)
+        words, _ = draws(stream_key, rule.count, purpose(PATCH), frame_word(0, epoch))
+        corners = (even_corner(place, rule.side, height, width) for place in words.tolist())
     return tuple(Patch(rule.side, rule.side, number, y, x) for number, (y, x) in enumerate(corners))
 
 

@@ -8,35 +8,22 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.core.random_streams import STREAMS, frame_word, philox4x32, purpose
-from unprocess_gen.simulation.kernels.draws import (
-    dark_frame_words,
-    mixed_rgb2cam,
-    parameter_uniforms,
-    patch_words,
-    scatter_uniforms,
-)
+from unprocess_gen.core.random_streams import DARK_FRAME, PARAMETERS, PATCH, SCATTER, frame_word, philox4x32, purpose
+from unprocess_gen.simulation.kernels.draws import draws, mixed_rgb2cam
 from unprocess_gen.simulation.reference import colour
 
 keys, epochs = st.integers(0, 2**64 - 1), st.integers(0, 2**14 - 1)
 CAMERAS = tuple(colour.CAMERAS.values())
 
 
-def words_of_counter(key: int, number: int, word_2: int, word_3: int = 0) -> list[int]:
-    """Compute the output of the counter (0, number, word_2, word_3) with the reference."""
-    counter = tuple(np.array([word], dtype=np.uint64) for word in (0, number, word_2, word_3))
-    return [int(word[0]) for word in philox4x32(counter, key)]
-
-
 @given(keys, st.integers(0, 50), st.integers(0, 4095), epochs)
 def test_draw_n_is_the_output_of_counter_n(key: int, number: int, level: int, epoch: int) -> None:
-    high, low, _, _ = words_of_counter(key, number, purpose(0, level), frame_word(0, epoch))
-    assert parameter_uniforms(key, number + 1, level, epoch)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
-    high, low, _, _ = words_of_counter(key, number, STREAMS["scatter"] << 24)
-    assert scatter_uniforms(key, number + 1)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
-    patch = words_of_counter(key, number, STREAMS["patch"] << 24, frame_word(0, epoch))
-    assert patch_words(key, number + 1, epoch)[number] == patch
-    assert dark_frame_words(key) == words_of_counter(key, 0, STREAMS["dark_frame"] << 24)
+    for stream in (PARAMETERS, PATCH, SCATTER, DARK_FRAME):
+        counter = 0, number, purpose(stream, level), frame_word(0, epoch)
+        expected = [int(word[0]) for word in philox4x32(tuple(np.array([word], np.uint64) for word in counter), key)]
+        words, uniforms = draws(key, number + 1, *counter[2:])
+        assert words[number].tolist() == expected
+        assert uniforms[number] == ((expected[0] << 20 | expected[1] >> 12) + 0.5) / 2**52
 
 
 @given(st.lists(st.floats(1e-16, 1), min_size=4, max_size=4))

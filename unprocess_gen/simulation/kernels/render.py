@@ -9,16 +9,13 @@ except `clean.Unprocessing32` with `gaussian.Gaussian32`, which state their erro
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import PACKED, Frame, Srgb
-from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.simulation.facts import DarkPixels
-from unprocess_gen.simulation.frames import Counts, Pair
 from unprocess_gen.simulation.kernels.clean import (
     KEPT_FORMS,
     Unprocessing,
@@ -43,7 +40,7 @@ from unprocess_gen.simulation.kernels.readout import (
     write_clean,
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
-from unprocess_gen.simulation.kernels.site_patterns import EQUAL_RESPONSE, light_factor, patterns_at
+from unprocess_gen.simulation.kernels.site_patterns import patterns_at
 from unprocess_gen.simulation.kernels.strips import COUNT_FIELDS, STRIP, Scratch, buffers_in, locate, scratch_of_thread
 from unprocess_gen.simulation.plan import FAST, Plan
 from unprocess_gen.simulation.plan_slots import slots_of
@@ -53,27 +50,10 @@ CODES = 256, 65536
 """Numbers of codes of images of 8 bits and of 16 bits."""
 
 
-def render_pairs(
-    srgb: Srgb,
-    plans: Sequence[Plan],
-    origin: tuple[int, int] = (0, 0),
-    dark_pixels: DarkPixels | None = None,
-) -> list[Pair]:
-    """Simulate pairs that share the clean frame, in one pass; arguments as for `pair.make_pairs`."""
-    renderer = _renderer_of(srgb, tuple(plans), origin)
-    inverse, noise = renderer.records(origin, dark_pixels)
-    clean, noisy, numbers = renderer.fill(srgb, inverse, noise, renderer.keys, origin)
-    counts = _counts_of(numbers, plans[0])
-    return [Pair(clean, frame, counted) for frame, counted in zip(noisy, counts, strict=True)]
-
-
 def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
-    """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
-    renderer = _renderer_of(srgb, (plan.replace(dark=None),), origin)
-    return renderer.fill(srgb, *renderer.records(origin), renderer.keys[:0], origin)[0]
-
-
-Noise = Gaussian | Gaussian32 | Electrons
+    """Simulate the clean frame only; parameters as for `pair.make_pair`."""
+    renderer = renderer_of(srgb, (plan.replace(dark=None),), origin)
+    return renderer.render(srgb, origin, renderer.keys[:0])[0]
 
 
 class Renderer:
@@ -101,78 +81,49 @@ class Renderer:
         self._readout = readout_of(plans, shape if packed else (0, 0), corner, in_float32)
         self.keys = philox_keys(plans)
 
-    def records(
+    def render(
         self,
+        srgb: Srgb,
         origin: tuple[int, int],
+        keys: NDArray[np.uint64],
         dark_pixels: DarkPixels | None = None,
         epoch: int = 0,
         frame: Shape | None = None,
-    ) -> tuple[Unprocessing, Noise]:
-        """Numbers of the unprocessing and the noise at a place, whose classes select the compiled code."""
-        first, inverse, frames = self._plans[0], self._inverse, self._slots
-        if self._noise is not None:
-            return inverse, self._noise
-        if epoch and any(slots.depends_on_epoch for slots in frames):
-            frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in self._plans)
-        patterns = patterns_at(frames[0].patterns, self._shape, origin, frame)
-        factor = light_factor(frames[0].patterns, patterns, self._shape, origin, first.averaged)
-        if factor is not None:
-            inverse = with_response(inverse, factor)
-        if first.averaged:  # the clean frame contains the factor on the electrons, so the noise does not
-            patterns = patterns._replace(response=EQUAL_RESPONSE)
-        reach = frame[1] if frame and frames is self._slots else 0  # of live crops: the columns of all are drawn once
-        return inverse, electron_noise(self._plans, frames, patterns, dark_pixels, self._shape, origin, reach)
-
-    def fill(
-        self, srgb: Srgb, inverse: Unprocessing, noise: Noise, keys: NDArray[np.uint64], origin: tuple[int, int]
     ) -> tuple[Frame, Frame, NDArray[np.int64]]:
         """Clean frame, a noisy frame for each key, and their numbers of `Counts`.
 
-        Only the numbers of the first noisy frame include the counts of the clean frame.
+        Only the numbers of the first noisy frame include the counts of the clean frame. ``frame`` has the height and
+        width from which live crops are cut.
         """
+        inverse, frames = self._inverse, self._slots
+        noise: Gaussian | Gaussian32 | Electrons | None = self._noise
+        if noise is None:
+            if epoch and any(slots.depends_on_epoch for slots in frames):
+                frames = tuple(slots_of(plan.replace(epoch=epoch)) for plan in self._plans)
+            patterns, factor = patterns_at(frames[0].patterns, self._shape, origin, frame, self._plans[0].averaged)
+            if factor is not None:
+                inverse = with_response(inverse, factor)
+            reach = frame[1] if frame and frames is self._slots else 0  # the columns of all live crops are drawn once
+            noise = electron_noise(self._plans, frames, patterns, dark_pixels, self._shape, origin, reach)
         clean = np.empty(self._frame_shape, self._dtypes[0])
         noisy = np.empty((len(keys), *self._frame_shape), self._dtypes[1])
         counts = np.zeros((max(len(keys), 1), COUNT_FIELDS), np.int64)
         # a view, a read-only array or a subclass would be another type, compiled again
         codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
         scratch = scratch_of_thread(np.float32 if type(inverse) is Unprocessing32 else np.float64)
-        frames = clean.reshape(-1), noisy.reshape(len(keys), clean.size)
-        _render(codes, inverse, noise, keys, origin, self._readout, scratch, *frames, counts)
+        sites = clean.reshape(-1), noisy.reshape(len(keys), clean.size)
+        _render(codes, inverse, noise, keys, origin, self._readout, scratch, *sites, counts)
         return clean, noisy, counts
-
-    def crop(
-        self, srgb: Srgb, origin: tuple[int, int], epoch: int, frame: Shape
-    ) -> tuple[Frame, Frame, Callable[[], Counts]]:
-        """Clean and noisy frame of a crop of a ``frame`` in an epoch, and a function that counts sites, in 5 µs."""
-        plan, keys = self._plans[0], self.keys.copy()
-        keys[0, 3] = frame_word(plan.place.frame, epoch)
-        inverse, noise = self.records(origin, epoch=epoch, frame=frame)
-        clean, noisy, numbers = self.fill(srgb, inverse, noise, keys, origin)
-        return clean, noisy[0], lambda: _counts_of(numbers, plan)[0]
 
 
 _renderers = [functools.lru_cache(maxsize=count)(Renderer) for count in KEPT_FORMS]
 """Renderers of images of 8 bits and of 16 bits, wherever they are: kept for each size, because records are hashed."""
 
 
-def _renderer_of(srgb: Srgb, plans: tuple[Plan, ...], origin: tuple[int, int]) -> Renderer:
+def renderer_of(srgb: Srgb, plans: tuple[Plan, ...], origin: tuple[int, int]) -> Renderer:
+    """Renderer of plans that share the clean frame, for images of this size; their noise has one kind and unit."""
     is_wide = srgb.itemsize > 1
     return _renderers[is_wide](plans, srgb.shape[:2], (origin[0] % 2, origin[1] % 2), CODES[is_wide])
-
-
-def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
-    """Return the counts of frames that share the clean frame."""
-    clean_low, clean_high, _, _, saturated, _, light_high = numbers[0].tolist()
-    light = None if plan.scene.exposure == 1 else light_high
-    return [
-        Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, light)
-        for _, _, noisy_low, noisy_high, _, zero_variance, _ in numbers.tolist()
-    ]
-
-
-def pass_key(plan: Plan) -> tuple[object, ...]:
-    """Key that the plans of one pass have in common: the kernels, and the fixed patterns of the sensor unit."""
-    return plan.counts_electrons, slots_of(plan).patterns
 
 
 def uses_float32(plan: Plan) -> bool:

@@ -54,24 +54,36 @@ EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS = equal_sites(1.0), equal_sites(0.0), equ
 WITHOUT_PATTERNS = SitePatterns(EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS, np.zeros(1))
 
 
-def patterns_at(slots: Patterns, shape: Shape, origin: Shape, frame: Shape | None = None) -> SitePatterns:
-    """Fixed patterns of a sensor unit for a crop of ``shape`` at ``origin``, without the factor on the light.
+def patterns_at(
+    slots: Patterns, shape: Shape, origin: Shape, frame: Shape | None = None, is_averaged: bool = False
+) -> tuple[SitePatterns, SiteMap | None]:
+    """Fixed patterns of a sensor unit for a crop of ``shape`` at ``origin``, and the factor on the light, if any.
 
-    ``frame`` are the height and width of the complete frame from which live crops are cut.
+    ``frame`` are the height and width of the complete frame from which live crops are cut. With ``is_averaged``, the
+    clean frame contains the fixed patterns: the factor on the electrons is one on the light, and the noise has none.
     """
-    kept = _live_patterns if frame else _kept
-    response_of, defects_of = functools.partial(kept, _normal_pattern), functools.partial(kept, _defect_map)
-    if frame and not slots.light:
-        response_of = functools.partial(_cut_response, frame)
-    if frame:
-        defects_of = functools.partial(_cut_defects, frame)
+    stored = _caches[shape[0] * shape[1] > SMALL_SITES]
+    kept = _live_patterns if frame else stored
+    cut_response = functools.partial(_cut_response, frame) if frame and not slots.light else None
+    response_of = cut_response or functools.partial(kept, _normal_pattern)
+    defects_of = functools.partial(_cut_defects, frame) if frame else functools.partial(kept, _defect_map)
     defects = slots.bright, slots.dead
-    return SitePatterns(
-        response_of(slots.electrons, shape, origin) if slots.electrons else EQUAL_RESPONSE,
+    response = response_of(slots.electrons, shape, origin) if slots.electrons else EQUAL_RESPONSE
+    light = stored(_radial_factor, slots.light, shape, origin) if slots.light else None
+    if is_averaged:
+        if light is None:
+            light = response
+        elif slots.electrons:
+            values = light.values * response.values.astype(np.float64)
+            light = light._replace(values=values.astype(np.float32))
+        response = EQUAL_RESPONSE
+    patterns = SitePatterns(
+        response,
         kept(_normal_pattern, slots.sites_dn, shape, origin) if slots.sites_dn else NO_OFFSETS,
         defects_of(defects, shape, origin) if any(defects) else NO_DEFECTS,
         _means_e(slots.bright.mean_e if slots.bright else 0.0),
     )
+    return patterns, light
 
 
 @functools.lru_cache(maxsize=8)
@@ -79,27 +91,7 @@ def _means_e(mean_e: float) -> Float:
     return np.concatenate([[0.0, -1.0], mean_e * exponential_levels()])
 
 
-def light_factor(
-    slots: Patterns, patterns: SitePatterns, shape: Shape, origin: Shape, is_averaged: bool
-) -> SiteMap | None:
-    """Return the factor on the light of the clean frame, as `reference.electrons.light_factor`; None without one.
-
-    ``is_averaged``: the clean frame contains the fixed patterns.
-    """
-    if slots.light is None:
-        return patterns.response if is_averaged else None
-    light: SiteMap = _kept(_radial_factor, slots.light, shape, origin)
-    if not is_averaged or not slots.electrons:
-        return light
-    return light._replace(values=(light.values * patterns.response.values.astype(np.float64)).astype(np.float32))
-
-
 # A crop's pattern is computed once for all frames and patches at its place.
-
-
-def _kept(compute: Any, slot: Any, shape: Shape, origin: Shape) -> Any:
-    """Return a pattern of a crop from the cache for crops of its size."""
-    return _caches[shape[0] * shape[1] > SMALL_SITES](compute, slot, shape, origin)
 
 
 def _compute(compute: Any, slot: Any, shape: Shape, origin: Shape) -> Any:
