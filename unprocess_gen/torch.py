@@ -306,7 +306,7 @@ def _solve_gray_mean(y: Tensor, k: Tensor, threshold: Tensor) -> Tensor:
 
 
 def _gray_gains(gray: Tensor, k: Tensor, threshold: Tensor) -> Tensor:
-    """Inverse gains for a channel mean, as `isp._gray_gains`."""
+    """Inverse gains for a channel mean, as `unprocess.gray_gains`."""
     m = (gray - threshold).clamp(min=0) / (1 - threshold)
     return k + m * m * (1 - k).clamp(min=0)
 

@@ -129,7 +129,7 @@ class RawPairs:
 
     A DataLoader receives rows with NaN instead of None. Its default ``collate_fn`` stacks frames of one size.
 
-    A pair of an object store takes three requests, and more for the first pair of each shard. Such an instance cannot
+    A pair of an object store takes four requests, and more for the first pair of each shard. Such an instance cannot
     be used in a forked process: give a DataLoader ``multiprocessing_context="spawn"`` or ``"forkserver"``.
 
     Parameters

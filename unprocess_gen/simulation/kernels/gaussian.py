@@ -1,6 +1,6 @@
 """Sample noise that is one normal deviate per site, with a variance linear in the signal.
 
-`Gaussian` decides every DN as `reference.noise.heteroscedastic` does. Noise is computed in float32, eight sites at a
+`Gaussian` decides every DN as `reference.electrons.noisy` does. Noise is computed in float32, eight sites at a
 time, with an error bound; the read-out asks for the exact value of sites whose bound reaches a rounding boundary, about
 1 % at a standard deviation of 100 DN. `Gaussian32`, of the tier ``fast``, has polynomials in place of
 look-ups and asks for none; its DN count from the black level.
