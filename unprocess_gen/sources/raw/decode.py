@@ -29,6 +29,8 @@ from unprocess_gen.sources.raw.tags import TO_ARRAY, RawMetadata, tags_of
 
 ABOVE_WHITE, MOST_ABOVE = 0.01, 0.001
 """Distance above white, relative to the range, at which sites are damaged if a larger part of them is there."""
+ZERO_RUN = 32
+"""Zeros in a row that are damage where black is above 0; noise does not clip that many."""
 FAR_BELOW_WHITE = 0.25
 """Part of the range below which the brightest site raises doubts about the white level."""
 OTHERS = {
@@ -89,11 +91,12 @@ def _white_notes(
     black, brightest = min(facts.black_dn or (0.0,)), int(pixels.max())
     share = np.count_nonzero(pixels > white + ABOVE_WHITE * (white - black)) / pixels.size
     is_known = tag_dn is not None or white == given_dn
-    if is_known and (share > MOST_ABOVE or brightest >> int(white).bit_length()):
+    if is_known and (share > MOST_ABOVE or brightest >> max(int(white).bit_length(), facts.sample_bits)):
         problem = f"has sites of up to {brightest} DN, {share:.2%} of them far above the white level {white:g}"
         raise SourceError("corrupt", f"{problem}; restore it, or state the white level of an intact file")
-    if black > 0 and not pixels.any(axis=1).all():
-        raise SourceError("corrupt", "has rows of zeros only, far below its black level; restore it")
+    run = min(ZERO_RUN, pixels.shape[1])
+    if black >= 1 and not pixels[:, : pixels.shape[1] // run * run].reshape(-1, run).any(axis=1).all():
+        raise SourceError("corrupt", f"has {run} zeros in a row, far below its black level; restore it")
     if share > MOST_ABOVE:
         yield f"has {share:.2%} of its sites above the white level of LibRaw, {white:g} DN"
     if given_dn is None and brightest - black < FAR_BELOW_WHITE * (white - black):
@@ -101,7 +104,7 @@ def _white_notes(
 
 
 def read_metadata(path: Path, key: str, with_libraw: bool = True) -> RawMetadata:
-    """Read the facts of a raw file: those of TIFF, EXIF and DNG tags, and what LibRaw knows; ``key`` begins messages.
+    """Read the facts of a raw file; without LibRaw those of its tags, unchecked. ``key`` begins messages.
 
     Raises ConfigError or MachineError.
     """
@@ -110,11 +113,9 @@ def read_metadata(path: Path, key: str, with_libraw: bool = True) -> RawMetadata
     with machine_errors(path):
         content = path.read_bytes()
     try:
-        tags = tags_of(content, check=False)
         if not with_libraw:
-            return tags
-        with opened_by_libraw(content, path.suffix) as raw:
-            return tags.completed(_decoder_facts(raw))
+            return tags_of(content, check=False)
+        return decode_raw(content, path.suffix, white_dn=65535.0).metadata  # captures.csv may state another white level
     except SourceError as error:
         raise ConfigError(f"{key}: {path} {error.text}") from error
 
@@ -133,7 +134,7 @@ def opened_by_libraw(content: bytes, suffix: str) -> Iterator[Any]:
                 text = messages.decode(errors="replace").removeprefix("unknown file: ").splitlines()[0]
                 raise SourceError("corrupt", f"is damaged (LibRaw reports: {text})")
             if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
-                raise SourceError("unsupported", "contains no mosaic (LibRaw); expected red, green and blue sites")
+                raise SourceError("unsupported", f"has no mosaic, or LibRaw decodes another image of it; {TO_ARRAY}")
             if raw.raw_pattern.shape != (2, 2) or raw.num_colors != 3:
                 kind = "an X-Trans mosaic" if len(raw.raw_pattern) == 6 else f"a mosaic of {raw.num_colors} colours"
                 raise SourceError("unsupported", f"has {kind}; expected a Bayer mosaic")
@@ -146,6 +147,8 @@ def _refusal(content: bytes, suffix: str, error: Exception) -> SourceError:
     """The reason why LibRaw does not open a file."""
     import rawpy
 
+    if not content:
+        return SourceError("empty", "has 0 bytes")
     text = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
     problem, is_cr3 = f"cannot be decoded by LibRaw ({text})", content[4:11] == b"ftypcrx"
     kind = next((kind for word, kind in OTHERS.items() if word in content[:8] and not is_cr3), "")

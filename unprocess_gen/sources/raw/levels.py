@@ -56,12 +56,12 @@ def with_one_black(pixels: NDArray[np.uint16], black_dn: NDArray[np.float64], wh
     return pixels - np.where(pixels < white_dn, np.minimum(above[np.ix_(y, x)], pixels), np.uint16(0))
 
 
-def white_level(tags: Tags) -> float:
+def white_level(tags: Tags, largest_dn: float) -> float:
     """White level: the tag's, else the largest value. SourceError if colours have different ones."""
     whites = set(tags.get(WHITE_LEVEL, ()))
     if len(whites) > 1:
         raise SourceError("unsupported", f"has the white levels {sorted(whites)}; expected one; convert it to NPY")
-    return whites.pop() if whites else max(tags.get(LINEARIZATION_TABLE, (2 ** tags[258][0] - 1,)))
+    return whites.pop() if whites else largest_dn
 
 
 def unapplied_opcodes(tags: Tags) -> str:

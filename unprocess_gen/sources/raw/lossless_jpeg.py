@@ -20,8 +20,8 @@ HUFFMAN_TABLES, FRAME, SCAN, RESTART_INTERVAL = 0xC4, 0xC3, 0xDA, 0xDD
 """Markers of segments. Other codecs have other frames; no DNG is known with restart intervals."""
 
 
-def sample_count(data: bytes) -> int | None:
-    """Samples of complete data; 0 if they do not end properly, None for other JPEG data."""
+def line_samples(data: bytes) -> tuple[int, int, int] | None:
+    """Lines, samples of a line and components; zeros if the data do not end properly, None for other JPEG data."""
     at, tables, size = 2, dict[int, NDArray[np.uint8]](), (0, 0, 0)
     try:
         while True:
@@ -39,8 +39,8 @@ def sample_count(data: bytes) -> int | None:
         sites = size[0] * size[1]
         is_whole = len(components) == size[2] and _ends(np.frombuffer(data, np.uint8), at, sites, components)
     except (struct.error, IndexError, KeyError, ValueError):
-        return 0
-    return sites * size[2] if is_whole else 0
+        return 0, 0, 0
+    return (size[0], size[1] * size[2], size[2]) if is_whole else (0, 0, 0)
 
 
 @functools.lru_cache(maxsize=8)

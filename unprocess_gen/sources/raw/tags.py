@@ -28,16 +28,20 @@ CFA, LINEAR, MONOCHROME = 32803, 34892, 1
 DNG_VERSION, ACTIVE_AREA, CFA_PLANE_COLOR, COLOR_MATRIX_1 = 50706, 50829, 50710, 50721
 OF_FILE = (33434, 34855, 34867, COLOR_MATRIX_1, 50722, 50723, 50724, 50727, 50728, 50729, 50778, 50779, 51041, 52531)
 """Tags of the first image that are about the file: exposure, ISO, colours and noise. Levels are of the mosaic's own."""
-LAYOUTS = {50711: "CFALayout", 50974: "SubTileBlockSize", 50975: "RowInterleaveFactor", 52547: "ColumnInterleaveFactor"}
+LAYOUTS = {
+    266: "FillOrder", 50711: "CFALayout", 50974: "SubTileBlockSize",
+    50975: "RowInterleaveFactor", 52547: "ColumnInterleaveFactor",
+}  # fmt: skip
 """Tags that move sites; at other values than 1 LibRaw puts sites at wrong places."""
-SIGNED = (2, 3)
-"""Values of SampleFormat: signed integers and floats."""
+SIGNED = {2: "signed integers", 3: "floating-point pixels"}
+"""Values of SampleFormat that are refused."""
 RATIONALS = (5, 10)
 """Types of fractions (TIFF 6.0, section 2)."""
 UNCOMPRESSED, LOSSLESS_JPEG, LOSSY_JPEG = 1, 7, 34892
 """Values of Compression of the DNG files that LibRaw decodes; lossy JPEG removes the finest noise."""
 CODECS = {5: "LZW", 8: "deflate", 32773: "PackBits", 32946: "deflate", 52546: "JPEG XL"}
 TO_ARRAY = "convert it to NPY or TIFF, and give source.raw.pattern, black_dn and white_dn"
+UNDECODED = f"which LibRaw does not decode; {TO_ARRAY}"
 UNREADABLE = (ValueError, KeyError, IndexError, TypeError, ZeroDivisionError, struct.error)
 """Errors of values that a tag cannot have."""
 
@@ -48,10 +52,11 @@ class RawMetadata:
 
     ``pattern`` and ``black_dn`` (row by row) are of the top-left 2x2 sites of the visible part, ``area`` (ActiveArea of
     DNG) is its first row and column and the ends of its rows and columns, ``size`` the height and width of all sites of
-    a DNG. ``black_by_site`` are black levels that do not repeat within 2x2 sites; ``black_dn`` is then the lowest.
-    ``noise_profile`` (NoiseProfile of DNG) is S and O of each plane: variance S·x + O with x = 0 at black and 1 at
-    white. ``colour`` are colour tags of a DNG, ``xyz2cam`` the matrix in LibRaw's table, ``gains`` those of red and
-    blue as LibRaw reads them. ``notes`` are sentences about the file without a subject.
+    a DNG, ``sample_bits`` the bits that hold its values, 0 for 16, of which cameras use fewer. ``black_by_site`` are
+    black levels that do not repeat within 2x2 sites; ``black_dn`` is then the lowest. ``noise_profile`` (NoiseProfile
+    of DNG) is S and O of each plane: variance S·x + O with x = 0 at black and 1 at white. ``colour`` are colour tags of
+    a DNG, ``xyz2cam`` the matrix in LibRaw's table, ``gains`` those of red and blue as LibRaw reads them. ``notes`` are
+    sentences about the file without a subject.
     """
 
     pattern: str | None = None
@@ -66,6 +71,7 @@ class RawMetadata:
     xyz2cam: Matrix | None = None
     gains: tuple[float, float] | None = None
     size: tuple[int, int] | None = None
+    sample_bits: int = 0
     area: tuple[int, int, int, int] | None = None
     notes: tuple[str, ...] = ()
 
@@ -115,7 +121,7 @@ def _mosaic_page(pages: Sequence[Any]) -> Any:
 
 def _check_layout(page: Any, content: bytes, is_dng: bool) -> None:
     """Raise SourceError unless a page is a complete mosaic of integers, in a layout that LibRaw decodes."""
-    from unprocess_gen.sources.raw.lossless_jpeg import sample_count  # imports Numba
+    from unprocess_gen.sources.raw.lossless_jpeg import line_samples  # imports Numba
 
     pieces = list(zip(page.dataoffsets, page.databytecounts, strict=True))
     end = max(map(sum, pieces), default=0)
@@ -129,30 +135,38 @@ def _check_layout(page: Any, content: bytes, is_dng: bool) -> None:
     height, width, places = page.imagelength, page.imagewidth, iter(pieces)
     rows, columns = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, width)
     for y, x in itertools.product(range(0, height, rows), range(0, width, columns)):
-        (start, size), expected = next(places, (0, 0)), min(rows, height - y) * min(columns, width - x)
-        sites = sample_count(content[start : start + size]) if is_compressed else 8 * size // page.bitspersample
-        if sites is not None and sites < expected:
-            problem = "damaged lossless JPEG data" if is_compressed else f"only {sites} of {expected} sites"
-            raise SourceError("corrupt", f"has {problem} in the part at row {y}, column {x}")
+        (start, size), expected = next(places, (0, 0)), min(rows, height - y) * columns
+        sites, problem = 8 * size // page.bitspersample, f"has too few sites for {expected}"
+        if is_compressed:
+            lines, line, components = line_samples(content[start : start + size]) or (rows, columns, 1)
+            sites, problem = lines * line, "has damaged lossless JPEG data"
+            is_cut = line % columns != 0 and sites != rows * columns
+            if is_cut or (components > 1 and components * line == width):  # LibRaw takes these for two lines
+                text = f"lines of {line} samples with {components} components in tiles of {columns} columns"
+                raise SourceError("unsupported", f"has {text}, {UNDECODED}")
+        if sites < expected:
+            raise SourceError("corrupt", f"{problem} in the part at row {y}, column {x}")
 
 
 def _refusals(page: Any, pieces: Sequence[tuple[int, int]], photometric: int, is_dng: bool) -> Iterator[str]:
     """Yield each fact about the layout of a page that is not supported, and what to do instead."""
-    if photometric == LINEAR or (photometric == CFA and page.sampleformat in SIGNED):
-        kind = "is a linear DNG, whose pixels are demosaicked" if photometric == LINEAR else "has floating-point pixels"
-        yield f"{kind}; expected a mosaic of integers"
+    if photometric == LINEAR:
+        yield "is a linear DNG, whose pixels are demosaicked; expected a mosaic of integers"
+    if photometric == CFA and page.sampleformat in SIGNED:
+        yield f"has {SIGNED[page.sampleformat]}; {TO_ARRAY}"
     if not is_dng:
         return
     if photometric == MONOCHROME:
         yield "is monochrome; expected a mosaic of integers"
     problems = [f"{page.bitspersample} bits a site"] if page.bitspersample > 16 else []
+    problems += ["tiles wider than the mosaic"] if page.is_tiled and page.tilewidth > page.imagewidth else []
     if page.compression not in (UNCOMPRESSED, LOSSLESS_JPEG, LOSSY_JPEG):
         problems.append(f"the codec {CODECS.get(int(page.compression), int(page.compression))}")
     problems += (name for code, name in LAYOUTS.items() if set(np.ravel(page.tags.valueof(code, 1))) != {1})
     is_apart = any(start + size != after for (start, size), (after, _) in itertools.pairwise(pieces))
     if not page.is_tiled and (is_apart or (len(pieces) > 1 and page.compression == LOSSLESS_JPEG)):
         problems.append("several strips that are compressed, or apart")
-    yield from (f"has {problem}, which LibRaw does not decode; {TO_ARRAY}" for problem in problems)
+    yield from (f"has {problem}, {UNDECODED}" for problem in problems)
 
 
 def _tag_facts(tags: levels.Tags, exif: Mapping[str, Any], model: str) -> RawMetadata:
@@ -183,7 +197,8 @@ def _dng_facts(tags: levels.Tags, height: int, width: int) -> dict[str, Any]:
         top, left, bottom, right = area = tuple(map(int, tags.get(ACTIVE_AREA, (0, 0, height, width))))
         if not (0 <= top < bottom <= height and 0 <= left < right <= width):
             raise ValueError(f"ActiveArea {area} is not inside of {width} x {height} sites")
-        black, white = levels.black_levels(tags, bottom - top, right - left), levels.white_level(tags)
+        largest_dn = max(tags.get(levels.LINEARIZATION_TABLE, (2 ** tags[258][0] - 1,)))
+        black, white = levels.black_levels(tags, bottom - top, right - left), levels.white_level(tags, largest_dn)
         cell, by_site = None if black is None else tuple(black.ravel().tolist()), None
         if black is not None and black.size > 4:
             cell, by_site = (float(black.min()),) * 4, black
@@ -200,6 +215,7 @@ def _dng_facts(tags: levels.Tags, height: int, width: int) -> dict[str, Any]:
             # CFAPattern and BlackLevel begin at the corner of ActiveArea
             "pattern": "".join("RGB"[int(code)] for code in filters) if has_bayer else None,
             "size": (height, width),
+            "sample_bits": int(largest_dn).bit_length() % 16,
             "area": area,
             "black_dn": cell,
             "black_by_site": by_site,
