@@ -37,19 +37,10 @@ def read_raw_source(config: SourceConfig, content: bytes, name: str) -> Photogra
     Raises SourceError if they are damaged or no mosaic, and ConfigError if a library is missing.
     """
     suffix = PurePosixPath(name).suffix.lower()
-    if not content:
-        raise SourceError("empty", f"{name} has 0 bytes")
     if suffix in RAW_FILES:
         frame = decode_raw(content, suffix, config.max_pixels, config.raw.white_dn)
     else:
         frame = _mosaic(config, content, suffix)
-    try:
-        return _photograph(config, frame)
-    except SourceError as error:
-        raise SourceError(error.reason, f"{name} {error.text}") from error
-
-
-def _photograph(config: SourceConfig, frame: RawFrame) -> Photograph:
     facts, (sensor, black, white) = frame.metadata, file_sensor(frame, config.raw)
     digest, stated = array_xxh3(frame.pixels), (facts.iso or 0.0, facts.exposure_s or 0.0)
     source = SourcePlan(1, "off", config.shrink, sensor.pattern, black, white, digest, *stated)
@@ -87,7 +78,7 @@ def file_sensor(frame: RawFrame, raw: RawConfig) -> tuple[SensorPlan, Levels, Le
     facts = frame.metadata
     pattern, expected = facts.pattern or "", PATTERNS if raw.pattern is None else (raw.pattern,)
     if pattern not in expected:
-        text = f"has the CFA pattern {pattern or 'of no tile'}; expected {', '.join(expected)}"
+        text = f"has {pattern or 'no'} CFA pattern of 2 x 2 sites; expected {', '.join(expected)}"
         raise SourceError("unsupported", text)
     by_site = facts.black_dn if raw.black_dn is None else (raw.black_dn,) * 4
     level = facts.white_dn if raw.white_dn is None else raw.white_dn
