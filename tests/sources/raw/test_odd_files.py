@@ -227,6 +227,12 @@ def test_colours_follow_the_order_of_planes(colours: str) -> None:
     assert (found.camera.red_gain, found.camera.blue_gain) == pytest.approx((2.0, 1 / 0.7))
 
 
+def test_file_without_exposure_is_read() -> None:
+    end = len(tagged(34665, 4, 0))
+    exif = struct.pack("<HHHII4x2I", 1, 33434, 5, 1, end + 18, 0, 0)
+    assert light_error(read(tagged(34665, 4, end) + exif)) < 0.003
+
+
 NOISE = {
     "2": ((1e-4, 1e-6), True), "6": ((1e-4, 1e-6) * 3, True), "8": ((1e-4, 1e-6) * 4, True), "none": ((), False),
     "4": ((1e-4, 1e-6) * 2, False), "negative": ((1e-4, -1e-6), False), "one negative": ((-1e-4, 1e-6) * 3, False),

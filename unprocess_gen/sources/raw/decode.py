@@ -95,7 +95,8 @@ def _white_notes(
         problem = f"has sites of up to {brightest} DN, {share:.2%} of them far above the white level {white:g}"
         raise SourceError("corrupt", f"{problem}; restore it, or state the white level of an intact file")
     run = min(ZERO_RUN, pixels.shape[1])
-    if black >= 1 and not pixels[:, : pixels.shape[1] // run * run].reshape(-1, run).any(axis=1).all():
+    is_full = pixels[:, ::run].all() or pixels[:, : pixels.shape[1] // run * run].reshape(-1, run).any(axis=1).all()
+    if black >= 1 and not is_full:
         raise SourceError("corrupt", f"has {run} zeros in a row, far below its black level; restore it")
     if share > MOST_ABOVE:
         yield f"has {share:.2%} of its sites above the white level of LibRaw, {white:g} DN"

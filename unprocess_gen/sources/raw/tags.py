@@ -176,7 +176,7 @@ def _tag_facts(tags: levels.Tags, exif: Mapping[str, Any], model: str) -> RawMet
     isos = [max(iso) if isinstance(iso, tuple) else iso for iso in stated]
     seconds, black = exif.get("ExposureTime", tags.get(33434)), tags.get(levels.BLACK_LEVEL, ())
     if isinstance(seconds, tuple):
-        seconds = seconds[0] / seconds[1] if len(seconds) == 2 else seconds[0]
+        seconds = seconds[0] / (seconds[1] or float("inf")) if len(seconds) == 2 else seconds[0]  # 0/0 is not known
     return RawMetadata(
         black_dn=(black * 4)[:4] if len(set(black)) == 1 else black if len(black) == 4 else None,
         # the largest of 16 bits means that another tag has the ISO
