@@ -31,7 +31,7 @@ from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.keys import key_text
-from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.dataset.reader import mosaic_dn, row_of_batch
 from unprocess_gen.dataset.row import pair_row, plan_from_row
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline import generate as _generate
@@ -365,7 +365,7 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
     """
     if not isinstance(row, (Mapping, Plan)):
         raise TypeError(f"row is {type(row).__name__}; expected a manifest row or a plan: develop(raw, row)")
-    plan = row if isinstance(row, Plan) else plan_from_row(row)
+    plan = row if isinstance(row, Plan) else plan_from_row(row_of_batch(row))
     recorded: Row = {
         "pattern": plan.sensor.pattern,
         "layout": plan.output.layout,

@@ -9,6 +9,7 @@ from helpers.captures import Numbers, Shot, draw, with_levels
 
 from unprocess_gen.calibration.calibrate import calibrate
 from unprocess_gen.calibration.captures import EMVA_ISO, read_captures
+from unprocess_gen.core.errors import ConfigError, MachineError
 
 LEVELS = (0.03, 0.06, 0.09, 0.12)
 
@@ -28,6 +29,30 @@ def test_list_of_a_spreadsheet_is_read(delimiter: str, tmp_path: Path) -> None:
         text.replace(f"{delimiter}0.01{delimiter}", f"{delimiter}0{comma}01{delimiter}")
     )
     assert read_captures(folder) == known
+
+
+def test_header_may_have_capitals_and_spaces(tmp_path: Path) -> None:
+    folder = captures(tmp_path)
+    known = read_captures(folder)
+    first, rest = (folder / "captures.csv").read_text(encoding="utf-8").split("\n", 1)
+    (folder / "captures.csv").write_text(f"{first.title()}\n{rest}".replace(",", ", ").replace("\n", "\r"))
+    assert read_captures(folder) == known
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"), [('"d.npy,dark,100', "unexpected end of data"), ("d.npy,dark,0,5", "has more than 3 cells")]
+)
+def test_a_line_that_is_no_row_is_refused_in_one_line(line: str, problem: str, tmp_path: Path) -> None:
+    (tmp_path / "captures.csv").write_text(f"file,kind,iso\n{line}\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=problem) as refused:
+        read_captures(tmp_path)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_link_to_nothing_is_not_left_out_in_silence(tmp_path: Path) -> None:
+    (tmp_path / "dark.npy").symlink_to("nowhere")
+    with pytest.raises((ConfigError, MachineError), match=r"dark\.npy"):
+        read_captures(tmp_path)
 
 
 def test_each_series_of_an_emva_description_is_its_own(tmp_path: Path) -> None:

@@ -245,6 +245,13 @@ def test_config_yaml_round_trip_keeps_the_text(settings: Settings, tmp_path: Pat
         assert dataset_yaml(again) == text, file
 
 
+def test_keys_that_format_1_gained_may_be_missing(settings: Settings, tmp_path: Path) -> None:
+    text = dataset_yaml(settings())
+    (tmp_path / "config.yaml").write_text(older := text.replace("  exclude: []\n", ""), encoding="utf-8")
+    assert older != text and differences(text, older) == []
+    assert dataset_yaml(read_dataset_yaml(tmp_path / "config.yaml")[0]) == text
+
+
 def test_config_yaml_contains_source_kind_but_no_path(settings: Settings, tmp_path: Path) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings(f"source.root={tmp_path}")))
     assert loaded["source"]["kind"] == "folder"

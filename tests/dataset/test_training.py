@@ -71,6 +71,7 @@ def test_batches_have_one_type_in_each_column(dataset: Path) -> None:
     for name in batch[0].row:
         kinds = {type(item.row[name]) for item in batch}
         assert len(kinds) == 1 and kinds <= {int, float, str, bool}, name
+    np.testing.assert_array_equal(ug.develop(batch[0].noisy, batch[0].row), ug.develop(*pairs[1][1:]))
     assert [*map(len, ug.RawPairs(dataset, arrays_only=True).__getitems__([0]))] == [2]
 
 

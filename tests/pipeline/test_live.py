@@ -80,7 +80,7 @@ def test_all_redraws_parameters_and_patches_and_keeps_the_body(night: Path) -> N
     assert [row.get("epoch") for row in rows] == [None, 1, 2]
 
 
-def test_second_epoch_without_numbers_warns_once(night: Path) -> None:
+def test_second_epoch_without_numbers_warns_once(night: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     live, repeated = ug.LivePairs(night), ug.LivePairs(night, redraw="none")
     for number in range(len(live)):
         live[0, number], live[number], repeated[number]
@@ -89,6 +89,8 @@ def test_second_epoch_without_numbers_warns_once(night: Path) -> None:
         live[0]
     live[1]
     assert len(warned) == 1
+    pickle.loads(pickle.dumps(live))[0]
+    monkeypatch.setattr(multiprocessing, "parent_process", multiprocessing.current_process)
     with pytest.warns(UserWarning, match="sampler=EpochSampler"):  # a worker process knows nothing of other epochs
         pickle.loads(pickle.dumps(live))[0]
 

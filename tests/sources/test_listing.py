@@ -49,6 +49,7 @@ def test_order_is_by_the_bytes_of_the_relative_path(tmp_path: Path) -> None:
 
 
 HIDDEN = ("._a.jpg", "sub/._b.jpg", ".x.jpg", ".thumbnails/a.jpg", "sub/@eaDir/a.jpg/t.jpg", "__MACOSX/sub/._a.jpg")
+SYSTEM = ("$Recycle.Bin/a.jpg", "lost+found/a.jpg", "#snapshot/a.jpg", ".\x1b[2J\n.jpg", "@eaDir/a.jpg", "@tmp/a.jpg")
 
 
 def test_hidden_files_and_folders_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -60,6 +61,12 @@ def test_hidden_files_and_folders_are_left_out_and_counted(tmp_path: Path) -> No
     assert set(warning.removeprefix("source.root: hidden files and folders are left out: ").split(", ")) == counts
     assert paths(listed(tmp_path / ".thumbnails")) == ["a.jpg"]  # a root is named
     assert paths(listed(tmp_path / "._a.jpg")) == ["._a.jpg"]
+
+
+def test_folders_of_systems_are_left_out_and_counted_in_one_line(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", *SYSTEM)
+    (warning,) = listed(tmp_path).warnings
+    assert paths(listed(tmp_path)) == ["a.jpg"] and warning.isprintable() and warning.endswith("1 others")
     fill(tmp_path / "only", ".a.jpg")
     with pytest.raises(
         ConfigError, match=r"no file matches .* hidden files and folders are left out: 1 \.a\.jpg; choose"

@@ -58,8 +58,8 @@ def test_lists_name_files_below_root(places: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("delimiter", [";", "\t"])
 def test_spreadsheets_may_write_other_delimiters(places: Path, tmp_path: Path, delimiter: str) -> None:
-    table = tmp_path / "table.csv"
-    table.write_text('"id";file;note\n1;"=a,ö.png";0,5\n'.replace(";", delimiter), encoding="utf-8-sig")
+    table = tmp_path / ("table.tsv" if delimiter == "\t" else "table.csv")
+    table.write_text('"id"; File;note\n1;"=a,ö.png";0,5\n'.replace(";", delimiter), encoding="utf-8-sig")
     assert listed(f"source.root={places}", f"source.list={table}") == ["%3Da,ö.png"]
     table.write_text("sub/001.png;0,5\nsub/002.png;1\n".replace(",", ""), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"line 1: has a semicolon"):

@@ -45,6 +45,9 @@ def data_keys(group: Any) -> tuple[str, ...]:
 TYPE_NAMES = {"array": "list", "object": "mapping", "Number out of range": "float"}
 """Names of types in messages, by those of msgspec."""
 
+ADDED: dict[str, Any] = {"source.exclude": []}
+"""Keys that format 1 had not from its start, with the value that is meant where one is missing."""
+
 SOURCE_KINDS = ("folder", "synthetic", "raw")
 
 
@@ -114,7 +117,7 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
         wanted = problem.removeprefix("Expected `").partition("`")[0].partition(" | ")[0]
         raise refusal(place, value, f"expected a value of type {TYPE_NAMES.get(wanted, wanted)}") from None
     given, known = flat(loaded).keys(), flat(recorded(config)).keys()
-    for problem, keys in (("missing", known - given), ("unknown", given - known)):
+    for problem, keys in (("missing", known - given - ADDED.keys()), ("unknown", given - known)):
         if keys:
             raise ConfigError(f"{problem} key {', '.join(sorted(keys))[:200]}")
     return config, str(kind)
@@ -153,7 +156,7 @@ def read_option(group: str, name: str | Path) -> Any:
 
 def differences(config_yaml: str, other_yaml: str) -> list[str]:
     """List the differences between two ``config.yaml`` texts, ``key=value (there: value)``, sorted by key."""
-    here, there = flat(parse_yaml_mapping(config_yaml)), flat(parse_yaml_mapping(other_yaml))
+    here, there = (ADDED | flat(parse_yaml_mapping(text)) for text in (config_yaml, other_yaml))
     return [
         "{}={} (there: {})".format(key, *_shortened(value_text(here.get(key)), value_text(there.get(key))))
         for key in sorted(here.keys() | there.keys())

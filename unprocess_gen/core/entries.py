@@ -15,15 +15,18 @@ Result = TypeVar("Result")
 KINDS_SHOWN = 5
 """Names of hidden files that `hidden_sentence` counts."""
 
-SYSTEM_NAMES = {"@eaDir", "@Recycle", "#recycle", "$RECYCLE.BIN", "System Volume Information", "__MACOSX"}
-"""Names of folders in which systems keep thumbnails, companions of files, and deleted files."""
+SYSTEM_NAMES = {
+    *("@eadir", "@recycle", "@tmp", "#recycle", "#snapshot", "$recycle.bin", "system volume information"),
+    *("lost+found", "__macosx"),
+}
+"""Names, in small letters, of folders in which systems keep thumbnails, companions of files, and old versions."""
 
 
 def hidden_part(path: str) -> str:
     """Path of the first hidden file or folder in a path, such as ``.thumbnails`` or ``@eaDir``; empty without any."""
     parts = path.split("/")
     for number, name in enumerate(parts, start=1):
-        if name.startswith(".") or name in SYSTEM_NAMES:
+        if name.startswith(".") or name.lower() in SYSTEM_NAMES:
             return "/".join(parts[:number])
     return ""
 
@@ -67,9 +70,16 @@ class Entry(NamedTuple):
 def hidden_sentence(paths: Iterable[str]) -> str:
     """Sentence that counts hidden files and folders by name; empty without any."""
     names = (path.rpartition("/")[2] for path in paths)
-    kinds = Counter("._*" if name.startswith("._") else name for name in names).most_common()
-    shown = [f"{count} {name}" for name, count in kinds[:KINDS_SHOWN]] + ["…"] * (len(kinds) > KINDS_SHOWN)
+    kinds = Counter("._*" if name.startswith("._") else _printable(name) for name in names).most_common()
+    shown = [f"{count} {name}" for name, count in kinds[:KINDS_SHOWN]]
+    if others := sum(count for _, count in kinds[KINDS_SHOWN:]):
+        shown.append(f"{others} others")
     return f"hidden files and folders are left out: {', '.join(shown)}" if kinds else ""
+
+
+def _printable(name: str) -> str:
+    """Name without characters that a terminal would obey."""
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in name)
 
 
 def started_ahead(

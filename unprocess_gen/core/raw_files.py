@@ -18,9 +18,10 @@ SUFFIXES = (".npy", *PICTURE_SUFFIXES, *RAW_FILES)
 def list_raw_files(folder: Path, suffixes: Collection[str], recursive: bool = True) -> tuple[list[Path], str]:
     """Files with these suffixes in a folder, in order, and a sentence on hidden ones, which are left out.
 
-    Raises OSError for a folder that cannot be read.
+    Links to nothing are listed, so that whoever opens them names them. Raises OSError for a folder that cannot be read.
     """
     entries = list(LocalPath(folder).walk_entries(recursive, enters_hidden=False))
-    files = [Path(folder, entry.path) for entry in entries if entry.kind is EntryKind.FILE]
+    kinds = EntryKind.FILE, EntryKind.BROKEN_LINK, EntryKind.UNREADABLE
+    files = [Path(folder, entry.path) for entry in entries if entry.kind in kinds]
     hidden = hidden_sentence(entry.path for entry in entries if entry.kind is EntryKind.HIDDEN)
     return sorted(path for path in files if path.suffix.lower() in suffixes), hidden

@@ -95,17 +95,25 @@ class _FramesAndTargets(NamedTuple):
     targets: Mapping[str, NDArray[Any]]
 
 
+_TEXTS = {column.name for column in COLUMNS if column.type is number_or_text}
+
+
 def stackable(sample: Sample, **cells: Value) -> tuple[Any, ...]:
     """Frames, row and targets, if there are any, so that PyTorch's default ``collate_fn`` stacks them.
 
     Columns have one type in every pair: NaN instead of None, text where some pairs have text. ``cells`` are those of
     columns that some rows lack.
     """
-    texts = {column.name for column in COLUMNS if column.type is number_or_text}
     row = cells | {name: math.nan if value is None else value for name, value in sample.row.items()}
-    row = {name: str(value) if name in texts else value for name, value in row.items()}
+    row = {name: str(value) if name in _TEXTS else value for name, value in row.items()}
     frames = sample.clean, sample.noisy, row
     return _FramesAndTargets(*frames, sample.targets) if sample.targets else _Frames(*frames)
+
+
+def row_of_batch(row: Row) -> Row:
+    """Row as it was before `stackable`; others are the same."""
+    cells = {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
+    return cells | {name: number_or_text(str(cells[name])) for name in _TEXTS & cells.keys() if cells[name] is not None}
 
 
 def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:

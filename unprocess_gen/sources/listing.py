@@ -33,7 +33,7 @@ from unprocess_gen.core.object_store import StoreAccessError
 from unprocess_gen.core.paths import absolute_text, any_path
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.source import Source
-from unprocess_gen.core.tables import delimiter_of
+from unprocess_gen.core.tables import column_names, delimiter_of
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.names import encode_name
 from unprocess_gen.sources.reading import opened, read_bytes
@@ -177,14 +177,15 @@ def _listed_paths(file: str) -> Iterator[tuple[int, str]]:
     try:
         with any_path(file).open("rb") as stream:
             lines = stream.read().decode("utf-8-sig", "surrogateescape").split("\n")
-        if not file.lower().endswith(".csv"):
+        if not file.lower().endswith((".csv", ".tsv")):
             yield from ((number, line.rstrip("\r")) for number, line in enumerate(lines, start=1) if line.strip())
             return
         delimiter = delimiter_of(lines[0], "file")
-        if delimiter is None and ";" in lines[0] and "," not in lines[0]:
-            raise ConfigError(f"source.list={file}: line 1: has a semicolon and no comma; expected a header with file")
-        table = csv.reader(lines, strict=True, delimiter=delimiter or ",")
-        header = next(table, [])
+        if delimiter is None and (";" in lines[0] or "\t" in lines[0]) and "," not in lines[0]:
+            problem = "has a semicolon or a tab and no comma; expected a header with file"
+            raise ConfigError(f"source.list={file}: line 1: {problem}")
+        table = csv.reader(lines, strict=True, delimiter=delimiter or ",", skipinitialspace=True)
+        header = column_names(next(table, []))
         column = header.index("file") if "file" in header else 0
         yield from ((table.line_num, row[column]) for row in table if row)
     except IndexError:
