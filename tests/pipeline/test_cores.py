@@ -16,6 +16,7 @@ GROUPS = {
     "larger than the affinity": ("0::/", {"cpu.max": "9900000 100000"}, 8),
     "first version": ("2:cpu,cpuacct:/d", {"cpu/d/cpu.cfs_quota_us": "250000", "cpu/d/cpu.cfs_period_us": "100000"}, 3),
     "first version, path outside": ("1:cpu:/docker/x", {"cpu/cpu.cfs_quota_us": "9", "cpu/cpu.cfs_period_us": "9"}, 1),
+    "first version, no link": ("4:cpu,x:/d", {"cpu,x/cpu.cfs_quota_us": "20", "cpu,x/cpu.cfs_period_us": "10"}, 2),
     "first version, none": ("1:cpu:/", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 8),
     "of another controller": ("1:cpuset:/", {"cpu.max": "100000 100000"}, 8),
     "unreadable": ("nothing", {"cpu.max": "100000 100000"}, 8),

@@ -30,9 +30,9 @@ def _quotas(root: Path) -> Iterator[float]:
     for controllers, path in (line.split(":", 2)[1:] for line in lines if line.count(":") >= 2):
         if controllers and "cpu" not in controllers.split(","):
             continue
-        top = root / "sys/fs/cgroup" / ("" if not controllers else "cpu")
+        tops = [root / "sys/fs/cgroup" / name for name in (("cpu", controllers) if controllers else ("",))]
         group = Path(path.lstrip("/"))
-        for folder in (top / group, *(top / parent for parent in group.parents)):
+        for folder in (top / part for top in tops for part in (group, *group.parents)):
             with suppress(OSError, ValueError, ZeroDivisionError):  # "max" is no number
                 if controllers:
                     names = "cpu.cfs_quota_us", "cpu.cfs_period_us"
