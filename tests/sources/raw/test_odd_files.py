@@ -100,6 +100,7 @@ KINDS: dict[str, dict[str, tuple[Callable[[], bytes], str]]] = {
         "zeros": (lambda: damaged(0.5, 1, lambda part: bytes(len(part)), **FLAT), "corrupt"),
         "zeros in a tile": (lambda: damaged(0.3, 0.6, lambda part: bytes(len(part))), "corrupt"),
         "flipped": (lambda: damaged(0.3, 0.7, lambda part: bytes(byte ^ 0x5A for byte in part)), "corrupt"),
+        "half as wide": (lambda: damaged(0.99, 1, lambda part: part[:-2], **TWO | {"side": 48}), "corrupt"),
         "end marker": (lambda: damaged(0.99, 1, lambda part: part[:-2]), "corrupt"),
         "cut tile": (lambda: damaged(0.8, 1, lambda part: b""), "corrupt"),
         "hole": (lambda: damaged(0.5, 0.6, lambda part: b""), "corrupt"),

@@ -132,7 +132,7 @@ def _check_layout(page: Any, content: bytes, is_dng: bool) -> None:
         raise SourceError("unsupported", refusal)
     if not is_dng or photometric != CFA or page.compression == LOSSY_JPEG:
         return
-    height, width, places = page.imagelength, page.imagewidth, iter(pieces)
+    height, width, places, layout = page.imagelength, page.imagewidth, iter(pieces), ""
     rows, columns = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, width)
     for y, x in itertools.product(range(0, height, rows), range(0, width, columns)):
         (start, size), expected = next(places, (0, 0)), min(rows, height - y) * columns
@@ -142,10 +142,12 @@ def _check_layout(page: Any, content: bytes, is_dng: bool) -> None:
             sites, problem = lines * line, "has damaged lossless JPEG data"
             is_cut = line % columns != 0 and sites != rows * columns
             if is_cut or (components > 1 and components * line == width):  # LibRaw takes these for two lines
-                text = f"lines of {line} samples with {components} components in tiles of {columns} columns"
-                raise SourceError("unsupported", f"has {text}, {UNDECODED}")
+                layout = f"lines of {line} samples with {components} components in tiles of {columns} columns"
+                continue
         if sites < expected:
             raise SourceError("corrupt", f"{problem} in the part at row {y}, column {x}")
+    if layout:
+        raise SourceError("unsupported", f"has {layout}, {UNDECODED}")
 
 
 def _refusals(page: Any, pieces: Sequence[tuple[int, int]], photometric: int, is_dng: bool) -> Iterator[str]:
