@@ -111,10 +111,16 @@ def address(photos: Path) -> Iterator[str]:
         assert process.wait(30) == 143
 
 
-def answer_to(address: str, origin: str) -> int:
-    """Status with which the server answers a page of an origin that opens the socket."""
+def answer_to(address: str, origin: str, host: str = "localhost") -> int:
+    """Status with which the server answers a page of an origin that opens the socket of a host."""
     place = urlsplit(address)
-    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13", "Origin": origin}
+    headers = {
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec-WebSocket-Version": "13",
+        "Origin": origin,
+        "Host": host,
+    }
     connection = http.client.HTTPConnection(place.netloc, timeout=30)
     connection.request("GET", "/ws", headers=headers | {"Sec-WebSocket-Key": "MDEyMzQ1Njc4OWFiY2RlZg=="})
     status = connection.getresponse().status
@@ -127,6 +133,7 @@ def test_page_of_a_tunnel_works_and_other_names_do_not(address: str) -> None:
         assert answer_to(address, f"http://{name}:9000") == 101
     for name in ("evil.example:9000", "localhost.evil.example", "192.168.0.1:9000"):
         assert answer_to(address, f"http://{name}") == 403
+        assert answer_to(address, f"http://{name}", host=name) == 403  # a name that was made to lead to this machine
 
 
 def model(browser: Any, name: str, code: str) -> Any:

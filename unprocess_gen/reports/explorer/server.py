@@ -19,6 +19,7 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
     The server has a thread of its own, because an event loop drops exceptions that a signal raises in its callbacks.
     """
     from bokeh.server.server import Server
+    from tornado.web import ErrorHandler
 
     from unprocess_gen.reports.explorer.page import Page
 
@@ -32,6 +33,8 @@ def serve(choices: Choices, port: int, shows: bool, started: Callable[[str], Non
     server = Server({"/": lambda document: Page(choices, document).fill()}, port=port, address=HOST)
     # any port, for tunnels, but no other name that leads to this machine; the argument of Server takes no such pattern
     server._tornado.websocket_origins.update(f"{name}:*" for name in (HOST, "localhost"))
+    # Tornado asks for no origin that equals the host of the request, which may be any name that leads to this machine
+    server._tornado.add_handlers(r"(?!(?:127\.0\.0\.1|localhost)$).*", [(".*", ErrorHandler, {"status_code": 403})])
     server.start()
     thread = threading.Thread(target=server.io_loop.start, daemon=True)
     thread.start()
