@@ -9,5 +9,5 @@ from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.self_test import GOLDEN_PLANS, failures, golden_image, kernels
 
 for plan in GOLDEN_PLANS.values():
-    assert failures(kernels(plan)) == ()
+    assert not any(map(failures, kernels([plan])))
     make_pair(golden_image().astype(np.uint16), plan)
