@@ -120,6 +120,15 @@ def test_edited_file_of_a_dataset_is_reported_in_one_line(name: str, folder: Pat
     assert not list(filter(None, problems))
 
 
+def test_more_shards_than_sources_end_a_merge_at_once(folder: Path, run_main: RunMain) -> None:
+    assert run_main("part", "0/2", *SETTINGS).code == 0
+    record = folder / "ds" / RUN
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"shards": 2**62}))
+    done = run_main("merge", "ds")
+    assert (done.code, done.err.count("\n")) == (5, 1)
+    assert "more than .work/listing.jsonl has sources); delete ds/.work and run again" in done.err
+
+
 EDITS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     RUN: (
         lambda content: json.dumps(json.loads(content) | {"parts": 1e308}).encode(),

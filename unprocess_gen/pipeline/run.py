@@ -168,7 +168,15 @@ def _dark_facts(settings: PairSettings) -> DarkFrameFacts | None:
 
 def read_run(folder: OutFolder) -> RunFile | None:
     """Read what a run has recorded; None if none has begun."""
-    return folder.record(RUN, lambda content: parse_record(content, RunFile))
+    listing_bytes = (folder / LISTING).size()
+
+    def parse(content: bytes) -> RunFile:
+        run = parse_record(content, RunFile)
+        if listing_bytes is not None and run.shards > listing_bytes:  # merge would look for each
+            raise ValueError(f"shards={run.shards}: more than {LISTING} has sources")
+        return run
+
+    return folder.record(RUN, parse)
 
 
 def begin(folder: OutFolder, run: Run, parts: int | None = None) -> None:
