@@ -185,7 +185,7 @@ class Planner:
         scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         raw, light = None if facts is None else facts.raw, (scene.exposure, float(self._sensor.span_dn))
         if raw is None:
-            name, weights, rgb2cam = plan_camera(self._camera, uniforms)
+            name, weights, rgb2cam = plan_camera(self._camera, uniforms, epoch)
             red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
             lamp, cct_k = "", 0.0
             if self._lights:
@@ -339,7 +339,7 @@ class PhysicalLevel:
 Weights = tuple[float, float, float, float]
 
 
-def plan_camera(camera: CameraConfig, uniforms: Sequence[float]) -> tuple[str, Weights, colour.Matrix]:
+def plan_camera(camera: CameraConfig, uniforms: Sequence[float], epoch: int = 0) -> tuple[str, Weights, colour.Matrix]:
     """Return the name of the camera, the weights of the four known cameras in it, and its matrix from linear sRGB."""
     names = tuple(colour.CAMERAS)
     if camera.law == "identity":
@@ -348,7 +348,9 @@ def plan_camera(camera: CameraConfig, uniforms: Sequence[float]) -> tuple[str, W
         return camera.name, (0.0, 0.0, 0.0, 0.0), colour.rgb2cam(colour.matrix(camera.xyz2cam or ()))
     if camera.law == "convex":
         weights = convex_weights(uniforms if camera.weights is None else camera.weights)
-        return camera.name, weights, mixed_rgb2cam(weights)
+        # compiling takes as long as 20,000 matrices, which only redrawn plans may need
+        matrix = mixed_rgb2cam(weights) if epoch else colour.rgb2cam(xyz2cam(camera, weights))
+        return camera.name, weights, matrix
     name = names[int(uniforms[Draw.CHOICE] * len(names))] if camera.law == "choice" else camera.name
     w0, w1, w2, w3 = (float(name == other) for other in names)
     return name, (w0, w1, w2, w3), colour.rgb2cam(colour.CAMERAS[name])
