@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import samples_json, text_rows
@@ -283,6 +284,20 @@ def test_notes_are_in_rows_summary_and_plan(run_main: RunMain, tmp_path: Path) -
     rows = text_rows(tmp_path / "ds")
     assert [row["detail"].startswith(note) for row in rows] == [True, False]
     assert [row.get("detail", "")[: len(note)] for row in samples_json(tmp_path / "ds").values()] == [note, ""]
+
+
+def test_sites_above_the_level_of_libraw_are_noted_and_regenerated(run_main: RunMain, tmp_path: Path) -> None:
+    """A raw file that states no level, of a camera of whose table LibRaw has 3692 DN; a row records that level."""
+    (tmp_path / "frames").mkdir()
+    bayer = (33421, "H", 2, (2, 2), True), (33422, "B", 4, bytes([0, 1, 1, 2]), True)
+    model = (271, "s", 0, "Canon", True), (272, "s", 0, "EOS 5D", True)
+    with tifffile.TiffWriter(tmp_path / "frames" / "a.cr2") as file:
+        file.write(
+            np.minimum(2 * DN, 4095), photometric="cfa", metadata=None, software=False, extratags=[*model, *bayer]
+        )
+    done = run_main("source.kind=raw", "source.root=frames", "noise=none", "out=ds", "n_jobs=1")
+    assert done.code == 0 and "above the white level of LibRaw, 3692 DN" in done.err, done
+    assert "1 pair regenerated, bit for bit" in run_main("verify", "ds", "--regenerate", "1").out
 
 
 def test_damaged_file_is_refused_by_every_verb(run_main: RunMain, tmp_path: Path, capfd: Any) -> None:

@@ -86,11 +86,14 @@ def decode_raw(content: bytes, suffix: str, max_pixels: int = 2**40, white_dn: f
 def _white_notes(
     pixels: NDArray[np.uint16], facts: RawMetadata, tag_dn: float | None, given_dn: float | None
 ) -> Iterator[str]:
-    """Yield doubts about a white level; SourceError if the file is damaged by it. LibRaw's levels are not exact."""
+    """Yield doubts about a white level; SourceError if the file is damaged by it.
+
+    LibRaw's levels are not exact, and a row that records one gives it when the file is read again.
+    """
     white = max(given_dn or 0.0, facts.white_dn or 0.0)
     black, brightest = min(facts.black_dn or (0.0,)), int(pixels.max())
     share = np.count_nonzero(pixels > white + ABOVE_WHITE * (white - black)) / pixels.size
-    is_known = tag_dn is not None or white == given_dn
+    is_known = tag_dn is not None or white > (facts.white_dn or 0.0)
     if is_known and (share > MOST_ABOVE or brightest >> max(int(white).bit_length(), facts.sample_bits)):
         problem = f"has sites of up to {brightest} DN, {share:.2%} of them far above the white level {white:g}"
         raise SourceError("corrupt", f"{problem}; restore it, or state the white level of an intact file")
