@@ -88,7 +88,7 @@ def _white_notes(
 ) -> Iterator[str]:
     """Yield doubts about a white level; SourceError if the file is damaged by it.
 
-    LibRaw's levels are not exact, and a row that records one gives it when the file is read again.
+    LibRaw's levels are not exact. A row records the level, which is given again when its pair is regenerated.
     """
     white = max(given_dn or 0.0, facts.white_dn or 0.0)
     black, brightest = min(facts.black_dn or (0.0,)), int(pixels.max())
