@@ -225,6 +225,16 @@ def test_plan_describes_frames_and_what_they_contain(run_main: RunMain, darks: P
     assert text.count("contained in the dark frames") >= 5
 
 
+def test_hidden_companions_are_no_dark_frames(run_main: RunMain, darks: Path, pictures: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(darks, tmp_path / "darks")
+    (folder / "._0.npy").write_bytes(b"\0\5\x16\7")
+    (folder / "folder.npy").mkdir()
+    done = run_main("plan", *NOISE, f"noise.dark_frames={folder}", f"source.root={pictures}")
+    assert done.code == 0, done.err
+    assert f"3 dark frames in {folder}" in " ".join(done.out.split())
+    assert done.out.count("noise.dark_frames: hidden files and folders are left out: 1 ._*") == 1
+
+
 @pytest.fixture
 def reported(make: Make, tmp_path: Path, darks: Path) -> Path:
     """Return a dataset with dark frames that may be moved, and enough sites for a check of the noise."""
