@@ -82,9 +82,9 @@ def test_all_redraws_parameters_and_patches_and_keeps_the_body(night: Path) -> N
 
 def test_second_epoch_without_numbers_warns_once(night: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     live, repeated = ug.LivePairs(night), ug.LivePairs(night, redraw="none")
-    for number in range(len(live)):
-        live[0, number], live[number], repeated[number]
-    repeated[0]
+    for pairs in (live, repeated):  # a loop asks for an item after the last one too
+        assert len(list(pairs)) == len(pairs)
+    live[0, 0], repeated[0]
     with pytest.warns(UserWarning, match="sampler=EpochSampler") as warned:
         live[0]
     live[1]

@@ -180,12 +180,12 @@ class LivePairs:
         return f"LivePairs({names}, length={len(self)}, redraw={self._redraw!r})"
 
     def __getitem__(self, item: int | tuple[int, int]) -> Any:  # arrays instead of a LiveSample with arrays_only
-        if not isinstance(item, tuple) and self._redraw != "none":
-            self._warn_of_repetition()
         epoch, number = map(operator.index, item if isinstance(item, tuple) else (0, item))
         if not 0 <= epoch < EPOCHS:
             raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
         number, crop = divmod(range(len(self))[number], self._patches)
+        if not isinstance(item, tuple) and self._redraw != "none":
+            self._warn_of_repetition()
         place = bisect.bisect_right(self._ends, number)
         source = self._sources[place]
         image = source.image(number - (self._ends[place - 1] if place else 0))
