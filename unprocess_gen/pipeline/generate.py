@@ -29,6 +29,7 @@ from unprocess_gen.pipeline.folder import OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.run import (
+    LISTING,
     Run,
     RunFile,
     begin,
@@ -206,7 +207,8 @@ def merge(out: str) -> tuple[Summary, int]:
     """
     started = time.monotonic()
     with OutFolder(out) as folder:
-        known = read_run(folder)
+        most_shards = (folder / LISTING).size()  # each shard is looked for; it has a source, which takes a line
+        known = read_run(folder, most_shards)
         if known is not None:
             check_version(folder, known)
             folder.lock()

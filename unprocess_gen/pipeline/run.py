@@ -166,13 +166,12 @@ def _dark_facts(settings: PairSettings) -> DarkFrameFacts | None:
 # -------------------------------------------------------------------------------------------------------------- files
 
 
-def read_run(folder: OutFolder) -> RunFile | None:
-    """Read what a run has recorded; None if none has begun."""
-    listing_bytes = (folder / LISTING).size()
+def read_run(folder: OutFolder, most_shards: int | None = None) -> RunFile | None:
+    """Read what a run has recorded; None if none has begun. MachineError if it has more than ``most_shards``."""
 
     def parse(content: bytes) -> RunFile:
         run = parse_record(content, RunFile)
-        if listing_bytes is not None and run.shards > listing_bytes:  # merge would look for each
+        if most_shards is not None and run.shards > most_shards:
             raise ValueError(f"shards={run.shards}: more than {LISTING} has sources")
         return run
 
