@@ -2,15 +2,16 @@
 
 ``dataset.json`` contains the config and the digests of all other files. A shard is regenerated from its rows in the
 manifest and their sources. The manifest is collected from the rows in intact shards; rows that are in none are
-regenerated from the config and their sources. Each file is written to a temporary file, and
-replaces the damaged one if its digest is the recorded one. A damaged ``dataset.json`` is rewritten if the other
-files agree; its facts about the run (time, host, versions) are lost. Repair uses one process: if most of a dataset is
-damaged, ``gen-dataset again`` is faster.
+regenerated from the config and their sources. Each file is written to a temporary file, and replaces the damaged one
+if its digest is the recorded one. A damaged ``dataset.json`` is rewritten if the other files agree; its facts about the
+run (time, host, versions) are lost. Repair uses one process: if most of a dataset is damaged, ``gen-dataset again`` is
+faster.
 """
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import dataset_facts, dataset_text, fingerprint, read_dataset, recorded_places
 from unprocess_gen.dataset.keys import group_by_sample, image_key, key_text, sample_key
-from unprocess_gen.dataset.manifest import csv_lines, read_rows, shard_rows, write_manifest
+from unprocess_gen.dataset.manifest import csv_lines, shard_rows, write_manifest
 from unprocess_gen.dataset.row import columns_of, has_frames, row_json
 from unprocess_gen.dataset.shards import ShardWriter, shard_name, stored_rows
 from unprocess_gen.pipeline.folder import OutFolder
@@ -194,14 +195,15 @@ def _regenerate_shard(
 
 def _dataset_json(folder: Path, source: dict[str, Any]) -> str:
     """Describe the other files of a dataset as ``dataset.json`` does."""
-    manifest, entries = folder / MANIFEST, []
+    manifest, entries, counts = folder / MANIFEST, [], Counter[str]()
     for number, rows in shard_rows(manifest):
+        counts.update(count_rows(rows))
         path = folder / tar_name(number)
         result = ShardResult(ShardReport(number), rows=rows)
         if path.is_file():
             result.path, result.bytes, result.sha256 = str(path), path.stat().st_size, file_sha256(path)
         entries.append(result.entry())
     lost = dict.fromkeys(("not_matched", "skipped_links", "run", "versions"))
-    facts = count_facts(count_rows(read_rows(manifest))) | lost | {"source": source}
+    facts = count_facts(counts) | lost | {"source": source}
     text = (folder / CONFIG).read_bytes().decode()
     return dataset_text(dataset_facts(text, file_sha256(manifest), entries, facts))
