@@ -200,7 +200,7 @@ def test_unfinished_files_of_a_killed_process_are_deleted_at_the_start(
     assert not left.exists()
 
 
-def test_unfinished_files_of_a_running_process_are_kept(begun: Path, make: Make, tree_hash: TreeHash) -> None:
+def test_unfinished_files_of_a_running_process_are_kept(begun: Path, make: Make) -> None:
     with OutFolder(begun / "ds") as other:
         (other.scratch / "half").write_bytes(b"half")
         make(begun / "p", begun / "ds", FOUR)

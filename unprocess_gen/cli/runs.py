@@ -15,7 +15,7 @@ from unprocess_gen.cli.arguments import BEGUN, DATASET, INPUTS, N_JOBS, Call, Op
 from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
 from unprocess_gen.cli.jobs import Job, checked_jobs, composed_jobs, run_jobs
 from unprocess_gen.cli.messages import print_results, report
-from unprocess_gen.cli.places import dataset_folder, given_places, given_root
+from unprocess_gen.cli.places import dataset_folder, given_root
 from unprocess_gen.cli.sweep import result_cells
 from unprocess_gen.config.option_files import OptionFolders
 from unprocess_gen.core.errors import ConfigError, DamageError
@@ -133,7 +133,7 @@ def again(call: Call) -> int:
     places = {"source.root", "noise.dark_frames"}
     given = load_config([f"{key}={value}" for key, value in call.settings.items() if key not in places])
     changes = {key: attrgetter(key)(given) for key in {"executor", *call.settings} - places}
-    changes["noise.dark_frames"] = given_places(folder, call).dark_frames
+    changes["noise.dark_frames"] = call.settings.get("noise.dark_frames")
     config = recorded_config(folder, given_root(call), changes)
     code, lines = outcome(generate(config), config.source.max_failed)
     print_results(*lines)

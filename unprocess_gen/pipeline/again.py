@@ -25,7 +25,7 @@ from unprocess_gen.sources.reading import source_file
 
 
 def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any]) -> Config:
-    """Settings of a dataset with ``changes``, which contain another ``out`` and the dark frames.
+    """Settings of a dataset with ``changes``, which contain another ``out``, and dark frames or None.
 
     SourceChangedError if sources are missing or have other sizes than the manifest records.
     """
