@@ -175,6 +175,15 @@ def test_camera_has_the_weights_and_the_matrix_of_its_option(
     assert (camera.camera, [*camera.weights], camera.rgb2cam) == (name, weights, rgb2cam)
 
 
+@pytest.mark.parametrize("weights", ["null", "[1,2,0,1]", "[0,0,1,0]"])
+def test_compiled_and_plain_matrices_of_a_mix_are_equal(settings: Settings, weights: str) -> None:
+    """Redrawn plans compile it; other plans do not wait for the compiler."""
+    camera = settings(f"camera.weights={weights}").camera
+    for key in range(100):
+        uniforms = draws(key, DRAW_COUNT, purpose(PARAMETERS))[1].tolist()
+        assert plan_camera(camera, uniforms, is_compiled=True) == plan_camera(camera, uniforms)
+
+
 # Draws and names ------------------------------------------------------------------------------------------------------
 
 

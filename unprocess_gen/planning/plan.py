@@ -185,7 +185,8 @@ class Planner:
         scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
         raw, light = None if facts is None else facts.raw, (scene.exposure, float(self._sensor.span_dn))
         if raw is None:
-            name, weights, rgb2cam = plan_camera(self._camera, uniforms, epoch)
+            # compiling takes as long as 20,000 matrices, which only redrawn plans may need
+            name, weights, rgb2cam = plan_camera(self._camera, uniforms, is_compiled=epoch > 0)
             red, blue = draw_parameter(self._red, uniforms[Draw.RED]), draw_parameter(self._blue, uniforms[Draw.BLUE])
             lamp, cct_k = "", 0.0
             if self._lights:
@@ -339,8 +340,13 @@ class PhysicalLevel:
 Weights = tuple[float, float, float, float]
 
 
-def plan_camera(camera: CameraConfig, uniforms: Sequence[float], epoch: int = 0) -> tuple[str, Weights, colour.Matrix]:
-    """Return the name of the camera, the weights of the four known cameras in it, and its matrix from linear sRGB."""
+def plan_camera(
+    camera: CameraConfig, uniforms: Sequence[float], is_compiled: bool = False
+) -> tuple[str, Weights, colour.Matrix]:
+    """Return the name of the camera, the weights of the four known cameras in it, and its matrix from linear sRGB.
+
+    With ``is_compiled``, a kernel computes the matrix of a mix, with the same result.
+    """
     names = tuple(colour.CAMERAS)
     if camera.law == "identity":
         return camera.name, (0.0, 0.0, 0.0, 0.0), colour.IDENTITY
@@ -348,8 +354,7 @@ def plan_camera(camera: CameraConfig, uniforms: Sequence[float], epoch: int = 0)
         return camera.name, (0.0, 0.0, 0.0, 0.0), colour.rgb2cam(colour.matrix(camera.xyz2cam or ()))
     if camera.law == "convex":
         weights = convex_weights(uniforms if camera.weights is None else camera.weights)
-        # compiling takes as long as 20,000 matrices, which only redrawn plans may need
-        matrix = mixed_rgb2cam(weights) if epoch else colour.rgb2cam(xyz2cam(camera, weights))
+        matrix = mixed_rgb2cam(weights) if is_compiled else colour.rgb2cam(xyz2cam(camera, weights))
         return camera.name, weights, matrix
     name = names[int(uniforms[Draw.CHOICE] * len(names))] if camera.law == "choice" else camera.name
     w0, w1, w2, w3 = (float(name == other) for other in names)
