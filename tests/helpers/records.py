@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen.core.source import Source
-from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.frames import Counts, Pair, Patch
 from unprocess_gen.simulation.plan import (
     CameraPlan,
@@ -19,9 +18,6 @@ from unprocess_gen.simulation.plan import (
 )
 
 SHA256 = "ab" * 32
-
-
-FACTS = Facts(width=3, height=2, codes=256, dark_code=3, bright_code=250)
 
 
 SOURCE = Source(3, "a, b.png", "a, b.png", 1234)

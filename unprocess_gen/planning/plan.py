@@ -264,8 +264,7 @@ class TwoNumberLevel:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        a, b = interpretation.noise_distributions(config.noise)
-        self.distributions = {Draw.A: a, Draw.B: b}
+        self._a, self._b = interpretation.noise_distributions(config.noise)
         self._span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
         kept = functools.lru_cache(maxsize=64)  # of live pairs, which draw few of the numbers
         self._in_dn, self._plan = kept(self._convert), kept(self._noise_plan)
@@ -283,8 +282,8 @@ class TwoNumberLevel:
 
     def two_numbers(self, uniforms: Sequence[float]) -> tuple[float, float]:
         """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
-        a = draw_parameter(self.distributions[Draw.A], uniforms[Draw.A])
-        return self._in_dn(a, draw_parameter(self.distributions[Draw.B], uniforms[Draw.B], a))
+        a = draw_parameter(self._a, uniforms[Draw.A])
+        return self._in_dn(a, draw_parameter(self._b, uniforms[Draw.B], a))
 
     def _convert(self, a: float, b: float) -> tuple[float, float]:
         noise, sensor = self._config.noise, self._config.sensor
@@ -307,7 +306,6 @@ class PhysicalLevel:
 
     def __init__(self, config: Config) -> None:
         self._noise, self._rules = PhysicalNoise(config), EffectRules(config)
-        self.distributions = self._noise.distributions
         self._sensors: Recent[tuple[Any, ...], Sensor] = Recent(1024)
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> DrawnNoise:

@@ -1,4 +1,4 @@
-"""Fixed patterns of a sensor unit equal the reference for any crop."""
+"""Fixed patterns of a sensor unit are computed once, and those of live crops equal those of other crops."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.simulation.kernels import site_patterns
 from unprocess_gen.simulation.kernels.site_patterns import forget_patterns, patterns_at
 from unprocess_gen.simulation.kernels.strips import SiteMap
-from unprocess_gen.simulation.plan import Physics
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.slots import NormalPattern, Patterns
 
@@ -22,22 +21,12 @@ CROPS = (
 )  # fmt: skip
 """Shape and origin of crops, with sides and origins next to the sizes of blocks and strips."""
 
-SHARES = {"hot_pixel_share": 0.05, "dead_pixel_share": 0.03}
-NUMBERS = {"prnu_std": 0.05, "hot_pixel_e": 300.0, "body_key": 0xFEDCBA9876543210} | SHARES
-DEFECTS = ("hot_pixels", "dead_pixels")
-
 
 @pytest.fixture(autouse=True)
 def _forgotten() -> Iterator[None]:
     forget_patterns()
     yield
     forget_patterns()
-
-
-def patterns_of(*on: str, **numbers: float) -> tuple[Patterns, Physics]:
-    plan = plan_with(*on, **NUMBERS | numbers)
-    assert plan.physics is not None
-    return slots_of(plan).patterns, plan.physics
 
 
 def test_patterns_are_computed_once_for_all_frames_of_a_body() -> None:
@@ -56,7 +45,12 @@ def test_patterns_of_live_crops_equal_those_of_other_crops(
     """They are cut from patterns of the frame, which grow, unless these are too large or too many."""
     for name, limit in limits.items():
         monkeypatch.setattr(site_patterns, name, limit)
-    patterns, _ = patterns_of("prnu", *DEFECTS, hot_pixel_share=share, dead_pixel_share=share)
+    patterns = slots_of(
+        plan_with(
+            *("prnu", "hot_pixels", "dead_pixels"), body_key=0xFEDCBA9876543210, prnu_std=0.05, hot_pixel_e=300.0,
+            hot_pixel_share=share, dead_pixel_share=share,
+        )
+    ).patterns  # fmt: skip
     for shape, origin in CROPS:
         frame = origin[0] + shape[0], origin[1] + shape[1]
         expected, live = (patterns_at(patterns, shape, origin, sides)[0] for sides in (None, frame))

@@ -153,10 +153,6 @@ def _linear_limit(plan: Plan, brightest: float, exposure: float, gain: float) ->
     return min(1.0, light / exposure) / gain * 0.999
 
 
-KEPT_FORMS = 1024, 4
-"""Numbers of forms of images of 256 codes (18 kB each) and of 65,536 codes (5 MB each) that are kept."""
-
-
 def _products(plan: Plan, codes: int, scale: tuple[float, ...], dtype: Any) -> NDArray[Any]:
     """Return each entry of the matrix times the light of each code, in the scale of its channel."""
     if plan.source.is_raw:

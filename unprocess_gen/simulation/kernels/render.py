@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from unprocess_gen.core.arrays import PACKED, Frame, Srgb
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.kernels.clean import (
-    KEPT_FORMS,
     Unprocessing,
     Unprocessing32,
     fill_clean,
@@ -116,8 +115,9 @@ class Renderer:
         return clean, noisy, counts
 
 
-_renderers = [functools.lru_cache(maxsize=count)(Renderer) for count in KEPT_FORMS]
-"""Renderers of images of 8 bits and of 16 bits, wherever they are: kept for each size, because records are hashed."""
+_renderers = [functools.lru_cache(maxsize=count)(Renderer) for count in (1024, 4)]
+"""Renderers of images of 8 bits (18 kB each) and of 16 bits (5 MB each), wherever they are; kept for each size, because
+records are hashed."""
 
 
 def renderer_of(srgb: Srgb, plans: tuple[Plan, ...], origin: tuple[int, int]) -> Renderer:
