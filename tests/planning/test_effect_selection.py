@@ -294,9 +294,9 @@ def test_redrawn_plans_are_those_of_a_new_planner(settings: Settings, profile: s
         assert list(weakest_first(frame, on, EFFECTS)) == sorted(EFFECTS, key=strength)
 
 
-def predicted(effect: str, *given: Any) -> Prediction:
+def predicted(effect: str, *arguments: Any) -> Prediction:
     """Return the prediction of one effect, from the arguments of `all_predictions`."""
-    return next(one for one in all_predictions(*given) if one.effect == effect)
+    return next(one for one in all_predictions(*arguments) if one.effect == effect)
 
 
 def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[str, ...]:

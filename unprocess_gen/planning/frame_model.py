@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import add, mul
 
@@ -69,7 +68,7 @@ class AtLevel:
     def __init__(self) -> None:
         self.variances: list[tuple[str, float]] = []
         self.contributions: dict[tuple[str, float], tuple[Contribution, list[float]]] = {}
-        self.squares: dict[tuple[Sequence[str], frozenset[str]], list[float]] = {}
+        self.squares: dict[tuple[tuple[str, ...], frozenset[str]], list[float]] = {}
 
 
 class FrameModel(FrameFacts):
@@ -125,7 +124,7 @@ class FrameModel(FrameFacts):
             known = contributions[key] = predicted, [*map(mul, predicted.variances, self.counts)]
         return known
 
-    def squares(self, effects: Sequence[str], level_dn: float, on: frozenset[str]) -> list[float]:
+    def squares(self, effects: tuple[str, ...], level_dn: float, on: frozenset[str]) -> list[float]:
         """Square of the ratio of several effects together to the masking noise, in each statistic.
 
         Variances add; offsets add linearly.
@@ -135,7 +134,7 @@ class FrameModel(FrameFacts):
             known[key] = self._squares(effects, level_dn, on)
         return known[key]
 
-    def _squares(self, effects: Sequence[str], level_dn: float, on: frozenset[str]) -> list[float]:
+    def _squares(self, effects: tuple[str, ...], level_dn: float, on: frozenset[str]) -> list[float]:
         squares: list[float] = []
         offsets: list[float] = []
         before_well = 0.0
@@ -172,7 +171,7 @@ class FrameModel(FrameFacts):
                 other += effect_dn2
         return MEAN_ABS_NORMAL / 2 * (math.sqrt(other + variance) - math.sqrt(other))
 
-    def ratio(self, effects: Sequence[str], level_dn: float, on: frozenset[str]) -> float:
+    def ratio(self, effects: tuple[str, ...], level_dn: float, on: frozenset[str]) -> float:
         """Largest ratio of several effects together at a signal, over all statistics."""
         return math.sqrt(max(self.squares(effects, level_dn, on)))
 

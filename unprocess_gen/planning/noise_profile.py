@@ -187,10 +187,11 @@ def _share(iso: float, low: float, high: float) -> Decimal:
 
 
 @functools.lru_cache(maxsize=256)
-def _scatter_of_body(body: int) -> Any:
+def _scatter_of_body(body: int) -> list[float]:
     """Return the uniforms at which the numbers of a body are drawn, by `Number.counter`."""
-    _, uniforms = draws(body, max(declared.counter for declared in NUMBERS.values()) + 1, purpose(SCATTER))
-    return uniforms.tolist()
+    count = max(declared.counter for declared in NUMBERS.values()) + 1
+    uniforms: list[float] = draws(body, count, purpose(SCATTER))[1].tolist()
+    return uniforms
 
 
 @functools.lru_cache(maxsize=256)

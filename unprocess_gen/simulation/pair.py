@@ -33,7 +33,7 @@ from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
 def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None) -> Pair:
     """Simulate the clean and noisy raw frame of one image.
 
-    The result depends only on the arguments, not on machine, worker, method or electrons.
+    The result depends only on the arguments, not on machine, worker, method or order.
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def _survive_damage(cache: Any, folder: Path) -> None:
             _LOGGER.warning("%s: the machine code is damaged (%s); compiling it again", folder, type(error).__name__)
             for path in [*folder.rglob("*.nbi"), *folder.rglob("*.nbc"), *folder.glob("*.run")]:
                 with suppress(OSError):
-                    path.unlink(missing_ok=True)
+                    path.unlink()
 
     def save_overload(*arguments: Any) -> None:
         try:

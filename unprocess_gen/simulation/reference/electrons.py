@@ -47,8 +47,8 @@ def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: Dark
             return clean_dn
         n = normals(frame_words(plan, heteroscedastic.STREAM, shape, origin))
         return np.asarray(clean_dn + np.sqrt(noise_variance(clean_dn, plan)) * n)
-    slots, patterns = slots_of(plan), slots_of(plan).patterns
-    relative_gain = by_site(slots.plane_gains, shape, origin)
+    slots = slots_of(plan)
+    patterns, relative_gain = slots.patterns, by_site(slots.plane_gains, shape, origin)
     gain = slots.dn_per_e * relative_gain
     electrons = (clean_dn - slots.black_dn) / gain
     if patterns.electrons and not plan.averaged:  # otherwise the light of the clean frame has the factor
@@ -115,8 +115,8 @@ def average(clean_dn: Float, plan: Plan, origin: Shape = (0, 0)) -> Float:
     The sum of light, dark signal and hot pixels is limited by the full well, as in each frame of a real average. The
     frame has its `light_factor` already; the result is not clipped.
     """
-    slots, patterns, shape = slots_of(plan), slots_of(plan).patterns, (clean_dn.shape[0], clean_dn.shape[1])
-    gain = slots.dn_per_e * by_site(slots.plane_gains, shape, origin)
+    slots, shape = slots_of(plan), (clean_dn.shape[0], clean_dn.shape[1])
+    patterns, gain = slots.patterns, slots.dn_per_e * by_site(slots.plane_gains, shape, origin)
     if patterns.bright:  # recorded bytes depend on the order of these sums
         clean_dn = clean_dn + bright_means_e(patterns.bright, shape, origin) * gain
     if slots.uniform:

@@ -52,13 +52,13 @@ DEQUANTIZE = declare_stream("dequantize", 10)
 
 
 def dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Srgb:
-    """Dither 8-bit codes to 16 bits, [H, W, 3], so that 256 codes do not become 256 levels of raw, if the plan does.
+    """Dither 8-bit codes to 16 bits if the plan asks for it; return other codes as they are, [H, W, 3].
 
-    Each channel of each pixel gets an offset from the random stream ``dequantize``: one of the 257 integers within half
-    an 8-bit code. Codes 0 and 255 get none. For ``dither``, highlights get none either, because half a code is hundreds
-    of DN there: codes whose linear light is above the threshold of highlights. For ``dither_all`` they do,
-    and code 254 gets one of 385 integers up to white, which it does not reach: so the 16-bit codes have no gaps, white
-    stays white, and codes keep their order.
+    Without it, 256 codes become 256 levels of raw. Each channel of each pixel gets an offset from the random stream
+    ``dequantize``: one of the 257 integers within half an 8-bit code. Codes 0 and 255 get none. For ``dither``,
+    highlights get none either, because half a code is hundreds of DN there: codes whose linear light is above the
+    threshold of highlights. For ``dither_all`` they do, and code 254 gets one of 385 integers up to white, which it
+    does not reach: so the 16-bit codes have no gaps, white stays white, and codes keep their order.
     """
     if plan.source.dequantize == "off" or srgb.dtype != np.uint8:
         return srgb
