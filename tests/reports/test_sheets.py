@@ -238,6 +238,15 @@ def test_changed_photograph_is_named_and_its_panel_omitted(
     assert reason in done.err
 
 
+def test_moved_photographs_are_omitted(gray_world: Path, make: Make, run_main: RunMain, tmp_path: Path) -> None:
+    photos = shutil.copytree(gray_world, tmp_path / "photos")
+    make(photos, tmp_path / "ds", "source.limit=1")
+    photos.rename(tmp_path / "moved")
+    done = run_main("preview", "ds", "--to", "to")
+    assert (done.code, done.out, "panel is omitted" in done.err) == (5, "1 picture in to\n", True)
+    assert run_main("report", "ds").code == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -24,7 +24,7 @@ from unprocess_gen.cli.arguments import (
 from unprocess_gen.cli.jobs import Job, composed_jobs, option_folders, run_jobs
 from unprocess_gen.cli.messages import print_results
 from unprocess_gen.cli.messages import report as report_message
-from unprocess_gen.cli.places import dataset_folder, given_places
+from unprocess_gen.cli.places import dataset_folder, given_places, given_root
 from unprocess_gen.cli.sweep import swept_keys
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.libraries import require
@@ -93,8 +93,7 @@ def report(call: Call) -> int:
     folder = dataset_folder(call, sweeps=True)
     if isinstance(folder, Path) and is_sweep(folder):
         return _report_sweep(folder, call)
-    places = given_places(folder, call)
-    root, dark = places.root, places.dark_frames
+    root, dark = given_root(call), given_places(folder, call).dark_frames
     if "noise.dark_frames" in call.settings and dark is not None:
         dark_folder(dark)  # refuses a folder that the user names and that does not exist
     print_results(write_dataset_report(folder, call.to, None if root is None else any_path(root), dark))
@@ -126,11 +125,11 @@ def preview(call: Call) -> int:
     from unprocess_gen.reports.sheets import write_sheets
 
     folder = dataset_folder(call)
-    to, root, keys = call.to, given_places(folder, call).root, call.keys or ""
+    to, given, root, keys = call.to, given_root(call), given_places(folder, call).root, call.keys or ""
     files = code = 0
     failed = select_pairs(folder / "manifest.csv", keys).failed if keys else 0
     _check_not_among_photographs(to, root)
-    for sheet in write_sheets(folder, to, keys, None if root is None else any_path(root), call.stages):
+    for sheet in write_sheets(folder, to, keys, None if given is None else any_path(given), call.stages):
         files += len(sheet.files)
         if sheet.missing_source:
             code = SourceChangedError.exit_code if root is not None else code
