@@ -318,9 +318,12 @@ ASSUMABLE = (
 )
 """Keys that ``noise.assumed`` may name: numbers of a physical profile, and those of a branch that may be unknown."""
 
-LEVELS = ("black_level_dn", "white_level_dn")
 BRANCH_FIELDS = _number_fields(in_branch=True)
-SOURCED = (*LEVELS, *(name for name in BRANCH_FIELDS if name != "read_law"), *PHYSICAL_NUMBERS)
+SOURCED = (
+    *("black_level_dn", "white_level_dn"),
+    *(name for name in BRANCH_FIELDS if name != "read_law"),
+    *PHYSICAL_NUMBERS,
+)
 """Keys whose source a profile may state."""
 SWITCH_FIELDS: Fields = {
     effect.name: (
