@@ -244,7 +244,7 @@ def _metadata(file: Path) -> dict[str, Any]:
     stated = {name: getattr(facts, name) for name in ("iso", "exposure_s", "pattern", "bits")}
     black = None if facts.black_dn is None else sum(facts.black_dn) / len(facts.black_dn)
     stated |= {"black_level_dn": black, "white_level_dn": facts.white_dn}
-    assumed = ("bits", "white_level_dn") if any("no WhiteLevel" in note for note in facts.notes) else ()
+    assumed = ("bits", "white_level_dn") if facts.white_is_assumed else ()
     return {name: value for name, value in stated.items() if value is not None and name not in assumed}
 
 

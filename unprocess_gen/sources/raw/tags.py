@@ -53,16 +53,17 @@ class RawMetadata:
     ``pattern`` and ``black_dn`` (row by row) are of the top-left 2x2 sites of the visible part, ``area`` (ActiveArea of
     DNG) is its first row and column and the ends of its rows and columns, ``size`` the height and width of all sites of
     a DNG, ``sample_bits`` the bits that hold its values, 0 for 16, of which cameras use fewer. ``black_by_site`` are
-    black levels that do not repeat within 2x2 sites; ``black_dn`` is then the lowest. ``noise_profile`` (NoiseProfile
-    of DNG) is S and O of each plane: variance S·x + O with x = 0 at black and 1 at white. ``colour`` are colour tags of
-    a DNG, ``xyz2cam`` the matrix in LibRaw's table, ``gains`` those of red and blue as LibRaw reads them. ``notes`` are
-    sentences about the file without a subject.
+    black levels that do not repeat within 2x2 sites; ``black_dn`` is then the lowest. ``white_is_assumed`` is True for
+    a DNG without WhiteLevel. ``noise_profile`` (NoiseProfile of DNG) is S and O of each plane: variance S·x + O with
+    x = 0 at black and 1 at white. ``colour`` are colour tags of a DNG, ``xyz2cam`` the matrix in LibRaw's table,
+    ``gains`` those of red and blue as LibRaw reads them. ``notes`` are sentences about the file without a subject.
     """
 
     pattern: str | None = None
     black_dn: tuple[float, ...] | None = None
     black_by_site: NDArray[np.float64] | None = None
     white_dn: float | None = None
+    white_is_assumed: bool = False
     iso: float | None = None
     exposure_s: float | None = None
     model: str | None = None
@@ -205,9 +206,10 @@ def _dng_facts(tags: levels.Tags, height: int, width: int) -> dict[str, Any]:
         if black is not None and black.size > 4:
             cell, by_site = (float(black.min()),) * 4, black
         opcodes, noise = levels.unapplied_opcodes(tags), tags.get(51041)
+        white_is_assumed = levels.WHITE_LEVEL not in tags
         notes = {
             "is compressed with lossy JPEG, which removes noise and detail": tags.get(259) == (LOSSY_JPEG,),
-            f"states no WhiteLevel; {white:g} DN is assumed": levels.WHITE_LEVEL not in tags,
+            f"states no WhiteLevel; {white:g} DN is assumed": white_is_assumed,
             f"has {opcodes}, which would change the light, and is not applied": opcodes != "",
             "has black levels that differ by site, which are subtracted in integer DN": by_site is not None,
         }
@@ -222,6 +224,7 @@ def _dng_facts(tags: levels.Tags, height: int, width: int) -> dict[str, Any]:
             "black_dn": cell,
             "black_by_site": by_site,
             "white_dn": white,
+            "white_is_assumed": white_is_assumed,
             "noise_profile": noise,
             "colour": _dng_colour(tags, planes) if COLOR_MATRIX_1 in tags else None,
             "notes": tuple(note for note, holds in notes.items() if holds),
