@@ -121,7 +121,8 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     except SourceError as error:
         return SourceEstimate(source, time.perf_counter() - started, error)
     image = plan_pixels(settings, photograph, source, sha256)
-    levels, seconds = predicted_levels(settings, image, source, sha256), time.perf_counter() - started
+    seconds = time.perf_counter() - started
+    levels = predicted_levels(settings, image, source, sha256)
     _compile_kernels([plan for plan, _ in levels])
     started = time.perf_counter()
     for patch, plan, pair in image.pairs():
