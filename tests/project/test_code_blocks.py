@@ -135,7 +135,7 @@ def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "clips" / clip).mkdir(parents=True)
         for number in range(3):
             Image.fromarray(pixels(number, 96, 128)).save(tmp_path / "clips" / clip / f"{number:04}.png")
-    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
+    monkeypatch.setattr("unprocess_gen.pipeline.executors.local.usable_cores", lambda: 1)
     return tmp_path
 
 
