@@ -2,7 +2,7 @@
 
 Each test makes one small dataset in a new process under settings that change the code path of a library, and compares
 every byte with a plain run. The process reports whether the settings took effect (`everywhere`); a setting that a
-library no longer knows proves nothing. Others compile the kernels with other options.
+library no longer knows proves nothing. Some settings compile the kernels with other options.
 
 A change in the last place of a double changes one DN in 10^12 sites, so that bytes alone could miss it. Doubles before
 rounding are therefore compared too, and the machine code of the kernels is inspected for x86-64 with AVX-512, Arm and
