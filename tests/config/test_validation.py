@@ -403,6 +403,7 @@ EDITED = [
     ("source", "include", "*.jpg", r"source.include=\*.jpg: expected a value of type list"),
     ("source", "root", "/etc", "unknown key source.root"),
     ("noise", "gain", 1, "unknown key noise.gain"),
+    ("noise", "gain", {}, "unknown key noise.gain"),
     ("source", "kind", "web", "source.kind=web: expected one of folder, synthetic"),
     ("gains", "threshold", None, r"gains.threshold=null: expected a value of type float"),
     ("gains", "threshold", ..., r"missing key gains\.threshold"),

@@ -95,8 +95,8 @@ def parse_yaml_mapping(text: str) -> dict[str, Any]:
 
 
 def flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Values of mappings in mappings and in lists, by dotted key: ``noise.branches[0].iso``."""
-    if isinstance(value, dict):
+    """Values of mappings in mappings and in lists, by dotted key: ``noise.branches[0].iso``; empty ones are values."""
+    if isinstance(value, dict) and value:
         items = [(f"{prefix}.{key}".lstrip("."), item) for key, item in value.items()]
     elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
         items = [(f"{prefix}[{index}]", item) for index, item in enumerate(value)]
