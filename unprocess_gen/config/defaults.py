@@ -21,12 +21,9 @@ def default_options() -> dict[str, str | None]:
 
 def default_values(group: str) -> dict[str, Any]:
     """Default values of a group, or of the top level (``""``), by key as YAML has them; interpolations are text."""
-    kind = GROUPS[group] if group else Config
-    written = flat(_written(group))
-    return {
-        key: written.get(key, operator.attrgetter(key)(kind()))
-        for key in (all_settings(kind) if group else settings_of(kind))
-    }
+    schema = GROUPS[group]() if group else Config()
+    written, settings = flat(_written(group)), all_settings(schema) if group else settings_of(schema)
+    return {key: written.get(key, operator.attrgetter(key)(schema)) for key in settings}
 
 
 def _written(group: str) -> dict[str, Any]:
