@@ -122,7 +122,7 @@ def test_runs_have_the_bytes_of_generate(
     times = tier_costs.time_run(config, inputs, FAST, folder / "dataset")
     make(photos, folder / "ds", "accuracy=fast", "noise.levels=2", f"source.limit={inputs.source.limit}")
 
-    assert inputs.count == 2
+    assert len(inputs.samples) == 2
     assert min(times) > 0
     assert made == [tree_hash(folder / "ds")]
     assert not (folder / "dataset").exists()
@@ -166,7 +166,7 @@ def test_photographs_end_with_enough_pixels(
     ):
         monkeypatch.setattr(tier_costs, "RUN_PIXELS", pixels)
         inputs = tier_costs.select_inputs(settings(f"source.root={root}", *overrides), tmp_path)
-        assert (inputs.count, inputs.source.limit) == (count, count + 1)
+        assert (len(inputs.samples), inputs.source.limit) == (count, count + 1)
     with pytest.raises(ConfigError, match=r"none of 1 photographs can be read"):
         tier_costs.select_inputs(settings(f"source.root={root}", "source.limit=1"), tmp_path)
 

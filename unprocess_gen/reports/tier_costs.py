@@ -101,13 +101,12 @@ class AccuracyReport:
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Files of the runs, as a config of sources, with their number and pixels.
+    """Files of the runs, as a config of sources, with their pixels.
 
     ``samples`` are the photographs, subsampled to a grid, because the centre would be brighter.
     """
 
     source: SourceConfig
-    count: int
     pixels: int
     samples: tuple[tuple[Photograph, Source, str], ...]
 
@@ -138,7 +137,7 @@ def measure_accuracy(config: Config, command: str = "") -> AccuracyReport:
         "versions": ", ".join(f"{name} {version(name)}" for name in ("unprocess_gen", "numpy", "numba", "llvmlite")),
         "settings": f"{config.sensor.bits} bits, noise {config.noise.name}, scene {config.scene.name}",
     }
-    photographs = f"{counted(inputs.count, 'photograph')} ({inputs.pixels / 1e6:.1f} megapixels)"
+    photographs = f"{counted(len(inputs.samples), 'photograph')} ({inputs.pixels / 1e6:.1f} megapixels)"
     return AccuracyReport(tuple(rows), photographs, config.noise.name, conditions)
 
 
@@ -167,7 +166,7 @@ def select_inputs(config: Config, folder: Path) -> Inputs:
             f"source.root={source.place}: none of {len(listed)} photographs can be read with "
             f"output.layout={config.output.layout}; expected at least one"
         )
-    return Inputs(replace(source, limit=limit), len(samples), pixels, tuple(samples))
+    return Inputs(replace(source, limit=limit), pixels, tuple(samples))
 
 
 def _written_pictures(source: SourceConfig, folder: Path) -> SourceConfig:
