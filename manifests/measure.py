@@ -45,7 +45,6 @@ COLUMNS = tuple(
     for kind in ("psnr", "ssim")
 )
 
-Planes = NDArray[np.float64]
 Denoiser = Callable[[Frame, Row], Frame]
 """Function of a noisy mosaic in DN, uint16 [H, W], and its manifest row; returns the denoised mosaic, uint16."""
 

@@ -119,7 +119,7 @@ def _repetition(clean_dn: Float, plan: Plan, patch: Patch, dark_pixels: DarkPixe
         light_dn = light_dn - (electrons.average(np.full_like(clean_dn, black_dn), plan, origin) - black_dn)
     noisy_dn = electrons.noisy(np.clip(light_dn, black_dn, plan.brightest_dn), again, origin, dark_pixels)
     own_dn, other_dn = (
-        electrons.columns_dn(slots_of(frame).columns, (1, clean_dn.shape[1]), origin) for frame in (plan, again)
+        electrons.columns_dn(slots_of(drawn).columns, (1, clean_dn.shape[1]), origin) for drawn in (plan, again)
     )
     noisy_dn += own_dn - other_dn
     low_dn, high_dn = noisy_limits(plan.sensor.bits, black_dn, plan.sensor.sensor_clip)
