@@ -77,6 +77,7 @@ REFUSED = [
     ("sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
     ("seed=abc", r"seed=abc: expected 0 to 9223372036854775807$"),
     ("accuracy=quick", r"accuracy=quick: expected one of reference, exact, fast$"),
+    ("source.include=null", r"source.include=null: expected a list of at least one pattern such as "),
     ("source.include={a: 1}", r"source.include=\{a: 1\}: expected a list of at least one pattern such as "),
     ("noise.branches=[1]", r"noise.branches\[0\]: expected a list of mappings with the keys of a branch$"),
     ("noise.provenance=[{sauce: x}]", r"noise.provenance: sauce: no such key; noise.provenance has .* mean source\?"),

@@ -132,9 +132,9 @@ class SourceConfig(Group):
     kind: str = key("srgb", Choice("srgb", "raw"))
     list: Optional[str] = key(
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False)
-    include: Optional[tuple[str, ...]] = key(
+    include: tuple[str, ...] = key(
         ("*.jpg", "*.jpeg", "*.jpe", "*.jfif", "*.mpo", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
-        Limit("a list of at least one pattern such as '*.jpg'"), null="the suffixes of files that kind reads")
+        Limit("a list of at least one pattern such as '*.jpg'"))
     exclude: tuple[str, ...] = key((), Limit("a list of patterns such as '*_thumb.jpg'"))
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")

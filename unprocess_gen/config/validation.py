@@ -80,7 +80,7 @@ _allowed: Recent[bytes, bool] = Recent(64)
 def _check_values(config: Config) -> None:
     """Check all values but the seed."""
     _check_settings(config)
-    if config.source.include == ():
+    if not config.source.include:
         raise refusal("source.include", [], "expected at least one pattern such as '*.jpg'")
     patch_rule(config.source)
     check_raw_source(config)

@@ -42,7 +42,7 @@ NAMED_SUFFIXES = 5
 """Suffixes of unmatched files that `unmatched_sentence` names; the others are summed."""
 
 ADVICE = {
-    "extend source.include to read {}": {glob.removeprefix("*") for glob in SourceConfig.include or ()},
+    "extend source.include to read {}": {glob.removeprefix("*") for glob in SourceConfig.include},
     "convert {} to JPEG, PNG or TIFF": {".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"},
     "source.kind=raw reads {}": {".pgm", *RAW_FILES},
 }
@@ -86,7 +86,7 @@ def list_photographs(config: SourceConfig) -> Listing:
         pictures = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
         return Listing(number_clips(None, pictures) if config.clips else pictures)
     if config.list is None:
-        listed = list_folder(place, config.include or (), config.recursive, config.limit, config.exclude)
+        listed = list_folder(place, config.include, config.recursive, config.limit, config.exclude)
     else:
         listed = list_file(place, config.list, config.limit)
     listed = replace(listed, sources=number_twins(place, listed.sources))
