@@ -76,6 +76,8 @@ TARGETS = {
 
 
 def facts() -> dict[str, Any]:
+    import cv2  # imported late: it reads its settings at import, and the run decides when
+
     from unprocess_gen.pipeline import generate as runner
 
     features = np._core._multiarray_umath.__cpu_features__
@@ -85,6 +87,7 @@ def facts() -> dict[str, Any]:
         "optimize": sys.flags.optimize,
         "numpy": [name for name in np._core._multiarray_umath.__cpu_dispatch__ if features[name]],
         "opencv": opencv_features(),
+        "ipp": cv2.ipp.useIPP(),
         "product": product(),
         "libm": digest(repr([function(k / 999) for k in range(1, 999) for function in LIBM]).encode()),
         "kernels": kernels(),
@@ -93,7 +96,7 @@ def facts() -> dict[str, Any]:
 
 def opencv_features() -> list[str]:
     """Return the optional instruction sets that OpenCV uses."""
-    import cv2  # imported late: it reads its settings at import, and the run decides when
+    import cv2
 
     return [one[1:] for one in cv2.getCPUFeaturesLine().split() if one[0] == "*" and one[-1] != "?"]
 

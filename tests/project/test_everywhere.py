@@ -165,6 +165,8 @@ CHANGED |= {"NPY_DISABLE_CPU_FEATURES": "numpy", "OPENBLAS_CORETYPE": "product"}
 def test_settings_change_no_byte(flag: str, env: dict[str, str], make: Make, plain: Made, figure: Figure) -> None:
     made = make(sys.executable, *filter(None, [flag]), **env)
     assert made.facts["optimize"] == flag.count("O")
+    if env.keys() >= LIBRARIES.keys():
+        assert (made.facts["numpy"], made.facts["opencv"], made.facts["ipp"]) == ([], [], False)
     shown = [CHANGED[name] for name in env if name in CHANGED]
     if shown and all(made.facts[name] == plain.facts[name] for name in shown):
         pytest.skip(f"{', '.join(env)} changes nothing on this machine")
