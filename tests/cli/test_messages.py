@@ -153,27 +153,29 @@ import os, signal, sys
 
 class Interrupt:
     def find_spec(self, name, path, target=None):
-        if name == sys.argv[1]:
-            signal.raise_signal(signal.SIGINT)
+        if name == interrupted:
+            exec("signal.raise_signal(signal.SIGINT)")
 
+interrupted, *sys.argv[1:] = sys.argv[1:]
 sys.meta_path.insert(0, Interrupt())
 from unprocess_gen.__main__ import main
 sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("module", ["unprocess_gen.cli", "unprocess_gen.cli.verbs"])
-def test_interrupted_import_gives_one_line(module: str) -> None:
-    command = [sys.executable, "-c", INTERRUPTING, module]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
+@pytest.mark.parametrize("module", ["unprocess_gen.cli", "unprocess_gen.cli.verbs", "hydra"])
+def test_interrupted_import_gives_one_line(module: str, tmp_path: Path) -> None:
+    (tmp_path / "interrupting.py").write_text(INTERRUPTING)
+    command = [sys.executable, "-m", "interrupting", module, "plan"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "gen-dataset: interrupted\n")
 
 
 def test_ignored_interrupt_stays_ignored_during_imports() -> None:
-    command = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", sys.executable, "-c", INTERRUPTING, "argparse"]
+    command = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", sys.executable, "-c", INTERRUPTING, "argparse", "unknown"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert done.returncode == 2
-    assert messages(done.stderr)[0].startswith("gen-dataset: argparse: no such verb; expected ")
+    assert messages(done.stderr)[0].startswith("gen-dataset: unknown: no such verb; expected ")
 
 
 @pytest.mark.slow

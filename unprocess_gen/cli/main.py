@@ -79,6 +79,7 @@ def _report_end(error: BaseException, arguments: Sequence[str]) -> int:
     if isinstance(error, KeyboardInterrupt) or SIGNALS.received is not None:
         # OmegaConf and LLVM may fail in their own way when they are interrupted
         number = SIGNALS.received or signal.SIGINT
+        exec("")  # Python ends by SIGINT, whatever the exit code, if the last string it executed was interrupted
         try:
             resumes = find_verb(arguments)[0].name in RESUMING
         except ConfigError:
