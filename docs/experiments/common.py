@@ -40,7 +40,7 @@ def arguments(description: str, name: str, data: str) -> argparse.Namespace:
 
 def write(results: dict[str, Any], path: Path) -> None:
     """Write results with four digits, which all machines of one kind reproduce."""
-    path.write_text(json.dumps(_rounded(results), indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(_rounded(results), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     print(path.read_text(encoding="utf-8"), end="")
 
 
@@ -71,6 +71,34 @@ def divergence(real: Any, model: Any, width: int = 1) -> float:
     p, q = (np.histogram(values, edges)[0] + 0.5 for values in (real, model))
     p, q = p / p.sum(), q / q.sum()
     return float(np.sum(p * np.log(p / q)))
+
+
+YCBCR = np.array([[0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]])
+"""Rows of Y, Cb and Cr of BT.601, from R, G and B."""
+
+
+def colour(noise: Any) -> dict[str, float]:
+    """Return what the noise [H, W, 3] of a picture has in common between channels, and between neighbours in a row."""
+    y, cb, cr = np.moveaxis(noise @ YCBCR.T, -1, 0)
+    return {
+        "luma_std": float(y.std()),
+        "chroma_to_luma": float((cb.var() + cr.var()) / y.var()),
+        "red_green": correlation(noise[..., 0], noise[..., 1]),
+        "green_blue": correlation(noise[..., 1], noise[..., 2]),
+        "lag_1": float(np.mean([lag_1(channel) for channel in np.moveaxis(noise, -1, 0)])),
+        "lag_1_y": lag_1(y),
+        "lag_1_cb": lag_1(cb),
+    }
+
+
+def lag_1(values: Any) -> float:
+    """Return the correlation with the next pixel in a row."""
+    return correlation(values[:, :-1], values[:, 1:])
+
+
+def correlation(first: Any, second: Any) -> float:
+    """Return the correlation of two arrays of one shape."""
+    return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
 
 
 @dataclass(frozen=True)
