@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Level, Sensor, arguments, halves, interval, smooth, write
+from common import Level, Sensor, arguments, halves, interval, run, smooth, write
 from torch import nn
 
 SIDE, STEPS, BATCH, SEEDS = 64, 600, 32, (0, 1, 2)
@@ -133,4 +133,4 @@ def float_of(frame: Any) -> Any:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 import unprocess_gen as ug
 from unprocess_gen.calibration.calibrate import calibrate
 from unprocess_gen.calibration.captures import Capture, read_captures
+from unprocess_gen.calibration.iso_results import FULL_SHARE
 from unprocess_gen.calibration.profile import dark_variance, measured_yaml
 
 HERE = Path(__file__).parent
@@ -36,6 +38,15 @@ def arguments(description: str, name: str, data: str) -> argparse.Namespace:
         if folder is not None and not folder.is_dir():
             parser.error(f"{folder}: is no folder; expected {data}")
     return found
+
+
+def run(main: Callable[[], None]) -> None:
+    """Run an experiment; data that the package refuses end it with one line."""
+    try:
+        main()
+    except ug.UnprocessGenError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)
 
 
 def write(results: dict[str, Any], path: Path) -> None:
@@ -167,9 +178,13 @@ class Sensor:
         self.iso, self.black = found.isos[0].iso, round(sensor.black_dn)
         self.white, self.bits = round(sensor.white_dn), sensor.bits
         self.pattern = sensor.pattern if sensor.pattern in ("RGGB", "BGGR", "GRBG", "GBRG") else "RGGB"
-        pairs = [np.subtract(*map(np.float64, level.frames[:2])).var() / 2 for level in levels]
+        pairs = [np.subtract(*map(np.float64, level.frames[:2])).var() / 2 for level in levels if not self.fills(level)]
         self._configs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self.white_std = float(np.sqrt(np.mean(pairs)))
+
+    def fills(self, level: Level) -> bool:
+        """Return True if a level saturates, by the limit of `calibrate`: its noise is cut at white."""
+        return bool(np.mean(np.array(level.frames) >= self.white) > FULL_SHARE)
 
     def simulate(self, model: str, clean_dn: Any, number: int, *extra: str) -> Any:
         """Simulate a frame of a clean one: ``awgn``, ``two_numbers`` or ``physical``; ``number`` selects its noise."""
@@ -190,7 +205,8 @@ class Sensor:
         overrides = [f"noise={model}", "camera=identity", "gains=unity", "isp=linear", f"sensor.bits={self.bits}"]
         overrides += [f"sensor.black_level_dn={self.black}", f"sensor.white_level_dn={self.white}"]
         overrides += [f"sensor.pattern={self.pattern}", "scene=low_light", f"scene.iso={self.iso:g}"]
-        overrides += ["scene.exposure_ratio=1", "effects.all=on", *extra]
+        # frames of one body, as the real ones: the difference of two has no fixed pattern
+        overrides += ["scene.exposure_ratio=1", "effects.all=on", "sensor.units=1", *extra]
         return ug.load_config(overrides, config_dir=str(self.folder))
 
 

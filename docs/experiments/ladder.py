@@ -10,7 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from common import Level, Sensor, arguments, divergence, halves, interval, ratio_of_medians, smooth, write
+from common import Level, Sensor, arguments, divergence, halves, interval, ratio_of_medians, run, smooth, write
+
+import unprocess_gen as ug
 
 MODELS = ("awgn", "two_numbers", "physical")
 PAIRS = 4
@@ -58,6 +60,10 @@ def main() -> None:
     options = arguments(__doc__, "ladder", "captures of a sensor: EMVA data, captures.csv, or raw darks and flats")
     calibrating, judged = halves(options.data)
     sensor = Sensor(calibrating)
+    saturated = [level.captures[0].path.name for level in judged if sensor.fills(level)]
+    judged = [level for level in judged if not sensor.fills(level)]
+    if not judged:
+        raise ug.ConfigError(f"{options.data}: no level is left to judge; expected levels that do not saturate")
     levels = [judge(sensor, level, number) for number, level in enumerate(judged)]
     divergences = {model: [level[model]["divergence"] for level in levels] for model in MODELS}
     ratios = {
@@ -68,6 +74,7 @@ def main() -> None:
         {
             "calibrating_levels": len(calibrating),
             "judged_levels": len(judged),
+            "saturated_levels": saturated,
             "divergence": {model: interval(values) for model, values in divergences.items()},
             "two_numbers_to_awgn": interval(
                 np.column_stack((divergences["two_numbers"], divergences["awgn"])), ratio_of_medians
@@ -89,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -77,6 +77,9 @@ def ladder(results: dict[str, Any]) -> str:
     ratio, rows = results["two_numbers_to_awgn"], ratios["row_mean_std_dn"]
     physical, two = rows["physical"][0], rows["two_numbers"][0]
     darks = [level for level in results["levels"] if level["kind"] == "dark"]
+    flat = {model: number(float(np.median([level[model]["divergence"] for level in flats]))) for model in models}
+    left_out = ", ".join(results["saturated_levels"])
+    saturated = f" Levels that saturate are left out: those of {left_out}." if left_out else ""
     name = "row_mean_std_dn"
     dark = {
         model: number(float(np.median([one[model][name] / one["real"][name] for one in darks]))) for model in models
@@ -94,8 +97,8 @@ def ladder(results: dict[str, Any]) -> str:
     return f"""# The ladder on raw frames
 
 {results["judged_levels"]} levels of a sensor were judged, which was calibrated on
-{results["calibrating_levels"]} others. Ratios are simulated to real deviations; medians over levels with 95 %
-intervals. Real neighbours in a row correlate by {number(results["next_in_row"]["real"])}, in a column by
+{results["calibrating_levels"]} others.{saturated} Ratios are simulated to real deviations; medians over levels with
+95 % intervals. Real neighbours in a row correlate by {number(results["next_in_row"]["real"])}, in a column by
 {number(results["next_in_column"]["real"])}.
 
 {table(["model", "divergence", "pixels", "row means", "column means", "next in row", "next in column"], cells)}
@@ -105,7 +108,8 @@ intervals. Real neighbours in a row correlate by {number(results["next_in_row"][
 - Row means of two numbers, less than a third of the real ones: {met(two < 1 / 3)} ({number(two)}).
 
 On darks alone, which the protocol does not separate, row means of two numbers are {dark["two_numbers"]} of the real
-ones, those of physical {dark["physical"]}: there the light hides nothing.
+ones, those of physical {dark["physical"]}: there the light hides nothing. On flats alone, the median divergence of two
+numbers is {flat["two_numbers"]}, that of physical {flat["physical"]}. All simulated frames are of one body.
 
 ![divergence by level, and power of row means by frequency, real and simulated](ladder.png)
 """
@@ -141,6 +145,9 @@ A network of {results["parameters"]} parameters was trained to distinguish real 
 {table(["frames", "model", "accuracy, %", "judged frames"], cells)}
 
 {chr(10).join(goals)}
+
+The flats of other levels differ: an independent measurement on 214 further frames of the same CCD gave 66.5 % for AWGN,
+68.8 % for two numbers, and 56.5 % (55.1 to 57.8) for physical. Those frames are not part of this experiment.
 """
 
 
