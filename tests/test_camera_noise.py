@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import unprocess_gen as ug
+from unprocess_gen.picture_isp import SAMPLINGS
 from unprocess_gen.simulation.pair import make_pair
 
 CAMERAS = ("sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p")
@@ -159,13 +160,91 @@ def test_clean_can_be_the_picture_and_noisy_a_jpeg(picture: np.ndarray) -> None:
     assert errors[0] > 1.5 * errors[1] > 0
 
 
+ISO_12800 = ["noise=imx385_iso12800", "camera=sony_a7r"]
+
+
+def test_strength_multiplies_the_noise() -> None:
+    grey, linear = np.full((32, 33, 3), 30000, np.uint16), ["noise=imx385_iso1600", "camera=sony_a7r", "isp=linear"]
+    once, half, never = (ug.CameraNoise(linear, strength=factor)(grey, 1) for factor in (1, 0.5, 0))
+    assert (once[0] == half[0]).all()
+    assert (never[0] == never[1]).all()
+    difference = 2 * (half[1] - once[0].astype(float)) - (once[1] - once[0].astype(float))
+    assert np.abs(difference).max() <= 2  # codes are rounded
+
+
+def test_drawn_options_are_pure_in_seed_and_index(picture: np.ndarray) -> None:
+    drawn = {"strength": ["log_uniform", 0.5, 2], "jpeg": ["uniform", 70, 95]}
+    noise = ug.CameraNoise(ISO_12800, seed=3, **drawn)
+    copy = pickle.loads(pickle.dumps(noise))
+    assert (copy(picture, 7)[1] == ug.CameraNoise(ISO_12800, seed=3, **noise.drawn(7))(picture, 7)[1]).all()
+    values = [noise.drawn(index) for index in range(400)]
+    exponents = np.log2([value["strength"] for value in values])
+    assert -1 <= exponents.min() < exponents.max() <= 1
+    assert abs(exponents.mean()) < 3 * 2 / np.sqrt(12 * 400)
+    assert {value["jpeg"] for value in values} == set(range(70, 96))
+    assert noise.drawn(7) != ug.CameraNoise(ISO_12800, seed=4, **drawn).drawn(7)
+    assert ug.CameraNoise(jpeg=80).drawn(0) == {"strength": 1, "jpeg": 80}
+
+
+def luma_and_chroma(picture: np.ndarray) -> list[np.ndarray]:
+    """Y and Cb of codes, unrounded."""
+    return [picture @ np.array(weights) for weights in ([0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5])]
+
+
+def test_noise_reduction_acts_on_its_channels_of_noisy_pictures() -> None:
+    edge = np.full((64, 64, 3), 60, np.uint8)
+    edge[:, 32:] = 180
+    clean, noisy = ug.CameraNoise(ISO_12800)(edge, 1)
+    y, cb = luma_and_chroma(noisy)
+    for options in ({"chroma_nr": 2.0}, {"luma_nr": 30}):
+        same, reduced = ug.CameraNoise(ISO_12800, **options)(edge, 1)
+        assert (same == clean).all()
+        new_y, new_cb = luma_and_chroma(reduced)
+        inside = np.abs(reduced.astype(int) - 127).max(axis=2) < 127  # codes that no limit touches
+        if "chroma_nr" in options:
+            blurred = cv2.GaussianBlur(cb, (0, 0), 2.0)
+            assert np.abs(new_y - y)[inside].max() < 1  # rounding, twice
+            assert np.abs(new_cb - blurred)[inside].max() < 1
+        else:
+            assert np.abs(new_cb - cb)[inside].max() < 1
+            assert new_y[:, :24].std() < 0.6 * y[:, :24].std()
+            assert new_y[:, 33].mean() - new_y[:, 30].mean() > 0.9 * (y[:, 33].mean() - y[:, 30].mean())
+
+
+def test_chroma_sampling_of_jpeg() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (32, 32, 3)).astype(np.uint8)
+    noise = {sampling: ug.CameraNoise(jpeg=90, jpeg_sampling=sampling)(picture, 1)[1] for sampling in SAMPLINGS}
+    assert (noise["4:2:0"] == ug.CameraNoise(jpeg=90)(picture, 1)[1]).all()
+    uncompressed = ug.CameraNoise()(picture, 1)[1].astype(int)
+    errors = [np.abs(noise[sampling] - uncompressed).mean() for sampling in ("4:2:0", "4:2:2", "4:4:4")]
+    assert errors[0] > 1.1 * errors[1] > 1.1**2 * errors[2]
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 9), (3, 300)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_flat_colours_return_from_noise_reduction(shape: tuple[int, int], dtype: type) -> None:
+    flat = np.full((*shape, 3), np.array([0.2, 0.5, 0.4]) * np.iinfo(dtype).max, dtype)
+    noisy = ug.CameraNoise(["noise=none"], chroma_nr=100, luma_nr=255)(flat, 1)[1]
+    assert np.abs(noisy.astype(int) - flat).max() <= 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        ({"demosaic": "ahd"}, "demosaic='ahd': unknown; expected one of malvar, bilinear"),
+        ({"demosaic": "ahd"}, "CameraNoise: demosaic=ahd: not allowed; expected one of malvar, bilinear"),
         ({"clean": "none"}, "clean='none': unknown; expected one of developed, source"),
-        ({"jpeg": 0}, "jpeg=0: no quality; expected an integer from 1 to 100, or None"),
-        ({"jpeg": True}, "jpeg=True: no quality"),
+        ({"jpeg": 0}, "CameraNoise: jpeg=0: expected 1 to 100"),
+        ({"jpeg": True}, "jpeg=true: expected a finite number or a distribution: [uniform, lowest, highest]"),
+        ({"jpeg": 75.5}, "jpeg=75.5: not allowed; expected an integer from 1 to 100, a distribution, or None"),
+        ({"jpeg": ["uniform", 95, 70]}, "jpeg=[uniform, 95, 70]: expected the lowest value below the highest"),
+        ({"jpeg_sampling": "4:1:1"}, "jpeg_sampling=4:1:1: not allowed; expected one of 4:2:0, 4:2:2, 4:4:4"),
+        ({"strength": -1}, "strength=-1: expected 0 to 100"),
+        (
+            {"strength": ["normal", 1, 2]},
+            "expected a finite number or a distribution: [uniform, lowest, highest]; [log",
+        ),
+        ({"chroma_nr": -0.5}, "chroma_nr=-0.5: not allowed; expected 0 to 100"),
+        ({"luma_nr": "weak"}, "luma_nr=weak: not allowed; expected 0 to 255"),
         ({"config": "noise=none"}, "expected a list: ['noise=none']"),
         ({"config": ["noise=loud"]}, "noise=loud"),
         ({"config": ["seed=3"]}, "pass seed=3 to CameraNoise"),

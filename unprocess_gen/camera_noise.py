@@ -6,7 +6,6 @@ one between machines. No byte of a dataset depends on this module.
 
 from __future__ import annotations
 
-import functools
 import operator
 import os
 import warnings
@@ -14,9 +13,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from unprocess_gen.api import array_pixels, array_settings, plan_array
 from unprocess_gen.config.composition import load_config
@@ -25,11 +23,11 @@ from unprocess_gen.config.values import refusal
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.forks import SharedCount
+from unprocess_gen.picture_isp import IspOptions, compressed, render
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
-
-Float32 = NDArray[np.float32]
+from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 CLEANS = ("developed", "source")
 
@@ -46,12 +44,23 @@ class CameraNoise:
         From `load_config`, or Hydra overrides. Everything random is drawn for each index: camera, gains, noise.
     demosaic : str
         ``"malvar"``, the filters of Malvar, He and Cutler, or ``"bilinear"``.
-    jpeg : int, optional
-        Quality, 1 to 100, of the JPEG compression of noisy pictures; by default none.
+    jpeg : int or list, optional
+        Quality, 1 to 100, of the JPEG compression of noisy pictures, or its distribution, such as
+        ``["uniform", 70, 95]``, whose values are rounded to integers; by default none.
     seed : int
         Seed of all that is drawn. The config has none of its own.
     clean : str
         ``"developed"``: the frame without noise, developed like the noisy one. ``"source"``: the picture itself.
+    strength : float or list
+        Factor of the noise, 0 to 100, or its distribution, such as ``["log_uniform", 0.58, 1.7]``. The noisy light is
+        clean + strength · (noisy - clean), clipped where the sensor clips.
+    chroma_nr : float
+        Noise reduction of noisy pictures: standard deviation of the Gaussian blur of Cb and Cr, pixels; 0: none.
+    luma_nr : float
+        Noise reduction of noisy pictures by a bilateral filter of luma: difference that it smooths, as the standard
+        deviation of its range, in codes of 8 bits; 0: none.
+    jpeg_sampling : str
+        Chroma sampling of JPEG: ``"4:2:0"``, ``"4:2:2"`` or ``"4:4:4"``.
 
     Raises
     ------
@@ -88,26 +97,45 @@ class CameraNoise:
         self,
         config: Config | Sequence[str] = (),
         demosaic: str = "malvar",
-        jpeg: int | None = None,
+        jpeg: int | Sequence[Any] | None = None,
         seed: int = 0,
         clean: str = "developed",
+        *,
+        strength: float | Sequence[Any] = 1,
+        chroma_nr: float = 0,
+        luma_nr: float = 0,
+        jpeg_sampling: str = "4:2:0",
     ) -> None:
-        for name, value, allowed in (("demosaic", demosaic, tuple(isp.DEMOSAICS)), ("clean", clean, CLEANS)):
-            if value not in allowed:
-                raise ConfigError(f"CameraNoise: {name}={value!r}: unknown; expected one of {', '.join(allowed)}")
-        if jpeg is not None and (not isinstance(jpeg, int) or isinstance(jpeg, bool) or not 1 <= jpeg <= 100):
-            raise ConfigError(f"CameraNoise: jpeg={jpeg!r}: no quality; expected an integer from 1 to 100, or None")
+        self._options = IspOptions(demosaic, strength, chroma_nr, luma_nr, jpeg, jpeg_sampling)
+        if clean not in CLEANS:
+            raise ConfigError(f"CameraNoise: clean={clean!r}: unknown; expected one of {', '.join(CLEANS)}")
         if isinstance(config, str):
             raise ConfigError(f"CameraNoise: config={config!r}: is text; expected a list: [{config!r}]")
         if not isinstance(config, Config):
             config = load_config(config)
         self._settings = array_settings(_config_of_pictures(config, seed))
-        self._demosaic, self._jpeg, self._clean, self._seed = demosaic, jpeg, clean, seed
+        self._clean, self._seed = clean, seed
         self._calls, self._process, self._told = 0, os.getpid(), SharedCount()
 
     def __repr__(self) -> str:
         name = self._settings.config.noise.name
-        return f"CameraNoise(noise={name}, demosaic={self._demosaic}, jpeg={self._jpeg}, seed={self._seed})"
+        return f"CameraNoise(noise={name}, {self._options}, clean={self._clean}, seed={self._seed})"
+
+    def drawn(self, index: int) -> dict[str, float | int | None]:
+        """Strength of the noise and quality of the JPEG compression that an index selects.
+
+        Parameters
+        ----------
+        index : int
+            Number of the picture, as in a call.
+
+        Returns
+        -------
+        dict
+            ``strength``, a factor, and ``jpeg``, an integer or None.
+        """
+        strength, quality = self._options.drawn(self._seed, operator.index(index))
+        return {"strength": strength, "jpeg": quality}
 
     def __call__(self, picture: ArrayLike, index: int | None = None) -> tuple[Srgb, Srgb]:
         """Make a clean and a noisy picture.
@@ -128,22 +156,31 @@ class CameraNoise:
         pixels = array_pixels(picture)
         if min(pixels.shape[:2]) < 2:
             raise ValueError(f"picture is {list(pixels.shape)}; expected at least 2 x 2 pixels, for each filter one")
-        if self._jpeg is not None and pixels.dtype != np.uint8:
-            raise ValueError(f"picture is {pixels.dtype}; expected uint8 with jpeg={self._jpeg}, or jpeg=None")
+        if self._options.jpeg is not None and pixels.dtype != np.uint8:
+            raise ValueError(f"picture is {pixels.dtype}; expected uint8 with jpeg={self._options.jpeg}, or jpeg=None")
         if index is None:
             if os.getpid() != self._process and self._told.next() == 1:
                 problem = "without index, copies in several processes make the same noise"
                 warnings.warn(f"CameraNoise: {problem}; pass the index of the picture", stacklevel=2)
             index, self._calls = self._calls, self._calls + 1
-        _, image = plan_array(pixels, self._settings, operator.index(index))
+        index = operator.index(index)
+        _, image = plan_array(pixels, self._settings, index)
         if self._settings.config.self_test == "stop":
             self_test.check(image.plans[:1])
         _, plan, pair = next(image.pairs())
+        strength, quality = self._options.drawn(self._seed, index)
         has_noise = set(plan.noise.effects) != {"quantise"}
+        clean = noisy = _light(pair.clean, plan)
+        if has_noise:
+            noisy = _light(pair.noisy, plan)
+            noisy = noisy if strength == 1 else _with_strength(clean, noisy, strength, plan)
         codes = int(np.iinfo(pixels.dtype).max) + 1
-        noisy = _develop(pair.noisy if has_noise else pair.clean, plan, self._demosaic, codes)
-        clean = pixels.copy() if self._clean == "source" else _develop(pair.clean, plan, self._demosaic, codes)
-        return clean, noisy if self._jpeg is None else _compressed(noisy, self._jpeg)
+        noisy_picture = _develop(noisy, plan, self._options, codes)
+        if quality is not None:
+            noisy_picture = compressed(noisy_picture, quality, self._options.jpeg_sampling)
+        if self._clean == "source":
+            return pixels.copy(), noisy_picture
+        return _develop(clean, plan, self._options.without_reduction(), codes), noisy_picture
 
 
 def _config_of_pictures(config: Config, seed: int) -> Config:
@@ -161,35 +198,20 @@ def _config_of_pictures(config: Config, seed: int) -> Config:
     return replace(config, seed=seed, output=replace(config.output, clean_dtype=FLOAT32))
 
 
-def _develop(frame: Frame, plan: Plan, demosaic: str, codes: int) -> Srgb:
-    """Develop a frame in float32: gains, demosaicking, matrix, gamma and tone curve."""
+def _develop(light: Any, plan: Plan, options: IspOptions, codes: int) -> Srgb:
+    """Develop a mosaic of light to codes."""
+    return render(isp.white_balanced(light, plan, method=options.demosaic), plan, options, codes)
+
+
+def _light(frame: Frame, plan: Plan) -> Any:
+    """Light of a frame in float32, before the scene's darkening."""
     light: Any = frame.astype(np.float32)
-    is_dn = frame.dtype == np.uint16
-    light = isp.to_light(light, plan) if is_dn else light * np.float32(plan.scene.exposure_ratio)
-    image = isp.white_balanced(light, plan, method=demosaic)
-    table = _codes_of_roots(plan.isp.tone, plan.isp.gamma, codes)
-    positions: Any = cv2.transform(image, np.reshape(isp.cam2rgb(plan), (3, 3)).astype(np.float32))
-    np.sqrt(np.clip(positions, 0, 1, out=positions), out=positions)
-    positions *= np.float32(len(table) - 1)
-    positions += np.float32(0.5)
-    picture: Srgb = table.take(positions.astype(np.int32))
-    return picture
+    return isp.to_light(light, plan) if frame.dtype == np.uint16 else light * np.float32(plan.scene.exposure_ratio)
 
 
-ROOTS_PER_CODE = {256: 64, 65536: 4}
-"""Entries for each code of the table from roots of light to codes."""
-
-
-@functools.lru_cache(maxsize=8)
-def _codes_of_roots(tone: str, gamma: float | str, codes: int) -> Any:
-    """Codes of the squares of equally spaced values from 0 to 1, in place of powers of each pixel."""
-    light = np.linspace(0, 1, codes * ROOTS_PER_CODE[codes]) ** 2
-    rounded = isp.to_codes(isp.TONES[tone](isp.compress_gamma(light, gamma)), codes)
-    return np.asarray(rounded, dtype=np.uint8 if codes == 256 else np.uint16)
-
-
-def _compressed(picture: Srgb, quality: int) -> Srgb:
-    """Compress a picture as JPEG, and decode it."""
-    encoded = cv2.imencode(".jpg", picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
-    decoded: Any = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-    return np.ascontiguousarray(decoded[..., ::-1])
+def _with_strength(clean: Any, noisy: Any, strength: float, plan: Plan) -> Any:
+    """Light whose difference from the clean light is multiplied, clipped where the sensor clips."""
+    sensor, span_dn = plan.sensor, plan.sensor.span_dn
+    limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, sensor.sensor_clip)
+    low, high = ((limit - sensor.black_level_dn) / span_dn * plan.scene.exposure_ratio for limit in limits_dn)
+    return np.clip(clean + np.float32(strength) * (noisy - clean), low, high)

@@ -66,7 +66,7 @@ ONLY_IN = {
     "numba": {"simulation.kernels.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
-        *("reports.explorer.views", "reports.panels", "camera_noise"),
+        *("reports.explorer.views", "reports.panels", "picture_isp"),
     },
     "PIL": {"reports.pictures", "sources.image.decode", "sources.image.headers"},
     "tarfile": {"dataset.shards"},
