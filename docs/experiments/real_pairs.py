@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,8 @@ FORMS = {
     "ELD": re.compile(r"(?P<group>[^/]+)/scene-(?P<scene>\d+)/IMG_(?P<number>\d{4})\.\w+$"),
 }
 """Ends of the paths of noisy frames: their scene, and for some the phone and ISO, or the camera."""
+PATCHES = {"SIDD_patches": re.compile(r"samples_noisy/\d{4}_(?P<scene>\d{3})_(?P<group>\w+?_\d{5})_[^/]*$")}
+"""The same for the patches of SIDD in folders LIGHT/ISO/PHONE/KIND."""
 REFERENCES = (1, 6, 11, 16)
 """Numbers of the frames of an ELD scene that are clean."""
 
@@ -38,10 +40,10 @@ class RealPair:
     clean: Any
 
 
-def real_pairs(folder: Path) -> Iterator[RealPair]:
+def real_pairs(folder: Path, forms: Mapping[str, re.Pattern[str]] = FORMS) -> Iterator[RealPair]:
     """Yield the pairs below a folder, in the order of their names."""
     for path in sorted(folder.rglob("*")):
-        found = ((form, match) for form, name in FORMS.items() if (match := name.search(path.as_posix())))
+        found = ((form, match) for form, name in forms.items() if (match := name.search(path.as_posix())))
         form, match = next(found, ("", None))
         if match is None or path.suffix.lower() not in (*PICTURES, *RAW_FILES):
             continue
@@ -58,6 +60,8 @@ def clean_of(noisy: Path, form: str, scene: str) -> Path:
     if form == "ELD":
         number = min(REFERENCES, key=lambda reference: abs(reference - int(noisy.stem[-4:])))
         return noisy.with_stem(f"IMG_{number:04d}")
+    if form in PATCHES:
+        return noisy.parents[1] / "samples_gts" / noisy.name
     return noisy.with_name(noisy.name.replace("_real.", "_mean.").replace("NOISY_SRGB", "GT_SRGB"))
 
 

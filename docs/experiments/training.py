@@ -1,15 +1,20 @@
-"""Experiment 4: train one network on four kinds of noise, and judge it on real pairs.
+"""Experiment 4: train one network on several kinds of noise, and judge it on real pairs.
 
     python docs/experiments/training.py PAIRS [--raw CAPTURES] [--photos FOLDER] [--to RESULTS.json]
 
-Needs PyTorch. PAIRS is a folder of PolyU, SIDD, SID or ELD; CAPTURES is one that ``gen-dataset calibrate`` reads.
-Protocol: protocol.md.
+Needs PyTorch. PAIRS is a folder of PolyU, SIDD, patches of SIDD, SID or ELD, or of several of these, which are judged
+apart; CAPTURES is one that ``gen-dataset calibrate`` reads. The scores of each training are added to RESULTS.jsonl, and
+a training that has a line there is not repeated. Protocol: protocol.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
+import functools
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import islice, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +23,39 @@ import joblib
 import numpy as np
 import torch
 from common import Level, Sensor, arguments, halves, interval, write
-from real_pairs import real_pairs
+from real_pairs import FORMS, PATCHES, RealPair, real_pairs
 from torch import nn
 
 import unprocess_gen as ug
 
-WIDTH, SIDE, BATCH, STEPS, RATE, SEEDS = 24, 48, 8, 400, 0.002, (0, 1, 2)
-NOISE = ["noise=canon_5d4", "scene.iso=[log_uniform, 800, 6400]"]
-SCENES = {"srgb": "low_light", "srgb_daylight": "daylight"}
-SRGB = ("awgn", "signal_dependent", "two_numbers", "physical")
+WIDTH, BATCH, RATE, SEEDS = 24, 8, 0.002, (0, 1, 2)
+SIDE, STEPS, STEPS_PER_PICTURE = 32, 1600, 20 / 3
+RAW_SIDE, RAW_STEPS = 48, 400
+DAYLIGHT = ["noise=canon_5d4", "scene.iso=[log_uniform, 800, 6400]", "scene=daylight"]
+DAYLIGHT += ["effects.all=off", "effects.shot=on", "effects.read=on"]
+PHONES = ["noise=heteroscedastic", "noise.a=[log_uniform, 3, 60]", "noise.b=[log_uniform, 60, 3000]"]
+PHONES += ["noise.units=dn", "noise.black=subtracted"]
+PHONES += ["noise.bits=12", "noise.black_level_dn=240", "noise.white_level_dn=4095"]
+NOISE = {"SIDD": PHONES, "SIDD_patches": PHONES}
+"""Two numbers for the pictures of a set; `DAYLIGHT` for all others."""
+WHITE = {"awgn": 1.0, "awgn_1.6": 1.6, "awgn_2.5": 2.5}
+"""White models, and their deviation in luma relative to that of `CameraNoise`."""
+CAMERA = {"bilinear": "bilinear", "malvar": "malvar"}
+FITTED = ("fitted", "fitted_isp")
+MODELS = (*WHITE, *CAMERA, *FITTED, "real")
+DIFFERENCES = (
+    ("malvar", "awgn"),
+    ("malvar", "best_awgn"),
+    ("bilinear", "awgn"),
+    ("malvar", "bilinear"),
+    ("fitted", "malvar"),
+    ("fitted", "best_awgn"),
+    ("fitted_isp", "fitted"),
+    ("fitted_isp", "best_awgn"),
+    ("real", "best_awgn"),
+)
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 RAW = ("awgn", "two_numbers", "physical")
-TWO = ["effects.all=off", "effects.shot=on", "effects.read=on"]
 
 
 def network(channels: int) -> nn.Sequential:
@@ -50,43 +77,87 @@ def photographs(folder: Path | None) -> list[Any]:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg", ".png"))
         pictures = [cv2.imread(str(file), cv2.IMREAD_COLOR)[..., ::-1] for file in files]
     half = [cv2.resize(np.ascontiguousarray(p), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for p in pictures]
-    return [picture for picture in half if min(picture.shape[:2]) >= SIDE]
+    return [picture for picture in half if min(picture.shape[:2]) >= RAW_SIDE]
 
 
 def crops(pictures: Sequence[Any], seed: int) -> Iterator[tuple[int, Any]]:
-    """Yield the number and the pixels of random crops, the same for all models."""
+    """Yield the number and the pixels of random crops for raw frames, the same for all models."""
     random = np.random.default_rng(seed)
-    for number in range(STEPS * BATCH):
+    for number in range(RAW_STEPS * BATCH):
         picture = pictures[random.integers(len(pictures))]
-        y, x = (random.integers(side - SIDE + 1) for side in picture.shape[:2])
-        yield number, np.ascontiguousarray(picture[y : y + SIDE, x : x + SIDE])
+        y, x = (random.integers(side - RAW_SIDE + 1) for side in picture.shape[:2])
+        yield number, np.ascontiguousarray(picture[y : y + RAW_SIDE, x : x + RAW_SIDE])
 
 
-def noise_by_level(noisy: Any, clean: Any) -> Any:
-    """Return the standard deviation of the noise of each pixel, from that of its band of levels."""
-    bands, std = clean // 32, np.empty(clean.shape)
-    for channel in range(3):
-        for band in np.unique(bands[..., channel]):
-            where = bands[..., channel] == band
-            std[..., channel][where] = np.sqrt(np.mean((noisy[..., channel][where] - clean[..., channel][where]) ** 2))
-    return std
+@dataclass(frozen=True)
+class Training:
+    """One training: the set whose pictures judge it, its noise, seed, steps, and the half of the scenes it has seen."""
+
+    pictures: str
+    model: str
+    seed: int
+    steps: int
+    half: int | None = None
 
 
-def camera_patches(settings: Sequence[str], pictures: Sequence[Any], seed: int) -> list[tuple[Any, Any]]:
-    """Return clean and noisy patches of `CameraNoise`."""
-    camera = ug.CameraNoise(settings, seed=seed)
-    return [camera(crop, index=number) for number, crop in crops(pictures, seed)]
+def trainings(sets: Sequence[str]) -> Iterator[Training]:
+    """Yield all trainings, those that need no fit first."""
+    for seed, name, model in product(SEEDS, sets, (*WHITE, *CAMERA)):
+        yield Training(name, model, seed, STEPS)
+    for name, model in product(sets, (*WHITE, *CAMERA)):
+        yield Training(name, model, SEEDS[0], 2 * STEPS)
+    for name, half in product(sets, (0, 1)):
+        yield Training(name, "real", SEEDS[0], STEPS, half)
 
 
-def srgb_patches(model: str, patches: Sequence[tuple[Any, Any]], seed: int) -> Iterator[tuple[Any, Any]]:
-    """Yield noisy and clean patches of a model; white models have the strength of the two-number ``patches``."""
+def half_of(pairs: Sequence[RealPair], half: int) -> list[int]:
+    """Return the numbers of the pairs of one half of the scenes, which alternate in order."""
+    scenes = sorted({pair.scene for pair in pairs})[half::2]
+    return [number for number, pair in enumerate(pairs) if pair.scene in scenes]
+
+
+@functools.lru_cache(maxsize=2)
+def camera_pictures(name: str, demosaic: str, seed: int, steps: int, photos: Path | None) -> list[tuple[Any, Any]]:
+    """Return noisy and clean pictures of `CameraNoise`, which takes the photographs in turn."""
+    camera, pictures = ug.CameraNoise(NOISE.get(name, DAYLIGHT), demosaic=demosaic, seed=seed), photographs(photos)
+    count = round(steps / STEPS_PER_PICTURE)
+    return [camera(pictures[number % len(pictures)], index=number)[::-1] for number in range(count)]
+
+
+def cuts(pictures: Sequence[tuple[Any, Any]], seed: int, steps: int) -> Iterator[tuple[Any, Any]]:
+    """Yield noisy and clean patches, at the same places for all models with pictures of the same shapes."""
+    random = np.random.default_rng(seed)
+    for _ in range(steps * BATCH):
+        noisy, clean = pictures[random.integers(len(pictures))]
+        y, x = (random.integers(side - SIDE + 1) for side in clean.shape[:2])
+        yield tuple(picture[y : y + SIDE, x : x + SIDE].astype(np.float32) for picture in (noisy, clean))
+
+
+def whitened(patches: Iterator[tuple[Any, Any]], strength: float, seed: int) -> Iterator[tuple[Any, Any]]:
+    """Replace the noise of patches by white noise, whose deviation in luma is ``strength`` times theirs."""
     random = np.random.default_rng(100 + seed)
-    for pair in patches:
-        clean, noisy = (picture.astype(np.float64) for picture in pair)
-        if model in ("awgn", "signal_dependent"):
-            std = np.std(noisy - clean) if model == "awgn" else noise_by_level(noisy, clean)
-            noisy = np.clip(np.rint(clean + random.normal(0, 1, clean.shape) * std), 0, 255)
-        yield noisy / 255, clean / 255
+    for noisy, clean in patches:
+        std = strength * np.std((noisy - clean) @ LUMA) / np.sqrt(LUMA @ LUMA)
+        drawn = random.standard_normal(clean.shape, np.float32) * np.float32(std)
+        yield np.clip(np.rint(clean + drawn), 0, 255), clean
+
+
+def patches_of(training: Training, pairs: Sequence[RealPair], photos: Path | None) -> Iterator[tuple[Any, Any]]:
+    """Return the patches of a training, noisy and clean, in codes of 8 bits."""
+    model, seed, steps = training.model, training.seed, training.steps
+    if training.half is not None:
+        seen = [pairs[number] for number in half_of(pairs, training.half)]
+        return cuts([(pair.noisy, pair.clean) for pair in seen], seed, steps)
+    pictures = camera_pictures(training.pictures, CAMERA.get(model, "malvar"), seed, steps, photos)
+    patches = cuts(pictures, seed, steps)
+    return whitened(patches, WHITE[model], seed) if model in WHITE else patches
+
+
+def noise_facts(pairs: Sequence[tuple[Any, Any]]) -> dict[str, float]:
+    """Return the median deviation of the luma of noise, in codes, and its median correlation of red and green."""
+    noises = [np.subtract(noisy, clean, dtype=np.float64) for noisy, clean in pairs]
+    cross = [np.corrcoef(n[..., 0].ravel(), n[..., 1].ravel())[0, 1] for n in noises if n[..., :2].std((0, 1)).all()]
+    return {"luma_codes": float(np.median([np.std(n @ LUMA) for n in noises])), "red_green": float(np.median(cross))}
 
 
 def raw_patches(model: str, pictures: Sequence[Any], seed: int, sensor: Sensor) -> Iterator[tuple[Any, Any]]:
@@ -115,13 +186,13 @@ def to_tensor(images: Sequence[Any]) -> Any:
     return torch.from_numpy(np.stack(images).astype(np.float32)).permute(0, 3, 1, 2)
 
 
-def trained(patches: Iterator[tuple[Any, Any]], channels: int, seed: int) -> nn.Sequential:
+def trained(patches: Iterator[tuple[Any, Any]], channels: int, seed: int, steps: int) -> nn.Sequential:
     """Train a network on patches of one model."""
     torch.manual_seed(seed)
     model = network(channels)
-    optimiser = torch.optim.Adam(model.parameters(), RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
-    for _ in range(STEPS):
+    optimiser = torch.optim.Adam(model.parameters(), RATE, fused=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
         noisy, clean = (to_tensor(images) for images in zip(*(next(patches) for _ in range(BATCH)), strict=True))
         loss = nn.functional.mse_loss(noisy - model(noisy), clean)
         optimiser.zero_grad()
@@ -147,28 +218,9 @@ def quality(image: Any, clean: Any) -> tuple[float, float]:
     return float(-10 * np.log10(np.mean((image - clean) ** 2))), float(similar)
 
 
-def by_scene(scenes: Sequence[str], values: Any) -> Any:
-    """Return the mean of the values of each scene."""
-    return np.array([np.mean(values[[scene == other for other in scenes]], axis=0) for scene in sorted(set(scenes))])
-
-
 def by_seed(scores: Callable[..., dict[str, Any]], *given: Any) -> list[dict[str, Any]]:
     """Return what a function gives for each seed, each in its own process with one thread."""
     return list(joblib.Parallel(n_jobs=len(SEEDS))(joblib.delayed(scores)(seed, *given) for seed in SEEDS))
-
-
-def srgb_scores(
-    seed: int, pairs: Sequence[tuple[str, Any, Any]], pictures: Sequence[Any], settings: Sequence[str]
-) -> dict[str, Any]:
-    """Train all models with a seed; return PSNR and SSIM of each pair."""
-    prepare()
-    two, scores = camera_patches([*settings, *TWO], pictures, seed), {}
-    for model in SRGB:
-        patches = camera_patches(settings, pictures, seed) if model == "physical" else two
-        net = trained(srgb_patches(model, patches, seed), 3, seed)
-        scores[model] = [quality(denoised(net, noisy), clean) for _, noisy, clean in pairs]
-        print(model, seed, np.mean(scores[model], axis=0), flush=True)
-    return scores
 
 
 def raw_scores(seed: int, judged: Sequence[Level], sensor: Sensor, pictures: Sequence[Any]) -> dict[str, Any]:
@@ -176,7 +228,7 @@ def raw_scores(seed: int, judged: Sequence[Level], sensor: Sensor, pictures: Seq
     prepare()
     scores = {}
     for model in RAW:
-        net = trained(raw_patches(model, pictures, seed, sensor), 1, seed)
+        net = trained(raw_patches(model, pictures, seed, sensor), 1, seed, RAW_STEPS)
         scores[model] = [
             shares(lambda dn, net=net: denoised(net, to_input(dn, sensor)[..., None]), level, sensor)
             for level in judged
@@ -191,42 +243,90 @@ def prepare() -> None:
     torch.use_deterministic_algorithms(True)
 
 
-def noise_codes(pairs: Iterator[tuple[Any, Any]]) -> float:
-    """Return the median over pictures of the standard deviation of their noise, codes of 8 bits."""
-    return float(np.median([np.std(noisy - clean) for noisy, clean in pairs]) * 255)
+def judged(training: Training, pairs: Sequence[RealPair], photos: Path | None) -> dict[str, Any]:
+    """Train, and return PSNR and SSIM of the judged pairs by their numbers, with the facts of the training noise."""
+    prepare()
+    facts = noise_facts(list(islice(patches_of(training, pairs, photos), 300)))
+    patches = ((noisy / 255, clean / 255) for noisy, clean in patches_of(training, pairs, photos))
+    net = trained(patches, 3, training.seed, training.steps)
+    numbers = range(len(pairs)) if training.half is None else half_of(pairs, 1 - training.half)
+    scores = {n: quality(denoised(net, pairs[n].noisy / 255), pairs[n].clean / 255) for n in numbers}
+    return {"training": asdict(training), "scores": scores, **facts}
 
 
-def judge_srgb(folder: Path, pictures: Sequence[Any], scene: str) -> dict[str, Any]:
-    """Train on all models, and compare them on real sRGB pairs."""
-    settings = [*NOISE, f"scene={scene}"]
-    pairs = [(pair.scene, pair.noisy / 255, pair.clean / 255) for pair in real_pairs(folder)]
-    if not pairs:
-        raise SystemExit(f"{folder}: no pairs; expected files named as in PolyU, SIDD, SID or ELD")
-    scenes = [scene for scene, _, _ in pairs]
-    scores = {"noisy": np.array([quality(noisy, clean) for _, noisy, clean in pairs])}
-    seeds = by_seed(srgb_scores, pairs, pictures, settings)
-    trained_on = srgb_patches("two_numbers", camera_patches([*settings, *TWO], pictures, 0), 0)
-    for model in SRGB:
-        scores[model] = np.mean([found[model] for found in seeds], axis=0)
-        scores[f"{model}_seeds"] = np.mean([found[model] for found in seeds], axis=1)[:, 0]
-    means = {model: by_scene(scenes, scores[model]) for model in ("noisy", *SRGB)}
-    differences = [("two_numbers", "awgn"), ("two_numbers", "signal_dependent"), ("physical", "two_numbers")]
+def scores_of_all(sets: dict[str, list[RealPair]], file: Path, photos: Path | None) -> dict[Training, dict[str, Any]]:
+    """Return the scores of all trainings: those in the file, and the others, which are added to it."""
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    found = {Training(**line["training"]): line for line in map(json.loads, lines)}
+    for training in trainings(list(sets)):
+        if training not in found:
+            line = json.dumps(judged(training, sets[training.pictures], photos))
+            with file.open("a", encoding="utf-8") as stream:
+                stream.write(line + "\n")
+            found[training] = json.loads(line)
+            print(training, np.mean(list(found[training]["scores"].values()), axis=0), flush=True)
+    return found
+
+
+def by_group(pairs: Sequence[RealPair], values: Any) -> Any:
+    """Return the mean of the values of each group: scene, and phone and ISO if they are known."""
+    groups = [(pair.scene, pair.group) for pair in pairs]
+    return np.array([np.mean(values[[own == group for own in groups]], axis=0) for group in sorted(set(groups))])
+
+
+def quality_of(found: Iterable[dict[str, Any]], count: int) -> Any:
+    """Return PSNR and SSIM of the pairs of a set after one training, or after those of both halves: [pairs, 2]."""
+    values = np.full((count, 2), np.nan)
+    for scores in found:
+        for number, score in scores["scores"].items():
+            values[int(number)] = score
+    return values
+
+
+def summary(name: str, pairs: Sequence[RealPair], found: dict[Training, dict[str, Any]]) -> dict[str, Any]:
+    """Compare the models on the pairs of a set."""
+    lines: dict[tuple[str, int, int], list[dict[str, Any]]] = defaultdict(list)
+    for training, line in found.items():
+        if training.pictures == name:
+            lines[training.model, training.seed, training.steps].append(line)
+    by_pair = {key: quality_of(line, len(pairs)) for key, line in lines.items()}
+    seeds = {model: SEEDS[:1] if model == "real" else SEEDS for model in MODELS}
+    models = [m for m in MODELS if all(np.isfinite(by_pair.get((m, s, STEPS), np.nan)).all() for s in seeds[m])]
+    groups = {"noisy": by_group(pairs, np.array([quality(pair.noisy / 255, pair.clean / 255) for pair in pairs]))}
+    for model in models:
+        groups[model] = by_group(pairs, np.mean([by_pair[model, s, STEPS] for s in seeds[model]], axis=0))
+    best = max((model for model in WHITE if model in groups), key=lambda model: np.mean(groups[model][:, 0]))
+    compared = {**groups, "best_awgn": groups[best]}
+    differences = [pair for pair in DIFFERENCES if pair[0] in compared and pair[1] in compared]
+    noise = {"real": noise_facts([(pair.noisy, pair.clean) for pair in pairs])}
+    for model in models:
+        trained_on = [line for s in seeds[model] for line in lines[model, s, STEPS]]
+        noise[model] = {fact: float(np.median([line[fact] for line in trained_on])) for fact in noise["real"]}
+    measures = {"psnr": 0, "ssim": 1}
     return {
         "pairs": len(pairs),
-        "noise_codes": {"trained": noise_codes(trained_on), "judged": noise_codes(pair[1:] for pair in pairs)},
-        "scenes": len(means["noisy"]),
-        "parameters": sum(p.numel() for p in network(3).parameters()),
-        "psnr_db": {model: interval(means[model][:, 0], np.mean) for model in means},
-        "ssim": {model: interval(means[model][:, 1], np.mean) for model in means},
-        "psnr_db_by_seed": {model: scores[f"{model}_seeds"] for model in SRGB},
-        "psnr_difference_db": {
-            f"{first} - {second}": interval(means[first][:, 0] - means[second][:, 0], np.mean)
-            for first, second in differences
+        "groups": len(groups["noisy"]),
+        "not_run": [model for model in MODELS if model not in models],
+        "best_awgn": best,
+        "noise": noise,
+        **{f: {model: interval(groups[model][:, n], np.mean) for model in groups} for f, n in measures.items()},
+        **{
+            f"{measure}_difference": {
+                f"{first} - {second}": interval(compared[first][:, n] - compared[second][:, n], np.mean)
+                for first, second in differences
+            }
+            for measure, n in measures.items()
         },
-        "ssim_difference": {
-            f"{first} - {second}": interval(means[first][:, 1] - means[second][:, 1], np.mean)
-            for first, second in differences
+        "psnr_by_seed": {
+            model: [float(np.mean(by_group(pairs, by_pair[model, s, STEPS])[:, 0])) for s in seeds[model]]
+            for model in models
         },
+        "psnr_of_longer_training": {
+            model: float(np.mean(by_group(pairs, by_pair[model, SEEDS[0], 2 * STEPS])[:, 0]))
+            for model in models
+            if (model, SEEDS[0], 2 * STEPS) in by_pair
+        },
+        "psnr_by_group": {model: values[:, 0] for model, values in groups.items()},
     }
 
 
@@ -261,11 +361,22 @@ def shares(denoise: Callable[[Any], Any], level: Any, sensor: Sensor) -> float:
 def main() -> None:
     """Run the experiment."""
     options = arguments(__doc__, "training", "folder of PolyU, SIDD, SID or ELD")
+    forms = {**FORMS, **PATCHES}
+    sets = {name: list(real_pairs(options.data, {name: form})) for name, form in forms.items()}
+    sets = {name: pairs for name, pairs in sets.items() if pairs}
+    if not sets:
+        raise SystemExit(f"{options.data}: no pairs; expected files named as in PolyU, SIDD, SID or ELD")
+    found = scores_of_all(sets, options.to.with_suffix(".jsonl"), options.photos)
     pictures = photographs(options.photos)
-    results: dict[str, Any] = {"photographs": len(pictures), "steps": STEPS, "seeds": len(SEEDS)}
-    for name, scene in SCENES.items():
-        results[name] = judge_srgb(options.data, pictures, scene)
-        write(results, options.to)
+    results = json.loads(options.to.read_text(encoding="utf-8")) if options.to.exists() else {}
+    results = {
+        "photographs": len(pictures),
+        "steps": STEPS,
+        "seeds": len(SEEDS),
+        "parameters": sum(p.numel() for p in network(3).parameters()),
+        "sets": {name: summary(name, pairs, found) for name, pairs in sets.items()},
+        **({"raw": results["raw"]} if "raw" in results else {}),
+    }
     if options.raw:
         results["raw"] = judge_raw(options.raw, pictures)
     write(results, options.to)
