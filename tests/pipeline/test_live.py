@@ -151,6 +151,7 @@ def test_light_and_targets(night: Path) -> None:
     span = row["white_level_dn"] - row["black_level_dn"]
     np.testing.assert_array_equal(sample.noisy, ug.to_light(stored.noisy, row))
     np.testing.assert_array_equal(stored.targets["noise_std"], ug.noise_std(stored.noisy, row))
+    assert "prnu" not in row["effects"]
     law = row["a_dn"] * (stored.clean.astype(float) - row["black_level_dn"]) + row["dark_variance_dn2"]
     np.testing.assert_allclose(stored.targets["variance"], law, rtol=1e-6)
     np.testing.assert_allclose(sample.targets["variance"], law / span**2, rtol=1e-5)

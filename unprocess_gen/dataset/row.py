@@ -105,8 +105,8 @@ class Measured(PlanRecord, frozen=True, kw_only=True):
 
     # fmt: off
     dark_variance_dn2: Annotated[float, Field(
-        "noise variance of a site at black, by all simulated effects except hot pixels, dead pixels and rounding; "
-        "ug.noise_std uses it", FINITE, "DN²")]
+        "noise variance of a site at black, by all simulated effects except hot pixels, dead pixels and rounding, and "
+        "without the fixed patterns of the clean frame; ug.noise_std uses it", FINITE, "DN²")]
     clean_xxh3: Annotated[str, Field("XXH3-128 of the clean array's little-endian bytes", HEX_128, needs=FRAMES)]
     noisy_xxh3: Annotated[str, Field("XXH3-128 of the noisy array's little-endian bytes", HEX_128, needs=FRAMES)]
     targets: Annotated[str, Field(

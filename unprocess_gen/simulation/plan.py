@@ -332,7 +332,8 @@ class NoisePlan(PlanRecord, frozen=True):
         "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a "
         "plus a normal distribution of variance b", Choice("gaussian", "poisson"))]
     a_dn: Annotated[float, Field(
-        "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Numbers(-1e30, 1e30), "DN")]
+        "slope of the noise variance a_dn u + dark_variance_dn2 + (prnu_std u)², where u is x - black; the last term "
+        "only with prnu in effects, and not if the clean frame has the fixed patterns", Numbers(-1e30, 1e30), "DN")]
     b_dn2: Annotated[float, Field(
         "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE, "DN²")]
     effects: Annotated[tuple[str, ...], Field(
