@@ -53,6 +53,15 @@ def test_profile_is_used_as_it_was_written(calibrated: Any, run_main: RunMain, t
         assert text in done.err
 
 
+def test_flats_of_a_simulated_body_have_all_codes(calibrated: Any, tmp_path: Path) -> None:
+    """Shot noise hides the size of the read noise of this body, but not the steps between its electrons."""
+    camera = Camera("nikon_d850", 800, 256, effects="auto")
+    profile = calibrated(record(tmp_path / "captures", camera, darks=4, levels=(0.05, 0.1, 0.2, 0.3)))
+    gain = estimates(profile)["dn_per_e", 800.0, None]
+    low, high = gain["interval"]
+    assert abs(gain["value"] - camera.truth["dn_per_e"]) <= high - low  # four standard errors
+
+
 @pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.7, 1.0, 0.4)], ids=["neutral", "coloured"])
 def test_numbers_of_the_body_are_measured(light: tuple[float, float, float], calibrated: Any, tmp_path: Path) -> None:
     """Gains by colour and dark current agree with the true values in their errors, if levels reach the full well."""

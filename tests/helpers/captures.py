@@ -114,12 +114,13 @@ def load_profile(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Camera:
-    """A simulated camera: a profile at an ISO, the side of its frames, and a seed, which is its body."""
+    """A simulated camera: a profile at an ISO, the side of its frames, a seed, which is its body, and its effects."""
 
     profile: str
     iso: float
     side: int = 512
     seed: int = 0
+    effects: str = "on"
 
     def pair(self, light: float, seconds: float, number: int) -> ug.RawPair:
         """Record a frame of even light, a fraction of white above black."""
@@ -136,7 +137,7 @@ class Camera:
         levels = [f"sensor.{name}={getattr(noise, name)}" for name in ("bits", "black_level_dn", "white_level_dn")]
         return load(
             *("camera=identity", "gains=unity", "isp=linear", f"noise={self.profile}", f"scene.iso={self.iso}"),
-            *("effects.all=on", "sensor.units=1", *levels),
+            *(f"effects.all={self.effects}", "sensor.units=1", *levels),
         )
 
     @property

@@ -187,7 +187,7 @@ def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
     def around(middle: float, decades: float = 1.5) -> float:
         return float(middle * 10 ** rng.uniform(-decades, decades))
 
-    gain, read = around(1.0), around(2.0)
+    gain, read = around(0.3), around(2.0)
     return physics.replace(
         dn_per_e=gain,
         prnu_std=min(around(0.01), 0.3),

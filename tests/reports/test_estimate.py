@@ -6,10 +6,12 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill
+from PIL import Image
 
 from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.reports.estimate import SAMPLE, estimate_run
@@ -85,6 +87,13 @@ def test_every_effect_has_size_noise_and_reason(settings: Settings, tmp_path: Pa
     assert re.search(r"^dark_current .* 0 of 2 +too small to see$", text, re.MULTILINE)
     assert re.search(r"^row .* 0 of 2 +switched off \(it would be visible\)$", text, re.MULTILINE)
     assert re.search(r"^dsnu +0 of 2 +noise=nikon_d850 gives no dsnu_std_e$", text, re.MULTILINE)
+
+
+def test_read_noise_that_fills_codes_has_this_reason(settings: Settings, tmp_path: Path) -> None:
+    flat = tmp_path / "flat.png"
+    Image.fromarray(np.full((96, 128, 3), 150, np.uint8)).save(flat)
+    text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene.iso=800", f"source.root={flat}")
+    assert re.search(r"^read .* 1 of 1 +fills the codes between electrons, which are \S+ DN apart$", text, re.MULTILINE)
 
 
 NIGHT = r"scene     night: ISO 6400, 0\.1 s, 20 °C, light divided by "

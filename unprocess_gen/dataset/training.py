@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -109,7 +110,7 @@ def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
     black, _ = _levels(row)
     signal = np.asarray(noisy).astype(np.float32) - np.float32(black)
     skipped = {reason.partition(":")[0] for reason in str(row.get("skipped") or "").split(";")}
-    slope = np.float32(0 if skipped & {"shot", "heteroscedastic"} else row["a_dn"] or 0)
+    slope: Any = np.float32(0 if skipped & {"shot", "heteroscedastic"} else row["a_dn"] or 0)
     has_prnu = "prnu" not in skipped and not int(row.get("fixed_pattern_in_clean") or 0)
     if has_prnu and (prnu_std := float(row.get("prnu_std") or 0)):
         slope = np.float32(prnu_std**2) * signal + slope

@@ -3,7 +3,7 @@
 `frame_model` predicts the ratio of each effect to the masking noise: shot, dark-current, read and rounding
 noise of the other effects that stay on. Under ``auto``, the weakest effects are omitted while all omitted ones together
 stay within the tolerance in every statistic. Random parts add in quadrature, offsets linearly. The idea is imSim's:
-thresholds in units of the noise.
+thresholds in units of the noise. Read noise stays where it fills the codes between electrons (`effects.read`).
 
 Hot and dead pixels above one standard deviation of the masking noise are too rare for a variance. They are counted
 instead, and simulated if at least `MIN_OUTLIERS` are expected per frame.
@@ -64,6 +64,7 @@ class Prediction(NamedTuple):
     simulated: bool
     forced: bool  # the configuration decided, not the image
     why: str  # the comparison with the tolerance, or the reason in the configuration
+    kept_for: str  # why the effect is simulated although the noise hides it; empty for others
 
     @property
     def reason(self) -> str:
@@ -235,17 +236,20 @@ def omit_weakest(
 
     ``before`` are effects that were omitted already. The others are tried from weakest to strongest. The first omission
     that exceeds the tolerance, or drops `MIN_OUTLIERS` outliers, ends the search; so a larger tolerance never simulates
-    more.
+    more. Effects that others need stay on (`Effect.reason_to_keep`).
     """
     omitted = list(before)
     for effect in weakest_first(frame, on, free):
-        omitted.append(effect)
         rest = on - {effect}
+        omitted.append(effect)
         if any(frame.outliers(rare, rest) >= MIN_OUTLIERS for rare in omitted if rare in RARE):
             break
         if any(frame.ratio(tuple(omitted), level_dn, rest) > tolerance for level_dn in frame.levels(rest)):
             break
-        on = rest
+        if BY_NAME[effect].reason_to_keep(frame, on):
+            omitted.pop()
+        else:
+            on = rest
     return on
 
 
@@ -283,8 +287,10 @@ def _prediction(
     why = f"{ratios[index]:.3g} of the noise there"
     if BY_NAME[effect].has_outliers:
         why += f", {outliers:.3g} outliers"
+    kept_for = ""
     if simulated and ratios[index] <= tolerance and outliers < MIN_OUTLIERS:
-        why += ", too much together with the omitted effects"
+        kept_for = BY_NAME[effect].reason_to_keep(frame, on) or "too much together with the omitted effects"
+        why += f", {kept_for}"
     why += f" (tolerance {tolerance:g})"
     found = effect, STATISTICS[index], predicted_dn, math.sqrt(masking / frame.counts[index]), outliers, simulated
-    return Prediction(*found, forced is not None, forced.reason if forced else why)
+    return Prediction(*found, forced is not None, forced.reason if forced else why, kept_for)

@@ -262,4 +262,4 @@ def _reason(prediction: Prediction, tolerance: float) -> str:
         return f"{prediction.why} (it would be visible)" if is_visible and not prediction.simulated else prediction.why
     if not prediction.simulated:
         return "too small to see"
-    return "visible" if is_visible else "too much together with the omitted effects"
+    return prediction.kept_for or "visible"

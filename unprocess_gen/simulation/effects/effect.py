@@ -85,6 +85,10 @@ class Effect:
         """Predict the contribution at a signal in DN above black, where the other noise has a variance in DN²."""
         return independent(frame, self.variance(frame, level_dn))
 
+    def reason_to_keep(self, frame: FrameFacts, on: frozenset[str]) -> str:
+        """Return why the effects ``on`` need this one, however small it is; empty if they do not."""
+        return ""
+
     def outliers(self, frame: FrameFacts, level_dn: float, masking: float) -> float:
         """Predict the fraction of pixels that the effect moves by more than one standard deviation."""
         return 0.0
