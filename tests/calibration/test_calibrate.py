@@ -102,6 +102,21 @@ def test_fixed_pattern_is_neither_read_nor_column_noise(
     assert abs(found["read_shape", 800, None]["value"] - 0.1349) < 0.02
 
 
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.1])
+@pytest.mark.parametrize("strength_e", [25.0, 100.0])
+def test_hot_pixels_change_no_other_number(share: float, strength_e: float, tmp_path: Path) -> None:
+    """Their strengths reach from below the noise of darks to above that of flats."""
+    numbers = Numbers(prnu_std=0.005, hot_share=share, hot_e_per_s=100 * strength_e)
+    found = calibrate(read_captures(with_levels(draw(tmp_path / "captures", numbers, 1, side=192))))
+    result = found.isos[0]
+    wanted = {"dn_per_e": 2.0, "read_std_dn": 5.0, "row_std_dn": 1.2, "column_std_dn": 0.0, "dsnu_std_dn": 0.0}
+    numbers_found = [*((result[name], true) for name, true in wanted.items()), (found.shared["prnu_std"], 0.005)]
+    for number, true in numbers_found:
+        assert number is not None
+        assert abs(number.value - true) <= 4 * max(number.high - number.value, number.value - number.low) / 1.96
+    assert share < 0.01 or any("of the sites are hot" in note for note in found.captures.notes)
+
+
 def two_isos(folder: Path) -> Path:
     """Draw captures of ISO 800 and 1600."""
     captures = with_levels(draw(folder / "captures", Numbers(), 0, side=64))

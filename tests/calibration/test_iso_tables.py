@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from unprocess_gen.calibration.gain import estimate
+from unprocess_gen.calibration.gain import estimate, root_estimate
 from unprocess_gen.calibration.profile import modes, std_table, table
 
 ISOS = [100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0]
@@ -25,3 +25,10 @@ def test_numbers_of_several_isos_are_a_table() -> None:
     assert std_table(ISOS[:3], [3, 0, 3.5]) == ["by_iso", 100, 3, 200, 0.0035, 400, 3.5]
     assert (std_table(ISOS[:1], [2]), std_table(ISOS[:2], [0, 0])) == (2, 0)
     assert table([100, 125], [[1.0] * 4, [2.0] * 4]) == ["by_iso", 100, [1] * 4, 125, [2] * 4]
+
+
+@pytest.mark.parametrize("errors", [-3.0, -1.0, 0.0, 1.0, 2.5, 2.99, 3.01, 9.0])
+def test_interval_of_a_deviation_contains_its_value(errors: float) -> None:
+    number = root_estimate(errors * 0.04, 0.04)
+    assert (number.value == 0) == (errors < 3)
+    assert number.low <= number.value < number.high

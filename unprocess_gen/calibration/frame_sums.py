@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.calibration.deviations import Score
 from unprocess_gen.calibration.planes import NEIGHBOURS, TILE, planes_of
-from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.arrays import Bool, Float
 
 ROUNDING_DN2 = 1 / 12
 """Variance of the rounding of values whose noise is not weak."""
@@ -24,8 +24,12 @@ WINDOW = 11
 """Side of the squares of sites of a plane whose mean is subtracted before fixed patterns are measured."""
 SMOOTH = 1 - 1 / WINDOW**2
 """Part of the variance of independent sites that this leaves."""
-FAR = 8.0
-"""Distance of defects from the other pixels, in robust standard deviations."""
+INNER = (slice(WINDOW // 2, -(WINDOW // 2)),) * 2
+"""Sites of a plane whose squares do not reach beyond the border."""
+FAR, LEAST_FAR_DN = 8.0, 0.8 * 1.4826
+"""Distance of defects from the other pixels in robust standard deviations, and the least one."""
+PASSES = 4
+"""Largest number of times that defects are searched; each pass removes what they add to the means of squares."""
 FIXED = 3.0
 """Least deviation of defects in standard errors of the mean of their frames."""
 STRUCK = 100.0
@@ -44,10 +48,10 @@ class Measurement:
     follow from differences of sites. ``mean_dn`` is without defects. ``variance`` is that of a site in time, without
     offsets of rows. ``row``, ``column`` and ``fixed_column`` are variances of offsets of rows, of columns in one frame,
     and of columns in all frames, each with its standard error; ``row_correlation`` is that of neighbouring rows.
-    ``fixed`` is the variance of the fixed pattern without what is smooth over `WINDOW` sites, ``codes`` [4, 65536] the
-    histogram of the values, ``correlation`` the largest of pairs of neighbours in a difference of two frames,
-    ``shading`` [4, 4] the means of sixteenths of the mean frame, ``column_offsets`` [4, W] the means of columns over
-    those of their planes (DN).
+    ``fixed`` is the variance of the fixed pattern without what is smooth over `WINDOW` sites, ``hidden`` that of weak
+    hot pixels in it (`Pattern`), ``codes`` [4, 65536] the histogram of the values, ``correlation`` the largest of pairs
+    of neighbours in a difference of two frames, ``shading`` [4, 4] the means of sixteenths of the mean frame,
+    ``column_offsets`` [4, W] the means of columns over those of their planes (DN).
     """
 
     count: int
@@ -63,6 +67,7 @@ class Measurement:
     row_correlation: tuple[float, float]
     fixed: Float
     fixed_error: Float
+    hidden: Float
     codes: NDArray[np.int64]
     correlation: Score
     shading: Float
@@ -75,8 +80,28 @@ class Measurement:
 
     @property
     def dsnu(self) -> Float:
-        """Variance of the fixed pattern of the sites of each plane, without that of columns."""
-        return np.asarray(self.fixed - max(self.fixed_column[0], 0.0))
+        """Variance of the fixed pattern of the sites of each plane, without that of columns and of weak hot pixels."""
+        columns = max(self.fixed_column[0], 0.0) * (1 - 1 / WINDOW) / SMOOTH
+        return np.asarray(self.fixed - self.hidden - columns)
+
+
+class Pattern(NamedTuple):
+    """The fixed pattern of a plane: deviations of sites from the mean of the square around them, [H, W].
+
+    ``is_far`` are the sites that are farther than ``limit``, and those that are known to be defects. They have no part
+    in the means of squares, nor of ``columns`` [W]. ``hidden`` is the variance of hot pixels below the limit, if they
+    are as dense there as up to half above it: an assumption.
+    """
+
+    deviation: Float
+    is_far: Bool
+    columns: Float
+    limit: float
+    hidden: float
+
+
+NONE_KNOWN = np.zeros((4, 1, 1), bool)
+"""No known defects."""
 
 
 class FrameSums:
@@ -109,24 +134,31 @@ class FrameSums:
         """The mean of all frames, [H, W] DN."""
         return np.asarray(self._first + self._sum / np.float64(len(self._rows)))
 
-    def measure(self) -> Measurement:
-        """Estimate the noise of the frames; two or more."""
+    def measure(self, known: Bool = NONE_KNOWN) -> Measurement:
+        """Estimate the noise of the frames, two or more, without the defects that are ``known`` [4, H, W]."""
         count, rows, columns = len(self._rows), np.array(self._rows), np.array(self._columns)
         height, width = rows.shape[2], columns.shape[2]
         means = rows.mean(axis=2)
         own_rows, own_columns = rows - means[..., None], columns - means[..., None]
         mean_frame = self.mean_frame()
         variances = (self._squares - self._sum.astype(np.float64) ** 2 / count) / (count - 1)
-        both = zip(planes_of(mean_frame), planes_of(variances), strict=True)
-        planes = [_plane(mean, own, count) for mean, own in both]
-        mean_dn, total, total_error, patterns, good = (np.array(values) for values in zip(*planes, strict=True))
+        self.patterns = [
+            find_pattern(plane, own, LEAST_FAR_DN) for plane, own in zip(planes_of(mean_frame), known, strict=True)
+        ]
+        both = zip(self.patterns, planes_of(mean_frame), planes_of(variances), known, strict=True)
+        planes = [_plane(*numbers, count) for numbers in both]
+        defects, *numbers = zip(*planes, strict=True)
+        self.defects, (mean_dn, total, total_error, patterns, good) = np.array(defects), map(np.array, numbers)
         row_variance = rows.var(axis=0, ddof=1).mean(axis=1)
-        variance = (total - row_variance) * width / (width - 1)
-        per_column = float(variance.mean()) / height
-        row, correlation = _line_offsets(own_rows, 2, float(variance.mean()) / width / 2)
+        of_all = np.array([plane.mean() for plane in planes_of(variances)])  # the means of rows contain defects
+        noise = (of_all - row_variance) * width / (width - 1)
+        variance = total - (row_variance - noise / width)
+        per_column = float(noise.mean()) / height
+        row, correlation = _line_offsets(own_rows, 2, float(noise.mean()) / width / 2)
         column, _ = _line_offsets(own_columns, 1, per_column / 2)
         temporal = (variance * SMOOTH + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
-        offsets, fixed = own_columns.mean(axis=0), (patterns - temporal) / SMOOTH
+        levels = np.array([pattern.columns for pattern in self.patterns])
+        offsets, fixed = levels - levels.mean(axis=1, keepdims=True), (patterns - temporal) / SMOOTH
         still = per_column / count + max(float(fixed.mean()), 0.0) / height
         return Measurement(
             count=count,
@@ -142,6 +174,7 @@ class FrameSums:
             row_correlation=correlation,
             fixed=fixed,
             fixed_error=np.sqrt(2 / good) * patterns + total_error / count + _ripple(variance, fixed),
+            hidden=np.array([pattern.hidden for pattern in self.patterns]),
             codes=self._codes,
             correlation=_correlation(self._pair),
             shading=_block_means(mean_frame),
@@ -149,36 +182,45 @@ class FrameSums:
         )
 
 
-def high_passed(plane: Float) -> Float:
-    """A plane without the mean of the square around each site; sites near the border are omitted."""
+def find_pattern(plane: Float, known: Bool, least: float = 0.0) -> Pattern:
+    """The fixed pattern of a plane; ``least`` is the least distance of far sites."""
     from scipy.ndimage import uniform_filter
 
-    edge = WINDOW // 2
-    return np.asarray((plane - uniform_filter(plane, WINDOW))[edge:-edge, edge:-edge])
+    middle, is_far = np.median(plane), known | np.zeros(plane.shape, bool)
+    for _ in range(PASSES):
+        weights = np.maximum(uniform_filter(1.0 - is_far, WINDOW), 0.5 / WINDOW**2)
+        smooth = middle + uniform_filter((plane - middle) * ~is_far, WINDOW) / weights
+        distance, std = robust_std(plane - smooth, ~is_far)
+        limit, before = max(FAR * std, least), is_far.sum()
+        is_far = known | (distance > limit)
+        if is_far.sum() == before:
+            break
+    deviation = plane - smooth
+    is_weak = (deviation > limit) & (deviation <= 1.5 * limit) & ~known
+    hidden = 2 * float(is_weak[INNER].mean()) * limit**2 / 3
+    return Pattern(deviation, is_far, np.where(is_far, smooth, plane).mean(axis=0), limit, hidden)
 
 
-def robust_std(values: Any) -> tuple[Any, float]:
-    """The distances of values from their median, and their standard deviation without outliers."""
-    distances = np.abs(values - np.median(values))
-    return distances, ROBUST * float(np.median(distances))
+def robust_std(values: Any, used: Any = ...) -> tuple[Any, float]:
+    """The distances of values from the median of those used, whose standard deviation without outliers follows."""
+    distances = np.abs(values - np.median(values[used]))
+    return distances, ROBUST * float(np.median(distances[used]))
 
 
-def _plane(mean: Float, variances: Float, count: int) -> tuple[float, float, float, float, float]:
-    """Mean, variance, its error, variance of the fixed pattern, and number, of sites that are no defects.
+def _plane(
+    pattern: Pattern, mean: Float, variances: Float, known: Bool, count: int
+) -> tuple[Bool, float, float, float, float, float]:
+    """Defects; mean, variance, its error, variance of the fixed pattern, and number, of the other sites.
 
     A defect is far from its neighbours in all frames. A site with one far value, as heavy tails have it, is none.
     """
-    edge = WINDOW // 2
-    pattern = high_passed(mean)
-    distance, std = robust_std(pattern)
-    inner = variances[edge:-edge, edge:-edge]
-    is_far = distance > FAR * max(std, 0.1 * ROBUST)
-    is_good = (~is_far | (distance**2 < FIXED**2 / count * inner)) & (
-        inner <= STRUCK**2 / count * max(np.median(inner), 1 / 12)
-    )
+    is_defect = known | (pattern.is_far & (pattern.deviation**2 >= FIXED**2 / count * variances))
+    inner = variances[INNER]
+    is_good = ~is_defect[INNER] & (inner <= STRUCK**2 / count * max(np.median(inner), 1 / 12))
     sites, own = float(is_good.sum()), inner[is_good]
     error = float(own.std()) / math.sqrt(sites)
-    return float(mean[edge:-edge, edge:-edge][is_good].mean()), float(own.mean()), error, pattern[is_good].var(), sites
+    fixed = float(pattern.deviation[INNER][is_good].var())
+    return is_defect, float(mean[INNER][is_good].mean()), float(own.mean()), error, fixed, sites
 
 
 def _ripple(variance: Float, fixed: Float) -> Float:

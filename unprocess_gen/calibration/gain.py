@@ -50,9 +50,11 @@ def estimate(value: float, error: float, least: float = -math.inf) -> Estimate:
 
 
 def root_estimate(variance: float, error: float) -> Estimate:
-    """The root of a variance with its standard error; 0 if it is less than 3 standard errors."""
-    value, positive = math.sqrt(variance) if variance > SIGNIFICANT * error else 0.0, max(variance, 0.0)
-    return Estimate(value, math.sqrt(max(positive - NORMAL_95 * error, 0.0)), math.sqrt(positive + NORMAL_95 * error))
+    """The root of a variance with its standard error; below 3 standard errors 0, with an interval from 0."""
+    high = math.sqrt(max(variance, 0.0) + NORMAL_95 * error)
+    if variance <= SIGNIFICANT * error:
+        return Estimate(0.0, 0.0, high)
+    return Estimate(math.sqrt(variance), math.sqrt(variance - NORMAL_95 * error), high)
 
 
 def weighted_mean(values: Any, errors: Any) -> tuple[float, float]:

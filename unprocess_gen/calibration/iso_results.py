@@ -11,14 +11,14 @@ import numpy as np
 from unprocess_gen.calibration.capture_checks import check_dark, check_flat, is_clipped
 from unprocess_gen.calibration.captures import LEAST_FRAMES, Capture, CaptureSet, Sensor, place_of
 from unprocess_gen.calibration.frame_sums import (
-    FAR,
+    INNER,
+    NONE_KNOWN,
     ROUNDING_DN2,
     SMOOTH,
     WINDOW,
     FrameSums,
     Measurement,
-    high_passed,
-    robust_std,
+    find_pattern,
 )
 from unprocess_gen.calibration.gain import (
     LEAST_LEVELS,
@@ -32,12 +32,14 @@ from unprocess_gen.calibration.gain import (
 )
 from unprocess_gen.calibration.planes import planes_of
 from unprocess_gen.calibration.shape import Histogram, ReadShape, fill_histogram, fit_shape
-from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.arrays import Bool, Float
 from unprocess_gen.core.errors import ConfigError
 
 Watch = Callable[[Iterable[Capture]], Iterable[Capture]]
 """Function that passes frames on while they are read, and shows progress."""
 
+NOTED_SHARE = 1e-3
+"""Share of hot and dead sites from which it is noted."""
 FULL_SHARE = 1e-4
 """Largest share of values at white in a level that is fitted."""
 ROUNDED_STD_DN = 0.7
@@ -106,10 +108,10 @@ class IsoResult:
 
 def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate | None = None) -> IsoResult:
     """Measure the captures of one ISO, or darks alone if the ``gain`` is given; ConfigError if a check fails."""
-    sensor, darks = captures.sensor, _darks(captures, iso, watch)
+    sensor, (darks, defects) = captures.sensor, _darks(captures, iso, watch)
     dark = max(darks, key=lambda dark: dark.measured.count)
-    levels = [] if gain else _levels(iso, _flats(captures, iso, darks, watch), sensor)
-    histogram = fill_histogram((frame.pixels() for frame in watch(dark.frames)), dark.measured)
+    levels = [] if gain else _levels(iso, _flats(captures, iso, darks, defects, watch), sensor)
+    histogram = fill_histogram((frame.pixels() for frame in watch(dark.frames)), dark.measured, defects)
     shape = fit_shape(histogram)
     curves = _curves(levels, shape) if levels else []
     gains = [gain] if gain else fit_gain(curves, sensor.span_dn)
@@ -122,13 +124,13 @@ def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate |
         levels=levels,
         shape=shape,
         histogram=histogram,
-        prnu_square=_prnu_square(levels, watch) if levels else None,
+        prnu_square=_prnu_square(captures, levels, defects, watch) if levels else None,
     )
 
 
-def _darks(captures: CaptureSet, iso: float, watch: Watch) -> list[Dark]:
-    """Measure the darks of one ISO, in ascending order of exposures; ConfigError if there are none."""
-    darks = list[Dark]()
+def _darks(captures: CaptureSet, iso: float, watch: Watch) -> tuple[list[Dark], Bool]:
+    """Measure the darks of one ISO, in ascending order of exposures, and find defects [4, H, W]; refuse no darks."""
+    darks, defects = list[Dark](), NONE_KNOWN
     for frames in captures.groups("dark", iso):
         sums = _summed(frames, captures.sensor, watch)
         measured = sums.measure()
@@ -136,13 +138,17 @@ def _darks(captures: CaptureSet, iso: float, watch: Watch) -> list[Dark]:
             captures.notes.append(f"{place_of(frames)}: black is clipped by the dark current; left out")
             continue
         check_dark(captures, frames, measured)
-        patterns = [high_passed(plane) for plane in planes_of(sums.mean_frame())]
-        threshold = FAR * max(*(robust_std(pattern)[1] for pattern in patterns), 0.05)
-        hot = np.concatenate([pattern[pattern > threshold] for pattern in patterns])
-        darks.append(Dark(frames, measured, hot / SMOOTH, threshold / SMOOTH))
+        threshold = max(pattern.limit for pattern in sums.patterns)
+        strengths = [pattern.deviation * own for pattern, own in zip(sums.patterns, sums.defects, strict=True)]
+        hot = np.concatenate([strength[INNER][strength[INNER] > threshold] for strength in strengths])
+        darks.append(Dark(frames, measured, hot, threshold / SMOOTH))
+        defects = defects | sums.defects
     if not darks:
         raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
-    return darks
+    if (share := float(defects.mean())) > NOTED_SHARE:
+        text = f"{share:.2%} of the sites are hot or dead in darks; numbers of the other sites do not contain them"
+        captures.notes.append(f"calibrate: ISO {iso:g}: {text}")
+    return darks, defects
 
 
 def _summed(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSums:
@@ -159,12 +165,12 @@ def _summed(frames: Sequence[Capture], sensor: Sensor, watch: Watch) -> FrameSum
     return sums
 
 
-def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], watch: Watch) -> list[Flat]:
+def _flats(captures: CaptureSet, iso: float, darks: Sequence[Dark], defects: Bool, watch: Watch) -> list[Flat]:
     """Measure the levels that are not saturated, in ascending order."""
     sensor, flats = captures.sensor, []
     for frames in captures.groups("flat", iso):
         sums = _summed(frames, sensor, watch)
-        measured = sums.measure()
+        measured = sums.measure(defects)
         seconds = frames[0].exposure_s or 0.0
         dark = min(darks, key=lambda dark: abs(dark.exposure_s - seconds))
         signals = measured.mean_dn - dark.measured.mean_dn
@@ -223,6 +229,7 @@ def _dark_numbers(measured: Measurement, sensor: Sensor, shape: ReadShape) -> di
     variances, errors = _variances(measured, shape)
     variances, errors = variances - temporal, np.hypot(errors, columns[1] if temporal else 0.0)
     row, (correlation, error) = root_estimate(*measured.row), measured.row_correlation
+    dsnu_errors = np.linalg.norm(measured.fixed_error) / 4, measured.hidden.mean(), fixed_column[1]
     return {
         "read_std_dn": [
             root_estimate(float(variances.mean()), float(np.linalg.norm(errors)) / 4),
@@ -233,7 +240,7 @@ def _dark_numbers(measured: Measurement, sensor: Sensor, shape: ReadShape) -> di
         "row_correlation": [estimate(correlation, error) if row.value else estimate(0.0, 1.0)],
         "column_std_dn": [root_estimate(*fixed_column)],
         "column_temporal_std_dn": [root_estimate(*columns)],
-        "dsnu_std_dn": [root_estimate(float(measured.dsnu.mean()), float(np.linalg.norm(measured.fixed_error)) / 4)],
+        "dsnu_std_dn": [root_estimate(float(measured.dsnu.mean()), math.hypot(*dsnu_errors))],
         "black_error_dn": [
             estimate(float(mean) - sensor.black_dn, float(error))
             for mean, error in zip(_with_mean(measured.mean_dn), _black_errors(measured, variances), strict=True)
@@ -258,29 +265,36 @@ def _black_errors(measured: Measurement, variances: Float) -> Float:
     return np.asarray(np.sqrt(np.where(drifts, drift, own) + per_line + ripple**2))
 
 
-def _prnu_square(flats: Sequence[Flat], watch: Watch) -> tuple[float, float]:
-    """Square of the PRNU, and its standard error, from the mean of all frames of all levels.
+def _prnu_square(captures: CaptureSet, flats: Sequence[Flat], defects: Bool, watch: Watch) -> tuple[float, float]:
+    """Square of the PRNU, and its standard error, from the mean of all frames of all levels minus their darks.
 
     Frames have the weight signal/variance, which gives the mean of frame/signal the least noise. The variance of its
-    fixed pattern contains that of the darks' pattern, c² times, and the temporal noise.
+    fixed pattern contains the temporal noise.
     """
-    total, squares = np.zeros(1), list[tuple[float, float]]()
     weights = [flat.signal_dn / flat.measured.variance.mean() for flat in flats]
-    counts = np.array([flat.measured.count for flat in flats])
-    for flat, weight in zip(flats, weights, strict=True):
-        for frame in watch(flat.frames):
+    frames: list[tuple[Flat | Dark, float]] = list(zip(flats, weights, strict=True))
+    scales = sum(weight * flat.measured.count * flat.signals_dn for flat, weight in zip(flats, weights, strict=True))
+    for dark in {id(flat.dark): flat.dark for flat in flats}.values():
+        light = [weight * flat.measured.count for flat, weight in zip(flats, weights, strict=True) if flat.dark is dark]
+        frames.append((dark, -sum(light) / dark.measured.count))
+    total = np.zeros(1)
+    for group, weight in frames:
+        for frame in watch(group.frames):
             total = total + np.float32(weight) * frame.pixels()
-    dark = flats[-1].dark.measured
-    scales = counts * weights @ [flat.signals_dn for flat in flats]
+    shares = np.array([group.measured.count * weight**2 for group, weight in frames])
+    degrees = sum(flat.measured.count - 1 for flat in flats)
+    squares, hidden, hot = list[tuple[float, float]](), list[float](), list[float]()
     for plane, (sums, scale) in enumerate(zip(planes_of(total), scales, strict=True)):
-        share = counts * np.square(weights) / scale**2
-        rows = share @ [max(flat.measured.row[0], 0.0) for flat in flats] * (1 - 1 / WINDOW)
-        pattern = high_passed(sums / scale)
-        distance, std = robust_std(pattern)
-        pattern = pattern[distance <= FAR * std]
-        noise = share @ [flat.measured.variance[plane] for flat in flats]
-        dark_factor = float(counts @ weights / scale) ** 2
-        square = (float(pattern.var()) - rows) / SMOOTH - noise - dark_factor * dark.fixed[plane]
-        error = math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt((counts - 1).sum()))
-        squares.append((square, math.hypot(error, dark_factor * dark.fixed_error[plane])))
-    return weighted_mean(*np.transpose(squares))
+        found, share = find_pattern(sums / scale, defects[plane]), shares / scale**2
+        rows = share @ [max(group.measured.row[0], 0.0) for group, _ in frames] * (1 - 1 / WINDOW)
+        noise = share @ [group.measured.variance[plane] for group, _ in frames]
+        pattern = found.deviation[INNER][~found.is_far[INNER]]
+        square = (float(pattern.var()) - rows) / SMOOTH - noise - found.hidden
+        squares.append((square, math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt(degrees))))
+        hidden.append(found.hidden)
+        hot.append(float(np.mean((found.deviation > found.limit) & ~defects[plane])))
+    if np.mean(hot) > NOTED_SHARE:
+        text = f"{np.mean(hot):.2%} of the sites are hot, but not in darks; record darks at the exposures of the flats"
+        captures.notes.append(f"calibrate: ISO {flats[0].frames[0].iso:g}: {text}")
+    mean, error = weighted_mean(*np.transpose(squares))
+    return mean, math.hypot(error, float(np.mean(hidden)))

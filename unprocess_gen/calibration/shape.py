@@ -19,7 +19,7 @@ from unprocess_gen.calibration.deviations import NORMAL_95
 from unprocess_gen.calibration.frame_sums import Measurement
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.planes import planes_of
-from unprocess_gen.core.arrays import Float
+from unprocess_gen.core.arrays import Bool, Float
 from unprocess_gen.core.exact_distributions import tukey_std
 
 NORMAL_SHAPE = 0.1349
@@ -72,21 +72,21 @@ class ReadShape:
         return self.tukey_std_dn if self.is_tukey else self.normal_std_dn
 
 
-def fill_histogram(frames: Iterable[NDArray[np.uint16]], measured: Measurement) -> Histogram:
-    """The histogram of the frames that were measured."""
+def fill_histogram(frames: Iterable[NDArray[np.uint16]], measured: Measurement, defects: Bool) -> Histogram:
+    """The histogram of the sites that are no defects [4, H, W], of the frames that were measured."""
     columns, is_seen = measured.column_offsets, measured.dsnu > 2 * measured.fixed_error
     pattern = float(np.where(is_seen, measured.dsnu, 0.0).mean())
     width, half = math.sqrt(float(measured.variance.mean()) + pattern) / PARTS, PARTS * REACH
     counts = np.zeros(2 * half + 1)
     for pixels in frames:
-        planes = np.stack(planes_of(pixels)).astype(np.float32)
+        planes = np.where(defects, measured.mean_dn[:, None, None], planes_of(pixels)).astype(np.float32)
         rows = planes.mean(axis=2, keepdims=True, dtype=np.float64)
         levels = rows.mean(axis=1, keepdims=True)
         # planes of a row share its offset
         offsets = (rows - levels).reshape(2, 2, -1, 1).mean(axis=1).repeat(2, axis=0)
         rest = planes - (levels + offsets + columns[:, None, :]).astype(np.float32)
         places = np.clip(np.rint(rest / np.float32(width)), -half, half).astype(np.int32) + half
-        counts += np.bincount(places.ravel(), minlength=2 * half + 1)
+        counts += np.bincount(places[~defects], minlength=2 * half + 1)
     return Histogram(counts, width, 2 * columns.shape[1], math.sqrt(pattern))
 
 

@@ -13,6 +13,7 @@ Frame = Raw | Normalised
 Array = Frame | Srgb
 """Frame or target of a pair."""
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 UINT16, FLOAT32 = "uint16", "float32"
 """Dtypes of frames."""
