@@ -10,39 +10,87 @@ has no learned noise. Protocol: protocol.md.
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from common import arguments, divergence, interval, write
+from common import arguments, colour, divergence, interval, write
 from real_pairs import real_pairs
 from scipy.optimize import nnls
 
 import unprocess_gen as ug
+from unprocess_gen.simulation.reference.colour import CAMERAS
+from unprocess_gen.simulation.reference.light import camera_gains, planckian_xy
 
-CURVES, DEMOSAICS = ("smoothstep_gamma22", "gamma22", "srgb"), ("bilinear", "malvar")
-BINS = np.arange(0, 257, 16)
-WIDTH = 4
+CAMERA, CURVES = "nexus_6p", ("smoothstep_gamma22", "gamma22", "srgb")
+BAND, WIDTH = 16, 4
 FIRST = (20.0, 100.0)
 """Numbers from which the fit starts: a (DN) and b (DN²) at 12 bits."""
-KINDS = {"GAN": ("GAN", "samples_gts"), "noise_flow": ("samples_noiseflowNF", "samples_gtsNF")}
+STEPS = 3
+LEARNED = {"GAN": ("GAN", "samples_gts"), "noise_flow": ("samples_noiseflowNF", "samples_gtsNF")}
+RATIOS = ("luma_std", "chroma_to_luma")
+"""Statistics of colour that are divided by the real ones; of correlations the difference is taken."""
+NAME = re.compile(r"\d{4}_(?P<scene>\d{3})_(?P<phone>\w+?)_(?P<iso>\d{5})_(?P<speed>\d{5})_(?P<kelvin>\d{4})_[NLH]")
+"""Names of SIDD: scene, phone, ISO, reciprocal of the exposure time in seconds, colour temperature."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Patch:
-    """Hold the pictures of a patch by kind; those with the same phone and ISO are fitted together."""
+    """Hold the pictures of a patch by kind, and what its name states."""
 
-    name: str
-    group: str
+    number: int
+    scene: str
+    phone: str
+    iso: int
+    speed: int
+    kelvin: int
     kinds: dict[str, Any]
+
+    @property
+    def group(self) -> str:
+        """Scene, phone and ISO."""
+        return f"{self.scene}_{self.phone}_{self.iso}"
+
+    @property
+    def clean(self) -> Any:
+        """The real clean picture."""
+        return self.kinds["samples_gts"]
+
+    @property
+    def real(self) -> Any:
+        """The real noise."""
+        return self.noise("samples_noisy", "samples_gts")
 
     def noise(self, noisy: str, clean: str) -> Any:
         """Return the difference of two pictures of the patch."""
         return self.kinds[noisy].astype(int) - self.kinds[clean]
+
+
+@dataclass(frozen=True)
+class Form:
+    """State which other patches a judged patch is fitted on, and what the light and the exposure decide."""
+
+    fits: Callable[[Patch, Patch], bool]
+    strength: Callable[[Patch], float]
+    by_light: bool = True
+
+
+def same_phone(patch: Patch, other: Patch) -> bool:
+    """Return whether two patches have the same phone and ISO."""
+    return other is not patch and (other.phone, other.iso) == (patch.phone, patch.iso)
+
+
+FORMS = {
+    "camera_noise": Form(same_phone, lambda patch: 1.0),
+    "by_exposure": Form(same_phone, lambda patch: patch.speed / 1000),
+    "fixed_gains": Form(same_phone, lambda patch: 1.0, by_light=False),
+    "other_phone": Form(lambda patch, other: other.phone != patch.phone, lambda patch: patch.iso / 1000),
+}
+"""a is proportional to the strength of a patch, b to its square."""
 
 
 def patches_of(folder: Path) -> list[Patch]:
@@ -52,12 +100,18 @@ def patches_of(folder: Path) -> list[Patch]:
         place = noisy.parents[1]
         files = {kind.name: kind / noisy.name for kind in place.iterdir() if kind.is_dir()}
         files["GAN"] = place / "GAN" / f"{noisy.stem}_fake_B.png"
-        kinds = {kind: read(file) for kind, file in files.items() if file.exists()}
-        if "samples_gts" in kinds:
-            found.append(Patch(noisy.stem, f"{place.name}_{place.parent.name}", kinds))
-    for pair in real_pairs(folder):
-        found.append(Patch(pair.name, pair.group, {"samples_noisy": pair.noisy, "samples_gts": pair.clean}))
-    return found
+        found.append((noisy.stem, {kind: read(file) for kind, file in files.items() if file.exists()}))
+    found += [(pair.name, {"samples_noisy": pair.noisy, "samples_gts": pair.clean}) for pair in real_pairs(folder)]
+    patches = []
+    for number, (name, kinds) in enumerate(found):
+        facts = NAME.search(name)
+        if facts is None or "samples_gts" not in kinds:
+            raise SystemExit(
+                f"{name}: no real pair of SIDD; expected a name as 0001_001_S6_00100_00060_3200_L, and GTs"
+            )
+        scene, phone, *numbers = facts.groups()
+        patches.append(Patch(number, scene, phone, *map(int, numbers), kinds))
+    return patches
 
 
 def read(file: Path) -> Any:
@@ -66,140 +120,157 @@ def read(file: Path) -> Any:
 
 
 def by_level(noise: Any, clean: Any) -> tuple[Any, Any]:
-    """Return variance and number of the pixels of each channel in each band of levels, [3, 16]."""
-    bands = np.digitize(clean, BINS) - 1
-    cells = [[noise[..., c][bands[..., c] == band] for band in range(len(BINS) - 1)] for c in range(3)]
-    variances = [[cell.var() if cell.size > 50 else 0 for cell in row] for row in cells]
-    return np.array(variances), np.array([[cell.size if cell.size > 50 else 0 for cell in row] for row in cells])
-
-
-def correlation(noise: Any, lag: int) -> float:
-    """Return the mean over channels of the correlation with the pixel ``lag`` further in the row."""
-    return float(np.mean([np.corrcoef(noise[:, :-lag, c].ravel(), noise[:, lag:, c].ravel())[0, 1] for c in range(3)]))
+    """Return variance and number of the pixels of each channel in each band of levels, [48]; rare levels have none."""
+    cells = (clean // BAND + 256 // BAND * np.arange(3)).ravel()
+    values = noise.ravel().astype(float)
+    counts, sums, squares = (np.bincount(cells, weights, 768 // BAND) for weights in (None, values, values * values))
+    counts[counts <= 50] = 0
+    number = np.maximum(counts, 1)
+    return np.where(counts > 0, squares / number - (sums / number) ** 2, 0), counts
 
 
 @functools.cache
-def camera_noise(curve: str, demosaic: str, a: float, b: float) -> ug.CameraNoise:
-    """Return the camera noise of a curve, a demosaicking and two numbers."""
-    numbers = [f"noise.a={a}", f"noise.b={b}", "noise.units=dn", "noise.black=subtracted"]
-    levels = ["noise.bits=12", "noise.black_level_dn=240", "noise.white_level_dn=4095"]
-    return ug.CameraNoise(
-        ["noise=heteroscedastic", *numbers, *levels, f"isp={curve}", "camera=nexus_6p"], demosaic=demosaic
-    )
+def settings(curve: str, kelvin: int | None) -> ug.Config:
+    """Return the settings of a curve and a light."""
+    overrides = ["noise=heteroscedastic", "noise.units=dn", "noise.black=subtracted", "noise.bits=12"]
+    overrides += [f"noise.a={FIRST[0]}", f"noise.b={FIRST[1]}", "noise.black_level_dn=240", "noise.white_level_dn=4095"]
+    overrides += [f"isp={curve}", f"camera={CAMERA}", "gains=fixed"]
+    if kelvin is not None:
+        red, blue = camera_gains(CAMERAS[CAMERA], planckian_xy(kelvin))
+        overrides += [f"gains.red={red}", f"gains.blue={blue}"]
+    return ug.load_config(overrides)
 
 
-def simulate(model: ug.CameraNoise, patch: Patch, index: int) -> Any:
-    """Return the noise that a model adds to the clean picture of a patch."""
-    clean, noisy = model(patch.kinds["samples_gts"], index=index)
+def camera_noise(curve: str, kelvin: int | None, a: float, b: float) -> ug.CameraNoise:
+    """Return the camera noise of a curve, a light and two numbers."""
+    config = settings(curve, kelvin)
+    return ug.CameraNoise(replace(config, noise=replace(config.noise, a=a, b=b)), demosaic="malvar")
+
+
+def simulate(form: Form, fit: tuple[str, float, float], patch: Patch, stage: int) -> Any:
+    """Simulate the noise of a fit on the clean picture of a patch; each stage has other random values."""
+    curve, a, b = fit
+    strength = form.strength(patch)
+    model = camera_noise(curve, patch.kelvin if form.by_light else None, a * strength, b * strength**2)
+    clean, noisy = model(patch.clean, index=1000 * stage + patch.number)
     return noisy.astype(int) - clean
 
 
-def fit(patches: Sequence[Patch], curve: str, demosaic: str) -> tuple[float, float]:
+@functools.cache
+def equations(form: Form, fit: tuple[str, float, float], patch: Patch) -> tuple[Any, Any]:
+    """Return the equations for a and b, linear about a fit: their effect on the variance by level, and what it lacks.
+
+    Both are divided by the real variance.
+    """
+    curve, *numbers = fit
+    real, counts = by_level(patch.real, patch.clean)
+    weights = np.sqrt(counts) / np.maximum(real, 1)
+    steps = 0.1 * np.array(numbers) + 0.01 * np.array(FIRST)
+    points = [numbers, *(np.array(numbers) + np.diag(steps))]
+    base, *moved = (by_level(simulate(form, (curve, *point), patch, 0), patch.clean)[0] for point in points)
+    slopes = np.stack([(one - base) / step for one, step in zip(moved, steps, strict=True)], axis=1)
+    return slopes * weights[:, None], (real - base + slopes @ numbers) * weights
+
+
+def fitted(form: Form, curve: str, patches: Sequence[Patch]) -> tuple[str, float, float]:
     """Fit a and b to the variance by level: least squares relative to it, then one step of scale."""
-    rows, targets = [], []
-    for index, patch in enumerate(patches):
-        clean = patch.kinds["samples_gts"]
-        real, counts = by_level(patch.noise("samples_noisy", "samples_gts"), clean)
-        parts = [
-            by_level(simulate(camera_noise(curve, demosaic, *numbers), patch, index), clean)[0].ravel()
-            for numbers in ((FIRST[0], 0.0), (0.0, FIRST[1]))
-        ]
-        weights = np.sqrt(counts.ravel()) / np.maximum(real.ravel(), 1)
-        rows.append(np.stack(parts, axis=1) * weights[:, None])
-        targets.append(real.ravel() * weights)
-    shares = nnls(np.concatenate(rows), np.concatenate(targets))[0]
-    a, b = (max(float(share * start), 1e-3) for share, start in zip(shares, FIRST, strict=True))
-    ratios = [
-        patch.noise("samples_noisy", "samples_gts").var()
-        / simulate(camera_noise(curve, demosaic, a, b), patch, 50 + n).var()
-        for n, patch in enumerate(patches)
-    ]
-    return a * float(np.median(ratios)), b * float(np.median(ratios))
+    a, b = FIRST
+    for _ in range(STEPS):
+        rows, targets = zip(*(equations(form, (curve, a, b), patch) for patch in patches), strict=True)
+        a, b = (max(float(number), 1e-3) for number in nnls(np.concatenate(rows), np.concatenate(targets))[0])
+    scale = float(np.median([p.real.var() / simulate(form, (curve, a, b), p, 1).var() for p in patches]))
+    return curve, a * scale, b * scale
 
 
-def chosen(patches: Sequence[Patch]) -> tuple[str, str, float, float]:
-    """Return curve, demosaicking and numbers with the smallest mean divergence on the patches that are fitted."""
-    fits = []
-    for curve, demosaic in itertools.product(CURVES, DEMOSAICS):
-        a, b = fit(patches, curve, demosaic)
-        model = camera_noise(curve, demosaic, a, b)
-        error = np.mean(
-            [
-                divergence(patch.noise("samples_noisy", "samples_gts"), simulate(model, patch, 100 + n), WIDTH)
-                for n, patch in enumerate(patches)
-            ]
-        )
-        fits.append((float(error), curve, demosaic, a, b))
-    return min(fits)[1:]
+@functools.cache
+def chosen(form: Form, patches: tuple[Patch, ...]) -> tuple[str, float, float]:
+    """Return curve and numbers with the smallest mean divergence on the patches that are fitted."""
+    fits = [fitted(form, curve, patches) for curve in CURVES]
+    return min(fits, key=lambda fit: np.mean([divergence(p.real, simulate(form, fit, p, 2), WIDTH) for p in patches]))
 
 
 def white(noise: Any, clean: Any, seed: int) -> Any:
     """Draw white Gaussian noise with the standard deviation of other noise at each level."""
-    deviations = np.sqrt(by_level(noise, clean)[0])
-    bands = np.digitize(clean, BINS) - 1
-    std = np.stack([deviations[c][bands[..., c]] for c in range(3)], axis=-1)
+    std = np.sqrt(by_level(noise, clean)[0])[clean // BAND + 256 // BAND * np.arange(3)]
     drawn = np.random.default_rng(seed).normal(0, 1, clean.shape) * std
     return np.clip(np.rint(clean + drawn), 0, 255).astype(int) - clean
 
 
-def judge(patch: Patch, others: Sequence[Patch], number: int) -> dict[str, Any]:
+def judge(patch: Patch, patches: Sequence[Patch]) -> dict[str, Any]:
     """Compare all models with the real noise of a patch."""
-    curve, demosaic, a, b = chosen(others)
-    clean = patch.kinds["samples_gts"]
-    real = patch.noise("samples_noisy", "samples_gts")
-    noises = {"camera_noise": (simulate(camera_noise(curve, demosaic, a, b), patch, 1000 + number), real)}
-    noises["white_oracle"] = (white(real, clean, number), real)
-    for name, (noisy, truth) in KINDS.items():
-        if noisy in patch.kinds and truth in patch.kinds:
-            reference = real if name == "GAN" else patch.noise("samples_noisyNF", truth)
-            noises[name] = (patch.noise(noisy, truth), reference)
-    found: dict[str, Any] = {"group": patch.group, "fit": [curve, demosaic, a, b], "fitted_patches": len(others)}
-    for name, (noise, reference) in noises.items():
-        lags = {f"lag_{lag}": [correlation(noise, lag), correlation(reference, lag)] for lag in (1, 2)}
-        ratio = float(noise.std() / reference.std())
-        found[name] = {"divergence": divergence(reference, noise, WIDTH), "std_to_real": ratio, **lags}
-    model, counts = by_level(noises["camera_noise"][0], clean)
-    truth = by_level(real, clean)[0]
+    found: dict[str, Any] = {"group": patch.group}
+    for name, form in FORMS.items():
+        others = tuple(other for other in patches if form.fits(patch, other))
+        if others:
+            fit = chosen(form, others)
+            noise = simulate(form, fit, patch, 3)
+            levels = level_error(noise, patch)
+            found[name] = {"fit": fit, "fitted_patches": len(others), **levels, **compared(noise, patch.real)}
+    found["white_oracle"] = compared(white(patch.real, patch.clean, patch.number), patch.real)
+    for name, (noisy, clean) in LEARNED.items():
+        if noisy in patch.kinds and clean in patch.kinds:
+            real = patch.real if name == "GAN" else patch.noise("samples_noisyNF", clean)
+            found[name] = compared(patch.noise(noisy, clean), real)
+    return found
+
+
+def compared(noise: Any, real: Any) -> dict[str, Any]:
+    """Compare noise with real noise: divergence, strength, and both statistics of colour."""
+    both = zip(colour(noise).items(), colour(real).values(), strict=True)
+    pairs = {name: [value, truth] for (name, value), truth in both}
+    return {"divergence": divergence(real, noise, WIDTH), "std_to_real": float(noise.std() / real.std()), **pairs}
+
+
+def level_error(noise: Any, patch: Patch) -> dict[str, float]:
+    """Return the median error of the variance by level."""
+    (model, counts), (truth, _) = by_level(noise, patch.clean), by_level(patch.real, patch.clean)
     filled = (counts > 500) & (truth > 0)
-    found["camera_noise"]["variance_by_level_error"] = float(np.median(np.abs(model[filled] / truth[filled] - 1)))
+    return {"variance_by_level_error": float(np.median(np.abs(model[filled] / truth[filled] - 1)))}
+
+
+def summary(name: str, judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return medians and intervals of a model over the groups of the patches."""
+    patches = [patch for patch in judged if name in patch]
+    groups = sorted({patch["group"] for patch in patches})
+
+    def over_groups(value: Callable[[dict[str, Any]], float]) -> list[float]:
+        return interval([np.median([value(p[name]) for p in patches if p["group"] == group]) for group in groups])
+
+    found: dict[str, Any] = {"patches": len(patches), "groups": len(groups)}
+    found["above_goal"] = sum(patch[name]["divergence"] > 0.02 for patch in patches)
+    for key, first in patches[0][name].items():
+        if isinstance(first, float):
+            found[key] = over_groups(lambda one, key=key: one[key])
+        elif key in RATIOS:
+            found[key] = {"to_real": over_groups(lambda one, key=key: one[key][0] / one[key][1])}
+        elif key not in ("fit", "fitted_patches"):
+            found[key] = {"difference": over_groups(lambda one, key=key: abs(one[key][0] - one[key][1]))}
+        if key in found and isinstance(first, list):
+            found[key] |= {
+                kind: over_groups(lambda one, key=key, n=n: one[key][n])[0] for n, kind in enumerate(("model", "real"))
+            }
     return found
 
 
 def main() -> None:
     """Run the experiment."""
     options = arguments(__doc__, "learned_noise", "folder of SIDD patches")
-    patches, judged = patches_of(options.data), []
-    for number, patch in enumerate(patches):
-        others = [other for other in patches if other.group == patch.group and other.name != patch.name]
-        if others:
-            judged.append(judge(patch, others, number))
-            print(patch.group, judged[-1]["camera_noise"], flush=True)
-    if not judged:
+    patches = patches_of(options.data)
+    judged = [judge(patch, patches) for patch in patches]
+    if not any("camera_noise" in patch for patch in judged):
         raise SystemExit(f"{options.data}: no two patches of one phone and ISO; expected LIGHT/ISO/PHONE/samples_noisy")
-    summary = {}
-    for name in ("camera_noise", "noise_flow", "GAN", "white_oracle"):
-        results = [patch[name] for patch in judged if name in patch]
-        if results:
-            lags = {
-                f"{lag}_difference": interval([abs(result[lag][0] - result[lag][1]) for result in results])
-                for lag in ("lag_1", "lag_2")
-            }
-            summary[name] = {
-                "patches": len(results),
-                "divergence": interval([result["divergence"] for result in results]),
-                "std_to_real": interval([result["std_to_real"] for result in results]),
-                "lag_1": float(np.median([result["lag_1"][0] for result in results])),
-                **lags,
-            }
-    real = float(np.median([patch["camera_noise"]["lag_1"][1] for patch in judged]))
+    with_partner = [patch for patch in judged if "camera_noise" in patch]
+    models = (*FORMS, *LEARNED, "white_oracle")
     write(
         {
             "patches": len(patches),
-            "judged": len(judged),
-            "groups": len({patch["group"] for patch in judged}),
-            "real_lag_1": real,
-            "models": summary,
-            "by_patch": [{key: value for key, value in patch.items() if key != "name"} for patch in judged],
+            "judged": len(with_partner),
+            "models": {
+                name: summary(name, judged if name == "other_phone" else with_partner)
+                for name in models
+                if any(name in patch for patch in with_partner)
+            },
+            "by_patch": judged,
         },
         options.to,
     )

@@ -31,7 +31,10 @@ REFERENCES = (1, 6, 11, 16)
 
 @dataclass(frozen=True)
 class RealPair:
-    """Noisy and clean centre of a frame, uint8 [H, W, 3], with name, scene, and phone and ISO if the name has them."""
+    """Noisy and clean centre of a frame, uint8 [H, W, 3], with name, scene, and phone and ISO if the name has them.
+
+    The name is that of the file, with its folder.
+    """
 
     name: str
     scene: str
@@ -50,7 +53,9 @@ def real_pairs(folder: Path, forms: Mapping[str, re.Pattern[str]] = FORMS) -> It
         clean = clean_of(path, form, match["scene"])
         if clean != path and clean.exists():
             facts = match.groupdict()
-            yield RealPair(path.stem, match["scene"], facts.get("group", ""), *centres(path, clean))
+            yield RealPair(
+                f"{path.parent.name}/{path.stem}", match["scene"], facts.get("group", ""), *centres(path, clean)
+            )
 
 
 def clean_of(noisy: Path, form: str, scene: str) -> Path:
