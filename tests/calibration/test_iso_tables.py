@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from unprocess_gen.calibration.gain import estimate, root_estimate
+from unprocess_gen.calibration.gain import Transfer, estimate, gain_change, root_estimate
 from unprocess_gen.calibration.profile import modes, std_table, table
 
 ISOS = [100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0]
@@ -32,3 +33,13 @@ def test_interval_of_a_deviation_contains_its_value(errors: float) -> None:
     number = root_estimate(errors * 0.04, 0.04)
     assert (number.value == 0) == (errors < 3)
     assert number.low <= number.value < number.high
+
+
+@pytest.mark.parametrize("change", [0.0, -0.05, 0.1])
+def test_change_of_the_gain_is_that_of_the_line(change: float) -> None:
+    """Variance/signal is a line, and errors of levels of 1 % do not show 0.1 % of change."""
+    signal = np.linspace(100.0, 4000.0, 10)
+    curve = Transfer(signal, signal * (0.3 + 0.3 * change * signal / 4000), 1e-3 * signal, 0 * signal, 0 * signal)
+    number = gain_change([curve] * 4, 5.0)
+    assert number.value == pytest.approx(change, abs=1e-9)
+    assert (number.low < 0 < number.high) == (change == 0) and number.error > 1e-3

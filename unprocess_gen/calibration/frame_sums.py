@@ -89,14 +89,16 @@ class Pattern(NamedTuple):
     """The fixed pattern of a plane: deviations of sites from the mean of the square around them, [H, W].
 
     ``is_far`` are the sites that are farther than ``limit``, and those that are known to be defects. They have no part
-    in the means of squares, nor of ``columns`` [W]. ``hidden`` is the variance of hot pixels below the limit, if they
-    are as dense there as up to half above it: an assumption.
+    in the means of squares, nor in ``columns`` [W], the means of columns over that of the plane. ``hot`` is the share
+    of hot pixels above the limit that are not known, ``hidden`` the variance of those below it, if they are as dense
+    there as up to half above it: an assumption.
     """
 
     deviation: Float
     is_far: Bool
     columns: Float
     limit: float
+    hot: float
     hidden: float
 
 
@@ -142,23 +144,18 @@ class FrameSums:
         own_rows, own_columns = rows - means[..., None], columns - means[..., None]
         mean_frame = self.mean_frame()
         variances = (self._squares - self._sum.astype(np.float64) ** 2 / count) / (count - 1)
-        self.patterns = [
-            find_pattern(plane, own, LEAST_FAR_DN) for plane, own in zip(planes_of(mean_frame), known, strict=True)
-        ]
-        both = zip(self.patterns, planes_of(mean_frame), planes_of(variances), known, strict=True)
-        planes = [_plane(*numbers, count) for numbers in both]
-        defects, *numbers = zip(*planes, strict=True)
+        planes = zip(planes_of(mean_frame), planes_of(variances), known, strict=True)
+        self.patterns, defects, *numbers = zip(*(_plane(*plane, count) for plane in planes), strict=True)
         self.defects, (mean_dn, total, total_error, patterns, good) = np.array(defects), map(np.array, numbers)
         row_variance = rows.var(axis=0, ddof=1).mean(axis=1)
-        of_all = np.array([plane.mean() for plane in planes_of(variances)])  # the means of rows contain defects
-        noise = (of_all - row_variance) * width / (width - 1)
+        # of all sites, because the means of rows contain defects
+        noise = (np.array([plane.mean() for plane in planes_of(variances)]) - row_variance) * width / (width - 1)
         variance = total - (row_variance - noise / width)
         per_column = float(noise.mean()) / height
         row, correlation = _line_offsets(own_rows, 2, float(noise.mean()) / width / 2)
         column, _ = _line_offsets(own_columns, 1, per_column / 2)
         temporal = (variance * SMOOTH + max(row[0], 0.0) * (1 - 1 / WINDOW)) / count
-        levels = np.array([pattern.columns for pattern in self.patterns])
-        offsets, fixed = levels - levels.mean(axis=1, keepdims=True), (patterns - temporal) / SMOOTH
+        offsets, fixed = np.array([pattern.columns for pattern in self.patterns]), (patterns - temporal) / SMOOTH
         still = per_column / count + max(float(fixed.mean()), 0.0) / height
         return Measurement(
             count=count,
@@ -196,9 +193,10 @@ def find_pattern(plane: Float, known: Bool, least: float = 0.0) -> Pattern:
         if is_far.sum() == before:
             break
     deviation = plane - smooth
-    is_weak = (deviation > limit) & (deviation <= 1.5 * limit) & ~known
-    hidden = 2 * float(is_weak[INNER].mean()) * limit**2 / 3
-    return Pattern(deviation, is_far, np.where(is_far, smooth, plane).mean(axis=0), limit, hidden)
+    new = (deviation * ~known)[INNER]
+    hot, strong = (float((new > factor * limit).mean()) for factor in (1.0, 1.5))
+    columns = np.where(is_far, smooth, plane).mean(axis=0)
+    return Pattern(deviation, is_far, columns - columns.mean(), limit, hot, 2 * (hot - strong) * limit**2 / 3)
 
 
 def robust_std(values: Any, used: Any = ...) -> tuple[Any, float]:
@@ -207,20 +205,19 @@ def robust_std(values: Any, used: Any = ...) -> tuple[Any, float]:
     return distances, ROBUST * float(np.median(distances[used]))
 
 
-def _plane(
-    pattern: Pattern, mean: Float, variances: Float, known: Bool, count: int
-) -> tuple[Bool, float, float, float, float, float]:
-    """Defects; mean, variance, its error, variance of the fixed pattern, and number, of the other sites.
+def _plane(mean: Float, variances: Float, known: Bool, count: int) -> tuple[Any, ...]:
+    """Pattern and defects; mean, variance, its error, variance of the fixed pattern, and number, of the other sites.
 
     A defect is far from its neighbours in all frames. A site with one far value, as heavy tails have it, is none.
     """
+    pattern = find_pattern(mean, known, LEAST_FAR_DN)
     is_defect = known | (pattern.is_far & (pattern.deviation**2 >= FIXED**2 / count * variances))
     inner = variances[INNER]
     is_good = ~is_defect[INNER] & (inner <= STRUCK**2 / count * max(np.median(inner), 1 / 12))
     sites, own = float(is_good.sum()), inner[is_good]
     error = float(own.std()) / math.sqrt(sites)
     fixed = float(pattern.deviation[INNER][is_good].var())
-    return is_defect, float(mean[INNER][is_good].mean()), float(own.mean()), error, fixed, sites
+    return pattern, is_defect, float(mean[INNER][is_good].mean()), float(own.mean()), error, fixed, sites
 
 
 def _ripple(variance: Float, fixed: Float) -> Float:

@@ -25,6 +25,9 @@ LEAST_LEVELS = 4
 SIGNIFICANT = 3.0
 """Standard errors from which a difference is systematic."""
 
+UNEVEN = 0.01
+"""Relative error of the variance of a level by uneven steps of the converter: that of the CCD of EMVA 1288 set 001."""
+
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
@@ -51,10 +54,9 @@ def estimate(value: float, error: float, least: float = -math.inf) -> Estimate:
 
 def root_estimate(variance: float, error: float) -> Estimate:
     """The root of a variance with its standard error; below 3 standard errors 0, with an interval from 0."""
-    high = math.sqrt(max(variance, 0.0) + NORMAL_95 * error)
-    if variance <= SIGNIFICANT * error:
-        return Estimate(0.0, 0.0, high)
-    return Estimate(math.sqrt(variance), math.sqrt(variance - NORMAL_95 * error), high)
+    half, is_seen = NORMAL_95 * error, variance > SIGNIFICANT * error
+    value, low = (math.sqrt(variance), math.sqrt(variance - half)) if is_seen else (0.0, 0.0)
+    return Estimate(value, low, math.sqrt(max(variance, 0.0) + half))
 
 
 def weighted_mean(values: Any, errors: Any) -> tuple[float, float]:
@@ -159,3 +161,13 @@ def fit_gain(curves: Sequence[Transfer], span_dn: float) -> list[Estimate]:
     sensor = Estimate(chosen.gain, min(fit.low for fit in intervals), max(fit.high for fit in intervals))
     below, above = (abs(end - chosen.gain) for end in (sensor.low, sensor.high))  # planes share the systematic error
     return [sensor, *(Estimate(plane.value, plane.low - below, plane.high + above) for plane in chosen.planes)]
+
+
+def gain_change(curves: Sequence[Transfer], dark_dn2: float) -> Estimate:
+    """Relative change of the gain from black to the brightest level; ``dark_dn2`` is the variance of the darks."""
+    numbers = [[curve.signal, curve.variance, curve.error / len(curves) ** 0.5] for curve in curves]
+    signal, variance, error = np.mean(numbers, axis=0)
+    errors = np.hypot(error, UNEVEN * (variance + dark_dn2))
+    by_point = influence(np.stack([signal, signal**2]), 1 / errors**2)
+    gain, slope = by_point @ variance
+    return estimate(slope, float(np.linalg.norm(by_point[1] * errors))).scaled(float(signal[-1] / gain))

@@ -27,6 +27,7 @@ from unprocess_gen.calibration.gain import (
     Transfer,
     estimate,
     fit_gain,
+    gain_change,
     root_estimate,
     weighted_mean,
 )
@@ -114,6 +115,9 @@ def measure_iso(captures: CaptureSet, iso: float, watch: Watch, gain: Estimate |
     histogram = fill_histogram((frame.pixels() for frame in watch(dark.frames)), dark.measured, defects)
     shape = fit_shape(histogram)
     curves = _curves(levels, shape) if levels else []
+    if curves and (change := gain_change(curves, float(dark.measured.variance.mean()))).low * change.high > 0:
+        value, low, high = (f"{share:+.1%}" for share in (change.value, change.low, change.high))
+        captures.notes.append(f"calibrate: ISO {iso:g}: the gain differs by {value} ({low} to {high}) in bright flats")
     gains = [gain] if gain else fit_gain(curves, sensor.span_dn)
     return IsoResult(
         iso=iso,
@@ -139,15 +143,13 @@ def _darks(captures: CaptureSet, iso: float, watch: Watch) -> tuple[list[Dark], 
             continue
         check_dark(captures, frames, measured)
         threshold = max(pattern.limit for pattern in sums.patterns)
-        strengths = [pattern.deviation * own for pattern, own in zip(sums.patterns, sums.defects, strict=True)]
-        hot = np.concatenate([strength[INNER][strength[INNER] > threshold] for strength in strengths])
-        darks.append(Dark(frames, measured, hot, threshold / SMOOTH))
+        strengths = (np.array([pattern.deviation for pattern in sums.patterns]) * sums.defects)[:, *INNER]
+        darks.append(Dark(frames, measured, strengths[strengths > threshold], threshold / SMOOTH))
         defects = defects | sums.defects
     if not darks:
         raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
     if (share := float(defects.mean())) > NOTED_SHARE:
-        text = f"{share:.2%} of the sites are hot or dead in darks; numbers of the other sites do not contain them"
-        captures.notes.append(f"calibrate: ISO {iso:g}: {text}")
+        captures.notes.append(f"calibrate: ISO {iso:g}: {share:.2%} of the sites are hot or dead in darks; left out")
     return darks, defects
 
 
@@ -271,30 +273,26 @@ def _prnu_square(captures: CaptureSet, flats: Sequence[Flat], defects: Bool, wat
     Frames have the weight signal/variance, which gives the mean of frame/signal the least noise. The variance of its
     fixed pattern contains the temporal noise.
     """
-    weights = [flat.signal_dn / flat.measured.variance.mean() for flat in flats]
-    frames: list[tuple[Flat | Dark, float]] = list(zip(flats, weights, strict=True))
-    scales = sum(weight * flat.measured.count * flat.signals_dn for flat, weight in zip(flats, weights, strict=True))
+    weights = np.array([flat.measured.count * flat.signal_dn / flat.measured.variance.mean() for flat in flats])
+    groups: list[tuple[Flat | Dark, float]] = list(zip(flats, weights, strict=True))
     for dark in {id(flat.dark): flat.dark for flat in flats}.values():
-        light = [weight * flat.measured.count for flat, weight in zip(flats, weights, strict=True) if flat.dark is dark]
-        frames.append((dark, -sum(light) / dark.measured.count))
+        groups.append((dark, -float(weights @ [flat.dark is dark for flat in flats])))
     total = np.zeros(1)
-    for group, weight in frames:
+    for group, weight in groups:
         for frame in watch(group.frames):
-            total = total + np.float32(weight) * frame.pixels()
-    shares = np.array([group.measured.count * weight**2 for group, weight in frames])
+            total = total + np.float32(weight / group.measured.count) * frame.pixels()
+    scales = weights @ [flat.signals_dn for flat in flats]
+    shares = np.array([weight**2 / group.measured.count for group, weight in groups])
+    rows = shares @ [max(group.measured.row[0], 0.0) for group, _ in groups] / scales**2 * (1 - 1 / WINDOW)
+    noise = shares @ [group.measured.variance for group, _ in groups] / scales**2
+    patterns = [find_pattern(*both) for both in zip(planes_of(total) / scales[:, None, None], defects, strict=True)]
+    others = [pattern.deviation[INNER][~pattern.is_far[INNER]] for pattern in patterns]
+    spread, sites = np.transpose([(values.var(), values.size) for values in others])
     degrees = sum(flat.measured.count - 1 for flat in flats)
-    squares, hidden, hot = list[tuple[float, float]](), list[float](), list[float]()
-    for plane, (sums, scale) in enumerate(zip(planes_of(total), scales, strict=True)):
-        found, share = find_pattern(sums / scale, defects[plane]), shares / scale**2
-        rows = share @ [max(group.measured.row[0], 0.0) for group, _ in frames] * (1 - 1 / WINDOW)
-        noise = share @ [group.measured.variance[plane] for group, _ in frames]
-        pattern = found.deviation[INNER][~found.is_far[INNER]]
-        square = (float(pattern.var()) - rows) / SMOOTH - noise - found.hidden
-        squares.append((square, math.sqrt(2 / pattern.size) * math.hypot(pattern.var(), noise / math.sqrt(degrees))))
-        hidden.append(found.hidden)
-        hot.append(float(np.mean((found.deviation > found.limit) & ~defects[plane])))
-    if np.mean(hot) > NOTED_SHARE:
-        text = f"{np.mean(hot):.2%} of the sites are hot, but not in darks; record darks at the exposures of the flats"
-        captures.notes.append(f"calibrate: ISO {flats[0].frames[0].iso:g}: {text}")
-    mean, error = weighted_mean(*np.transpose(squares))
-    return mean, math.hypot(error, float(np.mean(hidden)))
+    errors = np.sqrt(2 / sites) * np.hypot(spread, noise / math.sqrt(degrees))
+    square, error = weighted_mean((spread - rows) / SMOOTH - noise, errors)
+    hidden, hot = (float(np.mean([getattr(pattern, name) for pattern in patterns])) for name in ("hidden", "hot"))
+    if hot > NOTED_SHARE:
+        place = place_of(flats[-1].frames)
+        captures.notes.append(f"{place}: {hot:.2%} of the sites are hot in flats alone; record darks of this exposure")
+    return square - hidden, math.hypot(error, hidden)
