@@ -23,7 +23,6 @@ NAMES = {
     "real": "real",
     "noisy": "noisy, not denoised",
     "awgn": "AWGN",
-    "signal_dependent": "signal-dependent white",
     "two_numbers": "two numbers",
     "physical": "physical",
     "dark_frames": "dark frames",
@@ -34,6 +33,13 @@ NAMES = {
     "noise_flow": "Noise Flow",
     "GAN": "GAN",
     "white_oracle": "white, oracle",
+    "awgn_1.6": "AWGN, 1.6 times as strong",
+    "awgn_2.5": "AWGN, 2.5 times as strong",
+    "best_awgn": "best AWGN",
+    "bilinear": "`CameraNoise`, bilinear",
+    "malvar": "`CameraNoise` as it comes (Malvar)",
+    "fitted": "`CameraNoise`, fitted",
+    "fitted_isp": "`CameraNoise`, fitted with ISP",
 }
 
 
@@ -238,41 +244,74 @@ Noise Flow is compared with the real noise of its own pipeline, whose colours di
 """
 
 
+SETS = {
+    "SIDD_patches": "Patches of SIDD: phones, rendered from raw without denoising or compression",
+    "PolyU": "PolyU: pictures of cameras, saved again as JPEG of quality 75 with 4:2:0",
+}
+GOALS = {"SIDD_patches": {"malvar - awgn": 1.0, "malvar - best_awgn": 0.5}, "PolyU": {"malvar - awgn": 0.0}}
+"""Least differences of PSNR, in dB; from 1 dB on, the interval is to be above 0 too."""
+
+
+def decibels(values: Sequence[float]) -> str:
+    """Format a value in dB with its interval."""
+    return "{:.2f} ({:.2f} to {:.2f})".format(*values)
+
+
+def real_pictures(name: str, results: dict[str, Any], steps: int) -> str:
+    """Return the section of a set of real pairs."""
+
+    def difference(pair: str) -> str:
+        return " − ".join(NAMES[model] for model in pair.split(" - "))
+
+    cells = []
+    for model, psnr in results["psnr"].items():
+        noise = results["noise"]["real" if model == "noisy" else model]
+        facts = [f"{noise['luma_codes']:.1f}", f"{noise['red_green']:.2f}"]
+        cells.append([NAMES[model], decibels(psnr), with_interval(results["ssim"][model]), *facts])
+    differences = [
+        [difference(pair), decibels(psnr), with_interval(results["ssim_difference"][pair])]
+        for pair, psnr in results["psnr_difference"].items()
+    ]
+    longer = results["psnr_of_longer_training"]
+    seed_0 = {model: results["psnr_by_seed"][model][0] for model in longer}
+    more = [[NAMES[model], f"{seed_0[model]:.2f}", f"{psnr:.2f}"] for model, psnr in longer.items()]
+    lines = []
+    for pair, least in GOALS.get(name, {}).items():
+        value, low, _ = results["psnr_difference"][pair]
+        bound = f"at least {least:g} dB{' and an interval above 0' if least >= 1 else ''}"
+        is_met = met(value >= least and (least < 1 or low > 0))
+        lines.append(f"- {difference(pair)}, goal {bound}: {is_met} ({value:.2f} dB).")
+    changes = "keep" if sorted(seed_0, key=seed_0.__getitem__) == sorted(longer, key=longer.__getitem__) else "change"
+    lines.append(f"- Twice the steps {changes} the order of the models with seed 0.")
+    if results["not_run"]:
+        lines.append(f"- Not run: {', '.join(NAMES[model] for model in results['not_run'])}.")
+    return f"""
+## {SETS.get(name, name)}
+
+{results["pairs"]} pairs of {results["groups"]} groups. Luma and R–G are deviation and correlation of the noise of the
+training patches, in the first row of the judged pictures (medians). The best AWGN is chosen on the judged pictures.
+
+{table(["training noise", "PSNR, dB", "SSIM", "luma, codes", "R–G"], cells)}
+
+{table(["difference", "PSNR, dB", "SSIM"], differences)}
+
+{chr(10).join(lines)}
+
+{table(["PSNR, dB, with seed 0", f"{steps:,} steps", f"{2 * steps:,} steps"], more)}
+"""
+
+
 def training(results: dict[str, Any]) -> str:
     """Return the page of experiment 4."""
-    srgb, scenes = results["srgb"], (results["srgb"], results["srgb_daylight"])
-    measures = (("psnr_db", "psnr_difference_db"), ("ssim", "ssim_difference"))
-    head = ["PSNR, dB", "SSIM", "daylight: PSNR, dB", "daylight: SSIM"]
-    cells = [
-        [NAMES[model], *(with_interval(scene[name][model]) for scene in scenes for name, _ in measures)]
-        for model in srgb["psnr_db"]
-    ]
-    differences = [
-        [
-            " − ".join(NAMES[name] for name in pair.split(" - ")),
-            *(with_interval(scene[name][pair]) for scene in scenes for _, name in measures),
-        ]
-        for pair in srgb["psnr_difference_db"]
-    ]
-    low, daylight = (scene["noise_codes"] for scene in scenes)
+    sets = sorted(results["sets"].items(), key=lambda item: (item[0] not in GOALS, item[0] != "SIDD_patches"))
+    sections = "".join(real_pictures(name, found, results["steps"]) for name, found in sets)
     page = f"""# Does it train better
 
-One network of {srgb["parameters"]} parameters was trained on {results["photographs"]} photographs with each kind of
-noise, in {results["steps"]} steps, with {results["seeds"]} seeds. It was judged on {srgb["pairs"]}
-real sRGB pairs of {srgb["scenes"]} scenes; 95 % intervals over scenes.
-
-## On pictures
-
-The median noise of the training patches has a standard deviation of {low["trained"]:.1f} codes in low light and
-{daylight["trained"]:.1f} by daylight, that of the real pictures {low["judged"]:.1f}. Daylight was added after the
-first result, because the noise of low light is stronger than that of the real pictures.
-
-{table(["training noise", *head], cells)}
-
-Paired differences; an interval that contains 0 shows no difference:
-
-{table(["difference", *head], differences)}
-"""
+One network of {results["parameters"]:,} parameters was trained on {results["photographs"]} photographs with each kind
+of noise, in {results["steps"]:,} steps, with {results["seeds"]} seeds (real pairs with one). It was judged on real sRGB
+pairs. Means over groups with 95 % intervals over groups; an interval of a difference that contains 0 shows no
+difference.
+{sections}"""
     if "raw" not in results:
         return page
     raw = results["raw"]

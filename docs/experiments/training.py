@@ -41,7 +41,11 @@ NOISE = {"SIDD": PHONES, "SIDD_patches": PHONES}
 WHITE = {"awgn": 1.0, "awgn_1.6": 1.6, "awgn_2.5": 2.5}
 """White models, and their deviation in luma relative to that of `CameraNoise`."""
 CAMERA = {"bilinear": "bilinear", "malvar": "malvar"}
-FITTED = ("fitted", "fitted_isp")
+FITTED: dict[str, dict[str, Any]] = {"fitted": {}, "fitted_isp": {"clean": "mean"}}
+"""Fitted models, and their further arguments of `CameraNoise`."""
+JPEG = {"PolyU": 75}
+"""Quality of the JPEG pictures of a set, which `fitted_isp` knows."""
+FITTED_PAIRS, STRENGTH = 6, ["log_uniform", 0.58, 1.73]
 MODELS = (*WHITE, *CAMERA, *FITTED, "real")
 DIFFERENCES = (
     ("malvar", "awgn"),
@@ -89,6 +93,24 @@ def crops(pictures: Sequence[Any], seed: int) -> Iterator[tuple[int, Any]]:
         yield number, np.ascontiguousarray(picture[y : y + RAW_SIDE, x : x + RAW_SIDE])
 
 
+@dataclass(frozen=True, eq=False)
+class RealSet:
+    """Real pairs of one kind, which are judged together."""
+
+    name: str
+    pairs: list[RealPair]
+
+    def half(self, half: int) -> list[int]:
+        """Return the numbers of the pairs of one half of the scenes, which alternate in order."""
+        scenes = sorted({pair.scene for pair in self.pairs})[half::2]
+        return [number for number, pair in enumerate(self.pairs) if pair.scene in scenes]
+
+    def by_group(self, values: Any) -> Any:
+        """Return the mean of the values of each group: scene, and phone and ISO if they are known."""
+        groups = [(pair.scene, pair.group) for pair in self.pairs]
+        return np.array([np.mean(values[[own == group for own in groups]], axis=0) for group in sorted(set(groups))])
+
+
 @dataclass(frozen=True)
 class Training:
     """One training: the set whose pictures judge it, its noise, seed, steps, and the half of the scenes it has seen."""
@@ -108,12 +130,8 @@ def trainings(sets: Sequence[str]) -> Iterator[Training]:
         yield Training(name, model, SEEDS[0], 2 * STEPS)
     for name, half in product(sets, (0, 1)):
         yield Training(name, "real", SEEDS[0], STEPS, half)
-
-
-def half_of(pairs: Sequence[RealPair], half: int) -> list[int]:
-    """Return the numbers of the pairs of one half of the scenes, which alternate in order."""
-    scenes = sorted({pair.scene for pair in pairs})[half::2]
-    return [number for number, pair in enumerate(pairs) if pair.scene in scenes]
+    for model, seed, name, half in product(FITTED, SEEDS, sets, (0, 1)):
+        yield Training(name, model, seed, STEPS, half)
 
 
 @functools.lru_cache(maxsize=2)
@@ -122,6 +140,26 @@ def camera_pictures(name: str, demosaic: str, seed: int, steps: int, photos: Pat
     camera, pictures = ug.CameraNoise(NOISE.get(name, DAYLIGHT), demosaic=demosaic, seed=seed), photographs(photos)
     count = round(steps / STEPS_PER_PICTURE)
     return [camera(pictures[number % len(pictures)], index=number)[::-1] for number in range(count)]
+
+
+@functools.cache
+def fits_of(judged_on: RealSet, half: int, jpeg: int | None) -> dict[str, Any]:
+    """Fit `CameraNoise` to the pairs of one half, for each phone or camera and ISO apart."""
+    groups: dict[str, list[tuple[Any, Any]]] = defaultdict(list)
+    for pair in (judged_on.pairs[number] for number in judged_on.half(half)):
+        device_and_iso = pair.group or "_".join(pair.name.split("_")[0:4:3])
+        groups[device_and_iso].append((pair.noisy, pair.clean))
+    return {group: ug.CameraNoise.fit(groups[group][:FITTED_PAIRS], jpeg=jpeg) for group in sorted(groups)}
+
+
+def fitted_pictures(training: Training, fits: Sequence[Any], photos: Path | None) -> list[tuple[Any, Any]]:
+    """Return noisy and clean pictures of fits; each round of the photographs has one of them."""
+    cameras = [fit.noise(seed=training.seed, strength=STRENGTH, **FITTED[training.model]) for fit in fits]
+    pictures, made = photographs(photos), []
+    for number in range(round(training.steps / STEPS_PER_PICTURE)):
+        turn, picture = divmod(number, len(pictures))
+        made.append(cameras[turn % len(cameras)](pictures[picture], index=number)[::-1])
+    return made
 
 
 def cuts(pictures: Sequence[tuple[Any, Any]], seed: int, steps: int) -> Iterator[tuple[Any, Any]]:
@@ -142,15 +180,23 @@ def whitened(patches: Iterator[tuple[Any, Any]], strength: float, seed: int) -> 
         yield np.clip(np.rint(clean + drawn), 0, 255), clean
 
 
-def patches_of(training: Training, pairs: Sequence[RealPair], photos: Path | None) -> Iterator[tuple[Any, Any]]:
+def patches_of(training: Training, judged_on: RealSet, photos: Path | None) -> Iterator[tuple[Any, Any]]:
     """Return the patches of a training, noisy and clean, in codes of 8 bits."""
-    model, seed, steps = training.model, training.seed, training.steps
-    if training.half is not None:
-        seen = [pairs[number] for number in half_of(pairs, training.half)]
-        return cuts([(pair.noisy, pair.clean) for pair in seen], seed, steps)
-    pictures = camera_pictures(training.pictures, CAMERA.get(model, "malvar"), seed, steps, photos)
+    model, half, seed, steps = training.model, training.half, training.seed, training.steps
+    if half is None:
+        pictures = camera_pictures(judged_on.name, CAMERA.get(model, "malvar"), seed, steps, photos)
+    elif model in FITTED:
+        pictures = fitted_pictures(training, list(fits_of(judged_on, half, jpeg_of(training)).values()), photos)
+    else:
+        seen = (judged_on.pairs[number] for number in judged_on.half(half))
+        pictures = [(pair.noisy, pair.clean) for pair in seen]
     patches = cuts(pictures, seed, steps)
     return whitened(patches, WHITE[model], seed) if model in WHITE else patches
+
+
+def jpeg_of(training: Training) -> int | None:
+    """Return the quality of the JPEG pictures that the noise of a training has."""
+    return JPEG.get(training.pictures) if training.model == "fitted_isp" else None
 
 
 def noise_facts(pairs: Sequence[tuple[Any, Any]]) -> dict[str, float]:
@@ -243,35 +289,35 @@ def prepare() -> None:
     torch.use_deterministic_algorithms(True)
 
 
-def judged(training: Training, pairs: Sequence[RealPair], photos: Path | None) -> dict[str, Any]:
+def judged(training: Training, judged_on: RealSet, photos: Path | None) -> dict[str, Any]:
     """Train, and return PSNR and SSIM of the judged pairs by their numbers, with the facts of the training noise."""
     prepare()
-    facts = noise_facts(list(islice(patches_of(training, pairs, photos), 300)))
-    patches = ((noisy / 255, clean / 255) for noisy, clean in patches_of(training, pairs, photos))
+    pairs, half = judged_on.pairs, training.half
+    facts = noise_facts(list(islice(patches_of(training, judged_on, photos), 300)))
+    patches = ((noisy / 255, clean / 255) for noisy, clean in patches_of(training, judged_on, photos))
     net = trained(patches, 3, training.seed, training.steps)
-    numbers = range(len(pairs)) if training.half is None else half_of(pairs, 1 - training.half)
+    numbers = range(len(pairs)) if half is None else judged_on.half(1 - half)
     scores = {n: quality(denoised(net, pairs[n].noisy / 255), pairs[n].clean / 255) for n in numbers}
-    return {"training": asdict(training), "scores": scores, **facts}
+    line = {"training": asdict(training), "scores": scores, **facts}
+    if half is not None and training.model in FITTED:
+        fits = fits_of(judged_on, half, jpeg_of(training))
+        line["fits"] = {group: [*fit.overrides, *map(str, fit.options.items())] for group, fit in fits.items()}
+    return line
 
 
-def scores_of_all(sets: dict[str, list[RealPair]], file: Path, photos: Path | None) -> dict[Training, dict[str, Any]]:
+def scores_of_all(sets: Sequence[RealSet], file: Path, photos: Path | None) -> dict[Training, dict[str, Any]]:
     """Return the scores of all trainings: those in the file, and the others, which are added to it."""
     lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     found = {Training(**line["training"]): line for line in map(json.loads, lines)}
-    for training in trainings(list(sets)):
+    by_name = {judged_on.name: judged_on for judged_on in sets}
+    for training in trainings(list(by_name)):
         if training not in found:
-            line = json.dumps(judged(training, sets[training.pictures], photos))
+            line = json.dumps(judged(training, by_name[training.pictures], photos))
             with file.open("a", encoding="utf-8") as stream:
                 stream.write(line + "\n")
             found[training] = json.loads(line)
             print(training, np.mean(list(found[training]["scores"].values()), axis=0), flush=True)
     return found
-
-
-def by_group(pairs: Sequence[RealPair], values: Any) -> Any:
-    """Return the mean of the values of each group: scene, and phone and ISO if they are known."""
-    groups = [(pair.scene, pair.group) for pair in pairs]
-    return np.array([np.mean(values[[own == group for own in groups]], axis=0) for group in sorted(set(groups))])
 
 
 def quality_of(found: Iterable[dict[str, Any]], count: int) -> Any:
@@ -283,18 +329,19 @@ def quality_of(found: Iterable[dict[str, Any]], count: int) -> Any:
     return values
 
 
-def summary(name: str, pairs: Sequence[RealPair], found: dict[Training, dict[str, Any]]) -> dict[str, Any]:
+def summary(judged_on: RealSet, found: dict[Training, dict[str, Any]]) -> dict[str, Any]:
     """Compare the models on the pairs of a set."""
+    pairs, by_group = judged_on.pairs, judged_on.by_group
     lines: dict[tuple[str, int, int], list[dict[str, Any]]] = defaultdict(list)
     for training, line in found.items():
-        if training.pictures == name:
+        if training.pictures == judged_on.name:
             lines[training.model, training.seed, training.steps].append(line)
     by_pair = {key: quality_of(line, len(pairs)) for key, line in lines.items()}
     seeds = {model: SEEDS[:1] if model == "real" else SEEDS for model in MODELS}
     models = [m for m in MODELS if all(np.isfinite(by_pair.get((m, s, STEPS), np.nan)).all() for s in seeds[m])]
-    groups = {"noisy": by_group(pairs, np.array([quality(pair.noisy / 255, pair.clean / 255) for pair in pairs]))}
+    groups = {"noisy": by_group(np.array([quality(pair.noisy / 255, pair.clean / 255) for pair in pairs]))}
     for model in models:
-        groups[model] = by_group(pairs, np.mean([by_pair[model, s, STEPS] for s in seeds[model]], axis=0))
+        groups[model] = by_group(np.mean([by_pair[model, s, STEPS] for s in seeds[model]], axis=0))
     best = max((model for model in WHITE if model in groups), key=lambda model: np.mean(groups[model][:, 0]))
     compared = {**groups, "best_awgn": groups[best]}
     differences = [pair for pair in DIFFERENCES if pair[0] in compared and pair[1] in compared]
@@ -318,14 +365,18 @@ def summary(name: str, pairs: Sequence[RealPair], found: dict[Training, dict[str
             for measure, n in measures.items()
         },
         "psnr_by_seed": {
-            model: [float(np.mean(by_group(pairs, by_pair[model, s, STEPS])[:, 0])) for s in seeds[model]]
-            for model in models
+            model: [float(np.mean(by_group(by_pair[model, s, STEPS])[:, 0])) for s in seeds[model]] for model in models
         },
         "psnr_of_longer_training": {
-            model: float(np.mean(by_group(pairs, by_pair[model, SEEDS[0], 2 * STEPS])[:, 0]))
+            model: float(np.mean(by_group(by_pair[model, SEEDS[0], 2 * STEPS])[:, 0]))
             for model in models
             if (model, SEEDS[0], 2 * STEPS) in by_pair
         },
+        "fits": [
+            {"model": training.model, "half": training.half, **line["fits"]}
+            for training, line in found.items()
+            if training.pictures == judged_on.name and training.seed == SEEDS[0] and "fits" in line
+        ],
         "psnr_by_group": {model: values[:, 0] for model, values in groups.items()},
     }
 
@@ -362,8 +413,8 @@ def main() -> None:
     """Run the experiment."""
     options = arguments(__doc__, "training", "folder of PolyU, SIDD, SID or ELD")
     forms = {**FORMS, **PATCHES}
-    sets = {name: list(real_pairs(options.data, {name: form})) for name, form in forms.items()}
-    sets = {name: pairs for name, pairs in sets.items() if pairs}
+    sets = [RealSet(name, list(real_pairs(options.data, {name: form}))) for name, form in forms.items()]
+    sets = [judged_on for judged_on in sets if judged_on.pairs]
     if not sets:
         raise SystemExit(f"{options.data}: no pairs; expected files named as in PolyU, SIDD, SID or ELD")
     found = scores_of_all(sets, options.to.with_suffix(".jsonl"), options.photos)
@@ -374,7 +425,7 @@ def main() -> None:
         "steps": STEPS,
         "seeds": len(SEEDS),
         "parameters": sum(p.numel() for p in network(3).parameters()),
-        "sets": {name: summary(name, pairs, found) for name, pairs in sets.items()},
+        "sets": {judged_on.name: summary(judged_on, found) for judged_on in sets},
         **({"raw": results["raw"]} if "raw" in results else {}),
     }
     if options.raw:
