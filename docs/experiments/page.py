@@ -286,7 +286,7 @@ def real_pictures(name: str, results: dict[str, Any], steps: int) -> str:
     if results["not_run"]:
         lines.append(f"- Not run: {', '.join(NAMES[model] for model in results['not_run'])}.")
     return f"""
-## {SETS.get(name, name)}
+### {SETS.get(name, name)}
 
 {results["pairs"]} pairs of {results["groups"]} groups. Luma and R–G are deviation and correlation of the noise of the
 training patches, in the first row of the judged pictures (medians). The best AWGN is chosen on the judged pictures.
@@ -303,14 +303,17 @@ training patches, in the first row of the judged pictures (medians). The best AW
 
 def training(results: dict[str, Any]) -> str:
     """Return the page of experiment 4."""
-    sets = sorted(results["sets"].items(), key=lambda item: (item[0] not in GOALS, item[0] != "SIDD_patches"))
-    sections = "".join(real_pictures(name, found, results["steps"]) for name, found in sets)
+    sections = ""
+    for part in (results, results.get("more_photographs")):
+        if part is not None:
+            sets = sorted(part["sets"].items(), key=lambda item: (item[0] not in GOALS, item[0] != "SIDD_patches"))
+            sections += f"\n## Trained on {part['photographs']} photographs\n"
+            sections += "".join(real_pictures(name, found, results["steps"]) for name, found in sets)
     page = f"""# Does it train better
 
-One network of {results["parameters"]:,} parameters was trained on {results["photographs"]} photographs with each kind
-of noise, in {results["steps"]:,} steps, with {results["seeds"]} seeds (real pairs with one). It was judged on real sRGB
-pairs. Means over groups with 95 % intervals over groups; an interval of a difference that contains 0 shows no
-difference.
+One network of {results["parameters"]:,} parameters was trained with each kind of noise, in {results["steps"]:,} steps,
+with {results["seeds"]} seeds (real pairs with one). It was judged on real sRGB pairs. Means over groups with 95 %
+intervals over groups; an interval of a difference that contains 0 shows no difference.
 {sections}"""
     if "raw" not in results:
         return page

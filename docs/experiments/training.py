@@ -3,8 +3,9 @@
     python docs/experiments/training.py PAIRS [--raw CAPTURES] [--photos FOLDER] [--to RESULTS.json]
 
 Needs PyTorch. PAIRS is a folder of PolyU, SIDD, patches of SIDD, SID or ELD, or of several of these, which are judged
-apart; CAPTURES is one that ``gen-dataset calibrate`` reads. The scores of each training are added to RESULTS.jsonl, and
-a training that has a line there is not repeated. Protocol: protocol.md.
+apart; CAPTURES is one that ``gen-dataset calibrate`` reads. With FOLDER, which has more photographs, the results are a
+part of their own. The scores of each training are added to RESULTS.jsonl, or RESULTS.photos.jsonl, and a training that
+has a line there is not repeated. Protocol: protocol.md.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import cv2
 import joblib
 import numpy as np
 import torch
-from common import Level, Sensor, arguments, halves, interval, write
+from common import Level, Sensor, arguments, halves, interval, run, write
 from real_pairs import FORMS, PATCHES, RealPair, real_pairs
 from torch import nn
 
@@ -30,7 +31,7 @@ import unprocess_gen as ug
 
 WIDTH, BATCH, RATE, SEEDS = 24, 8, 0.002, (0, 1, 2)
 SIDE, STEPS, STEPS_PER_PICTURE = 32, 1600, 20 / 3
-RAW_SIDE, RAW_STEPS = 48, 400
+RAW_SIDE, RAW_STEPS, LARGEST = 48, 400, 256
 DAYLIGHT = ["noise=canon_5d4", "scene.iso=[log_uniform, 800, 6400]", "scene=daylight"]
 DAYLIGHT += ["effects.all=off", "effects.shot=on", "effects.read=on"]
 PHONES = ["noise=heteroscedastic", "noise.a=[log_uniform, 3, 60]", "noise.b=[log_uniform, 60, 3000]"]
@@ -71,8 +72,9 @@ def network(channels: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+@functools.cache
 def photographs(folder: Path | None) -> list[Any]:
-    """Return training photographs, halved in size, which also reduces their own noise."""
+    """Return training photographs, halved or with a shorter side of 256, which also reduces their own noise."""
     if folder is None:
         from skimage import data
 
@@ -80,8 +82,12 @@ def photographs(folder: Path | None) -> list[Any]:
     else:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg", ".png"))
         pictures = [cv2.imread(str(file), cv2.IMREAD_COLOR)[..., ::-1] for file in files]
-    half = [cv2.resize(np.ascontiguousarray(p), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for p in pictures]
-    return [picture for picture in half if min(picture.shape[:2]) >= RAW_SIDE]
+    scales = [min(0.5, LARGEST / min(picture.shape[:2])) for picture in pictures]
+    reduced = [
+        cv2.resize(np.ascontiguousarray(picture), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        for picture, scale in zip(pictures, scales, strict=True)
+    ]
+    return [picture for picture in reduced if min(picture.shape[:2]) >= RAW_SIDE]
 
 
 def crops(pictures: Sequence[Any], seed: int) -> Iterator[tuple[int, Any]]:
@@ -122,16 +128,16 @@ class Training:
     half: int | None = None
 
 
-def trainings(sets: Sequence[str]) -> Iterator[Training]:
-    """Yield all trainings, those that need no fit first."""
+def trainings(sets: Sequence[str], photos: Path | None) -> Iterator[Training]:
+    """Yield all trainings, those that need no fit first; real pairs need no photographs."""
     for seed, name, model in product(SEEDS, sets, (*WHITE, *CAMERA)):
         yield Training(name, model, seed, STEPS)
-    for name, model in product(sets, (*WHITE, *CAMERA)):
-        yield Training(name, model, SEEDS[0], 2 * STEPS)
-    for name, half in product(sets, (0, 1)):
-        yield Training(name, "real", SEEDS[0], STEPS, half)
     for model, seed, name, half in product(FITTED, SEEDS, sets, (0, 1)):
         yield Training(name, model, seed, STEPS, half)
+    for name, model in product(sets, (*CAMERA, *WHITE)):
+        yield Training(name, model, SEEDS[0], 2 * STEPS)
+    for name, half in product(sets if photos is None else (), (0, 1)):
+        yield Training(name, "real", SEEDS[0], STEPS, half)
 
 
 @functools.lru_cache(maxsize=2)
@@ -212,7 +218,8 @@ def raw_patches(model: str, pictures: Sequence[Any], seed: int, sensor: Sensor) 
     for number, crop in crops(pictures, seed):
         light = (crop.mean(axis=2) / 255) ** 2.2 * np.exp(random.uniform(np.log(0.02), 0))
         clean = sensor.black + light * span
-        noisy = sensor.simulate(model, clean, 10_000 * (seed + 1) + number)
+        # each patch is another place of the sensor, with a fixed pattern of its own
+        noisy = sensor.simulate(model, clean, 10_000 * (seed + 1) + number, "sensor.units=image")
         yield to_input(noisy, sensor)[..., None], to_input(clean, sensor)[..., None]
 
 
@@ -310,7 +317,7 @@ def scores_of_all(sets: Sequence[RealSet], file: Path, photos: Path | None) -> d
     lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     found = {Training(**line["training"]): line for line in map(json.loads, lines)}
     by_name = {judged_on.name: judged_on for judged_on in sets}
-    for training in trainings(list(by_name)):
+    for training in trainings(list(by_name), photos):
         if training not in found:
             line = json.dumps(judged(training, by_name[training.pictures], photos))
             with file.open("a", encoding="utf-8") as stream:
@@ -417,21 +424,17 @@ def main() -> None:
     sets = [judged_on for judged_on in sets if judged_on.pairs]
     if not sets:
         raise SystemExit(f"{options.data}: no pairs; expected files named as in PolyU, SIDD, SID or ELD")
-    found = scores_of_all(sets, options.to.with_suffix(".jsonl"), options.photos)
+    found = scores_of_all(sets, options.to.with_suffix(".photos.jsonl" if options.photos else ".jsonl"), options.photos)
     pictures = photographs(options.photos)
+    part = {"photographs": len(pictures), "sets": {judged_on.name: summary(judged_on, found) for judged_on in sets}}
+    parameters = sum(p.numel() for p in network(3).parameters())
     results = json.loads(options.to.read_text(encoding="utf-8")) if options.to.exists() else {}
-    results = {
-        "photographs": len(pictures),
-        "steps": STEPS,
-        "seeds": len(SEEDS),
-        "parameters": sum(p.numel() for p in network(3).parameters()),
-        "sets": {judged_on.name: summary(judged_on, found) for judged_on in sets},
-        **({"raw": results["raw"]} if "raw" in results else {}),
-    }
+    results |= {"steps": STEPS, "seeds": len(SEEDS), "parameters": parameters}
+    results |= {"more_photographs": part} if options.photos else part
     if options.raw:
         results["raw"] = judge_raw(options.raw, pictures)
     write(results, options.to)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
