@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from unprocess_gen.api import RawPair, develop, generate, make_pair, plan_image, replay, verify
+    from unprocess_gen.camera_fit import CameraFit
     from unprocess_gen.camera_noise import CameraNoise
     from unprocess_gen.config.composition import load_config
     from unprocess_gen.config.schema import Config
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 __version__ = "0.9.0"
 
 __all__ = [
+    "CameraFit",
     "CameraNoise",
     "Clip",
     "Config",
@@ -70,6 +72,7 @@ __all__ = [
 
 _MODULES = {
     "api": ("RawPair", "develop", "generate", "make_pair", "plan_image", "replay", "verify"),
+    "camera_fit": ("CameraFit",),
     "camera_noise": ("CameraNoise",),
     "config.composition": ("load_config",),
     "config.schema": ("Config",),

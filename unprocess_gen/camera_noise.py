@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from unprocess_gen.api import array_pixels, array_settings, plan_array
+from unprocess_gen.camera_fit import CameraFit, fit_pairs
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import refusal
@@ -116,6 +117,57 @@ class CameraNoise:
         self._settings = array_settings(_config_of_pictures(config, seed))
         self._clean, self._seed = clean, seed
         self._calls, self._process, self._told = 0, os.getpid(), SharedCount()
+
+    @classmethod
+    def fit(
+        cls, pairs: Sequence[tuple[ArrayLike, ArrayLike]], config: Sequence[str] = ("gains=fixed",), **options: Any
+    ) -> CameraFit:
+        """Fit the noise to real pairs of a noisy and a clean picture.
+
+        Parameters
+        ----------
+        pairs : sequence of (array_like, array_like)
+            Noisy and clean picture of one scene, uint8 or uint16 [H, W, 3], of one camera and ISO. All pairs together
+            are cut to 2**19 pixels, each to its middle.
+        config : sequence of str
+            Hydra overrides of everything but noise. ``isp=`` and ``camera=`` fix what is fitted otherwise.
+        **options : Any
+            Keyword arguments of `CameraNoise` that are known, such as ``jpeg=75``.
+
+        Returns
+        -------
+        CameraFit
+            Fitted numbers, a table of real against simulated noise, and ``noise()``, which makes the `CameraNoise`.
+
+        Raises
+        ------
+        ConfigError
+            If there is no pair, shapes or dtypes of a pair differ, its pictures are equal, or the pictures have too few
+            levels.
+        ValueError
+            If a picture has another dtype or shape.
+
+        Notes
+        -----
+        Fitted are a and b of ``noise=heteroscedastic``, curve (`isp`), colour matrix (`camera`), demosaicking,
+        ``chroma_nr``, and ``luma_nr`` from four pairs on; gains are those of the config. a and b are effective: they
+        hold with the fitted curve only. The fit matches standard deviations of luma and chroma by level, correlations
+        R-G and G-B, and those of horizontal neighbours in Y and Cb. Pixels with a clean code below 8 or above 247 are
+        left out.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import unprocess_gen as ug
+        >>> ramp = np.linspace(20, 220, 128).astype(np.uint8)[:, None, None] * np.ones((1, 128, 3), np.uint8)
+        >>> known = ug.CameraNoise(["noise=imx385_iso6400", "camera=sony_a7r", "gains=fixed"])
+        >>> clean, noisy = known(ramp, index=0)
+        >>> fit = ug.CameraNoise.fit([(noisy, clean)], ["gains=fixed", "camera=sony_a7r", "isp=smoothstep_gamma22"])
+        >>> fit.demosaic, fit.numbers["a_dn"].low < 13.5 < fit.numbers["a_dn"].high
+        ('malvar', True)
+        >>> noise = fit.noise(seed=1)
+        """
+        return fit_pairs(cls, pairs, config, **options)
 
     def __repr__(self) -> str:
         name = self._settings.config.noise.name

@@ -25,7 +25,16 @@ OUTSIDE_OUTPUT = {
     *("core/exact_distributions.py", "simulation/lookup_tables.py", "simulation/tone_curves.py"),
     *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
     "config/iso_forms.py",  # a logarithm decides only whether a config is refused
-    *("dataset/dng.py", "reports", "calibration", "statistics", "torch.py", "camera_noise.py", "picture_isp.py"),
+    *(
+        "dataset/dng.py",
+        "reports",
+        "calibration",
+        "statistics",
+        "torch.py",
+        "camera_noise.py",
+        "camera_fit.py",
+        "picture_isp.py",
+    ),
 }
 """Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables
 with a checked SHA-256, the formulas of the reference, its inverse, measurements, drawings and exports."""

@@ -72,7 +72,7 @@ ONLY_IN = {
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng", "sources.raw.tags"},
     "rawpy": {"sources.raw.decode"},
-    "scipy": {"calibration.calibrate", "calibration.frame_sums", "calibration.shape"},
+    "scipy": {"calibration.calibrate", "calibration.frame_sums", "calibration.shape", "camera_fit"},
     "torch": {"torch"},
     "dask": {"pipeline.executors.dask"},
     "distributed": {"pipeline.executors.dask"},

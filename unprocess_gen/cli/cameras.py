@@ -7,26 +7,33 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from unprocess_gen.cli.arguments import Call, Operand, flag, local, verb
+from unprocess_gen.cli.arguments import Call, Operand, flag, local, switch, verb
 from unprocess_gen.cli.messages import print_results, report
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.reports.formatting import counted, short_number
 
 
 @verb(
-    Operand("CAPTURES", "the folder of the raw frames, or with --from noise_profile of DNG files"),
+    Operand("CAPTURES", "the folder of the raw frames; of DNG files or of pairs of pictures with --from or --srgb"),
     flag("--to", "FILE", "write the profile to FILE.yaml, and estimates to FILE.json", local, required=True),
     flag("--report", "PAGE", "draw curves, histograms and maps in PAGE (HTML)", local),
     flag("--from", "noise_profile", "read tags of DNG files", dest="origin", choices=("noise_profile",)),
+    switch(
+        "--srgb", "fit CameraNoise to noisy and clean sRGB pictures: pairs.csv, or names as x_noisy.png, x_clean.png"
+    ),
 )
 def calibrate(call: Call) -> int:
-    """Measure the noise of a camera from raw frames, or read it from DNG files; write a noise profile."""
+    """Measure the noise of a camera from raw frames or sRGB pairs, or read it from DNG files; write a noise profile."""
     from unprocess_gen.calibration.profile import check_outputs
 
     folder, to, page = call.local_place("folder"), call.to, call.report
-    if call.origin and page is not None:
-        raise ConfigError(f"calibrate: --report {page}: draws measured frames, not tags; leave it out")
+    if (call.origin or call.srgb) and page is not None:
+        raise ConfigError(f"calibrate: --report {page}: draws measured raw frames only; leave it out")
+    if call.origin and call.srgb:
+        raise ConfigError("calibrate: --srgb --from noise_profile: tags have no pairs; expected one of them")
     check_outputs(to)
+    if call.srgb:
+        return _fit(folder, to)
     isos = _state(folder, to) if call.origin else _measure(folder, to, page)
     print_results(f"{to}: profile of {counted(len(isos), 'ISO')}; use it with {_usage(noise=to)} scene.iso={isos[0]:g}")
     return 0
@@ -43,6 +50,22 @@ def _state(folder: Path, to: Path) -> Sequence[float]:
     for iso, a, b, *_ in stated.isos:
         print_results(f"ISO {iso:g}: a {short_number(a[1], 4)} DN, b {short_number(b[1], 4)} DN² (stated)")
     return [result.iso for result in stated.isos]
+
+
+def _fit(folder: Path, to: Path) -> int:
+    """Write the profile of pairs of pictures."""
+    from unprocess_gen.calibration.picture_pairs import read_picture_pairs
+    from unprocess_gen.calibration.profile import write_profile
+    from unprocess_gen.camera_fit import fit_json, fit_yaml
+    from unprocess_gen.camera_noise import CameraNoise
+
+    read = read_picture_pairs(folder)
+    fit = CameraNoise.fit(read.pairs)
+    source = f"{counted(len(read.pairs), 'pair')} of pictures, SHA-256 of the list of their SHA-256 {read.sha256}"
+    write_profile(to, fit_yaml(fit, to.stem, source), fit_json(fit))
+    also = ", ".join(f"{key}={value!r}" for key, value in fit.options.items())
+    print_results(fit, f"{to}: use it with {_usage(noise=to)} {fit.settings}; in CameraNoise with {also} too")
+    return 0
 
 
 def _measure(folder: Path, to: Path, page: Path | None) -> Sequence[float]:

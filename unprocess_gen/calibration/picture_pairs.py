@@ -1,0 +1,74 @@
+"""List and read the pairs of a noisy and a clean picture below a folder."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from unprocess_gen.calibration.captures import joined_sha256
+from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.files import file_sha256, machine_errors
+from unprocess_gen.core.tables import column_names, delimiter_of
+from unprocess_gen.sources.image.decode import decode
+
+TABLE, COLUMNS = "pairs.csv", ("noisy", "clean")
+NAMES = {"_noisy.": "_clean.", "_real.": "_mean.", "NOISY_SRGB": "GT_SRGB"}
+"""Parts of the names of noisy pictures, and what clean ones have in their place; the last two as PolyU and SIDD."""
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+MAX_PIXELS = 2**26
+
+
+class PicturePairs(NamedTuple):
+    """Noisy and clean pictures, and the digest of their files."""
+
+    pairs: list[tuple[Srgb, Srgb]]
+    sha256: str
+
+
+def read_picture_pairs(folder: Path) -> PicturePairs:
+    """Read all pairs below a folder; ConfigError or MachineError."""
+    if not folder.is_dir():
+        raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of noisy and clean pictures")
+    with machine_errors(folder):
+        paths = list(_listed(folder) if (folder / TABLE).is_file() else _named(folder))
+        if not paths:
+            expected = f"expected {TABLE}, or names with {', '.join(f'{a} and {b}' for a, b in NAMES.items())}"
+            raise ConfigError(f"calibrate: {folder}: contains no picture as {', '.join(SUFFIXES)}; {expected}")
+        digests = [file_sha256(path) for pair in paths for path in pair]
+        return PicturePairs([(_read(noisy), _read(clean)) for noisy, clean in paths], joined_sha256(digests))
+
+
+def _listed(folder: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield the pairs of ``pairs.csv``."""
+    header, *lines = (folder / TABLE).read_text(encoding="utf-8-sig").splitlines() or [""]
+    delimiter = delimiter_of(header, COLUMNS[0]) or ","
+    for number, row in enumerate(csv.reader([header, *lines], delimiter=delimiter), start=1):
+        paths = [folder / cell.strip() for cell in row]
+        if len(row) != 2 or (tuple(column_names(row)) != COLUMNS if number == 1 else not all(map(Path.is_file, paths))):
+            expected = "expected the columns noisy,clean and files that exist"
+            raise ConfigError(f"{folder / TABLE}, line {number}: {','.join(row)}: {expected}")
+        if number > 1:
+            yield paths[0], paths[1]
+
+
+def _named(folder: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield the pairs that names state; ConfigError for a picture without a partner."""
+    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
+        both = (*NAMES.items(), *((clean, noisy) for noisy, clean in NAMES.items()))
+        partners = [path.with_name(path.name.replace(own, other)) for own, other in both if own in path.name]
+        if len(partners) != 1 or not partners[0].is_file():
+            expected = " or ".join(map(str, partners)) or "a name with _noisy or _clean"
+            raise ConfigError(f"calibrate: {path}: has no partner; expected {expected}, or list the pairs in {TABLE}")
+        if any(noisy in path.name for noisy in NAMES):
+            yield path, partners[0]
+
+
+def _read(path: Path) -> Srgb:
+    """Decode a picture; ConfigError if it cannot be used."""
+    try:
+        return decode(path.read_bytes(), max_pixels=MAX_PIXELS, icc="ignore", name=str(path)).srgb
+    except SourceError as error:
+        raise ConfigError(f"calibrate: {path}: {error.text}; expected a picture of 8 or 16 bits") from error

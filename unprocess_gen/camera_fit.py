@@ -1,0 +1,363 @@
+"""Fit `CameraNoise` to real pairs of a noisy and a clean sRGB picture, by second moments of noisy - clean.
+
+The statistics are standard deviations of luma and chroma in bands of levels, the correlations R-G and G-B, and those of
+horizontal neighbours in Y and Cb (ITU-T T.871). The clean pictures get simulated noise, always of the same random
+numbers. Least squares change a, b, chroma_nr² and luma_nr², in which variances are nearly linear, until its statistics
+are those of the real noise.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike
+
+from unprocess_gen.api import array_pixels
+from unprocess_gen.calibration.gain import Estimate
+from unprocess_gen.calibration.profile import MARK, rounded
+from unprocess_gen.config.composition import load_config
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.arrays import Float, Srgb
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.libraries import require
+from unprocess_gen.reports.formatting import short_number
+from unprocess_gen.simulation.reference.isp import DEMOSAICS
+
+Choice = tuple[str, str, str]
+"""Curve, camera and demosaicking; the first two are overrides."""
+
+NUMBERS = ("a_dn", "b_dn2", "chroma_nr", "luma_nr")
+TRIED = {
+    "isp=": ("isp=smoothstep_gamma22", "isp=gamma22", "isp=srgb"),
+    "camera=": ("camera=convex", "camera=nexus_6p", "camera=sony_a7r", "camera=olympus_em10", "camera=sony_rx100"),
+}
+"""Overrides that are tried unless the config has one of the group."""
+PIXELS, TILE, BAND, BANDS = 2**19, 32, 16, 16
+"""Most pixels of all pairs, which are cut to their middle; side of a tile; codes of a band of clean luma; bands."""
+DARKEST, BRIGHTEST = 8, 247
+"""Least and largest clean code of a channel that is used; beyond them, 0 and 255 cut the noise off."""
+LEAST_PIXELS, LEAST_TILES, LEAST_BANDS, LEAST_PAIRS = 400, 3, 2, 4
+"""Fewest pixels and tiles of a band; fewest bands, to separate a from b; fewest pairs that show luma reduction.
+
+Fewer pairs are resampled tile by tile.
+"""
+MODEL_ERRORS = (0.03, 0.02)
+"""Errors of the model, added to those of sampling: of logarithms of deviations, and of correlations. Chosen."""
+START = (0.0026, 7e-5, 2.0, 0.5)
+"""First a and b for light from 0 to 1 (their size follows from the luma), chroma_nr², luma_nr² in luma variances."""
+STEPS, RESAMPLES, ALIKE, LEAST_BLUR = 6, 200, 4.0, 0.3
+"""Most steps; resamples; excess of a sum of squares, in mean squares, that does not exclude a choice (two standard
+errors); least standard deviation of a Gaussian filter that changes a picture, pixels."""
+TO_YCC = np.array([[0.299, -0.1687, 0.5], [0.587, -0.3313, -0.4187], [0.114, 0.5, -0.0813]], np.float32)
+ALL = np.zeros((8, 5))
+"""R, G, B, Y, Cb, Cr, and Y and Cb of the right neighbour, from R, G, B, and Y and Cb of the right neighbour."""
+ALL[:3, :3], ALL[3:6, :3], ALL[6:, 3:] = np.eye(3), TO_YCC.T, np.eye(2)
+RATIOS = {"correlation R-G": (0, 1), "correlation G-B": (1, 2), "lag 1 of Y": (3, 6), "lag 1 of Cb": (4, 7)}
+"""Correlations of two rows of `ALL`."""
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """Camera noise that `CameraNoise.fit` fitted to real pairs; its text is a table, real against model.
+
+    Attributes
+    ----------
+    numbers : dict of Estimate
+        ``a_dn`` and ``b_dn2`` in DN of the sensor, ``chroma_nr``, and ``luma_nr`` if it was fitted; each has ``value``,
+        ``low`` and ``high`` (95 %). a and b are effective: they hold with the other overrides only.
+    choice : tuple of str
+        Curve, camera and demosaicking with the smallest residual.
+    alike : tuple of str
+        Other choices that the pairs do not exclude.
+    resampled : str
+        Number of the pairs or tiles whose bootstrap gives the intervals.
+    table : dict of (Estimate, Estimate)
+        Statistics of the real and of the simulated noise. Standard deviations are in 8-bit codes.
+    overrides : tuple of str
+        Hydra overrides of the fitted noise.
+    options : dict
+        Keyword arguments of `CameraNoise` in addition to the overrides.
+    """
+
+    numbers: Mapping[str, Estimate]
+    choice: Choice
+    alike: tuple[str, ...]
+    resampled: str
+    table: Mapping[str, tuple[Estimate, Estimate]]
+    overrides: tuple[str, ...]
+    options: Mapping[str, Any]
+    make: Callable[..., Any]
+
+    @property
+    def settings(self) -> str:
+        """Overrides with which a and b hold."""
+        return " ".join(word for word in self.overrides if not word.startswith("noise"))
+
+    def noise(self, seed: int = 0, **options: Any) -> Any:
+        """Make the fitted `CameraNoise`.
+
+        Parameters
+        ----------
+        seed : int
+            Seed of the noise.
+        **options : Any
+            Other keyword arguments of `CameraNoise`, such as ``strength``.
+
+        Returns
+        -------
+        CameraNoise
+            Noise with the fitted numbers.
+        """
+        return self.make(self.overrides, seed=seed, **{**self.options, **options})
+
+    def __str__(self) -> str:
+        lines = [("", f"{' '.join(self.choice)}; 95 % intervals: bootstrap over {self.resampled}")]
+        lines += [("", f"not excluded: {choice}") for choice in self.alike]
+        lines += [(name, _text(number)) for name, number in self.numbers.items()]
+        lines += [("", f"{'real':<26}model")]
+        lines += [(name, f"{_text(real):<26}{_text(model)}") for name, (real, model) in self.table.items()]
+        return "\n".join(f"{name:<24}{text}" if name or text[:4] == "real" else text for name, text in lines)
+
+
+def _text(number: Estimate) -> str:
+    value, low, high = (short_number(end, 3) for end in (number.value, number.low, number.high))
+    return f"{value} ({low} to {high})"
+
+
+def fit_yaml(fit: CameraFit, name: str, source: str) -> str:
+    """A fit as a noise profile; ``source`` describes the pairs."""
+    words = (word.removeprefix("noise.").partition("=") for word in fit.overrides if word.startswith("noise."))
+    numbers = {key: yaml.safe_load(value) for key, _, value in words}
+    lines = [
+        f"# Fitted {MARK} --srgb to {source}.",
+        f"# a and b are effective: they hold with {fit.settings}.",
+        f"# CameraNoise needs also {', '.join(f'{key}={value!r}' for key, value in fit.options.items())}.",
+        *(f"# Not excluded: {choice}." for choice in fit.alike),
+    ]
+    profile = {"name": name, "units": "dn", "black": "subtracted", **numbers, "negative_variance": "refuse"}
+    return "\n".join(lines) + "\n" + yaml.safe_dump(profile, sort_keys=False)
+
+
+def fit_json(fit: CameraFit) -> str:
+    """Choice, numbers and table of a fit as a JSON list, an object a line."""
+    named = [*fit.numbers.items(), *((f"{name} (real)", real) for name, (real, _) in fit.table.items())]
+    named += [(f"{name} (model)", model) for name, (_, model) in fit.table.items()]
+    lines: list[tuple[str, Any, list[float]]] = [(word.split("=")[0], word.split("=")[1], []) for word in fit.choice]
+    lines += [(name, rounded(each.value), [rounded(each.low), rounded(each.high)]) for name, each in named]
+    objects = (json.dumps(dict(zip(("name", "value", "interval"), line, strict=True))) for line in lines)
+    return "[\n" + ",\n".join(objects) + "\n]\n"
+
+
+# -------------------------------------------------------------------------------------------------------------- moments
+
+
+class Picture(NamedTuple):
+    """A clean picture, its real noise, the cell (band of a tile) of each pixel, -1 if left out, and number of tiles."""
+
+    clean: Srgb
+    noise: Any
+    cells: Any
+    tiles: int
+
+    def sums(self, noise: Any) -> Float:
+        """Sums of 1, R, G, B, and Y and Cb of the right neighbour, and their products; [tiles, bands, 6, 6]."""
+        used = self.cells >= 0
+        values = [*noise[:, :-1][used].T, *(noise[:, 1:] @ TO_YCC[:, :2])[used].T]
+        values, total = [np.ones_like(values[0]), *values], np.zeros((6, 6, self.tiles * BANDS))
+        for i, j in itertools.combinations_with_replacement(range(6), 2):
+            total[i, j] = total[j, i] = np.bincount(self.cells[used], values[i] * values[j], total.shape[2])
+        return np.moveaxis(total.reshape(6, 6, self.tiles, BANDS), (0, 1), (2, 3))
+
+
+def read_pictures(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Picture]:
+    """Check the pairs, cut them to the middle, and find the cell of each pixel; ConfigError."""
+    if not len(pairs):
+        raise ConfigError("CameraNoise.fit: pairs=[]: no pair; expected one or more pairs (noisy, clean)")
+    side, pictures = math.isqrt(PIXELS // len(pairs)), []
+    for number, (noisy, clean) in enumerate((array_pixels(noisy), array_pixels(clean)) for noisy, clean in pairs):
+        kinds = [f"{picture.dtype} {list(picture.shape)}" for picture in (noisy, clean)]
+        if kinds[0] != kinds[1] or np.array_equal(noisy, clean):
+            problem = f"noisy is {kinds[0]}, clean {kinds[1]}" if kinds[0] != kinds[1] else "noisy equals clean"
+            expected = "expected a noisy and a clean picture of one scene, shape and dtype"
+            raise ConfigError(f"CameraNoise.fit: pairs[{number}]: {problem}; {expected}")
+        y, x = (max(length - side, 0) // 2 for length in clean.shape[:2])
+        noisy, clean = (array_pixels(picture[y : y + side, x : x + side]) for picture in (noisy, clean))
+        codes: Any = clean * np.float32(255 / np.iinfo(clean.dtype).max)
+        used = ((codes >= DARKEST) & (codes <= BRIGHTEST)).all(axis=2)
+        rows, columns = (np.arange(length) // TILE for length in clean.shape[:2])
+        tiles = rows[:, None] * (columns[-1] + 1) + columns
+        cells = np.where(used, tiles * BANDS + (codes @ TO_YCC[:, 0] / BAND).astype(int), -1)[:, :-1]
+        cells[~used[:, 1:]] = -1  # the neighbour is left out
+        pictures.append(Picture(clean, _noise(noisy, clean), cells, int(tiles.max()) + 1))
+    return pictures
+
+
+def _noise(noisy: Srgb, clean: Srgb) -> Any:
+    """Noise in 8-bit codes, float32."""
+    return (noisy.astype(np.float32) - clean) * np.float32(255 / np.iinfo(clean.dtype).max)
+
+
+def statistics(sums: Float) -> Float:
+    """Logarithms of the deviations of luma and of chroma by band, and `RATIOS`; NaN without noise."""
+    count = sums[..., :1, :1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = sums / count
+        about = ALL @ (mean[..., 1:, 1:] - mean[..., 1:, :1] * mean[..., :1, 1:]) @ ALL.T
+        stds = [np.log(about[..., 3, 3]) / 2, np.log(about[..., 4, 4] + about[..., 5, 5]) / 2]
+        total = np.nansum(about * count, axis=-3)
+        ratios = [total[..., i, j] / np.sqrt(total[..., i, i] * total[..., j, j]) for i, j in RATIOS.values()]
+    values = np.concatenate([*stds, np.stack(ratios, axis=-1)], axis=-1)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _resampled(sums: Float, tiles: Sequence[int]) -> Float:
+    """Statistics of resamples of units that have some tiles each."""
+    units = len(tiles)
+    draws = np.random.default_rng(0).multinomial(units, np.full(units, 1 / units), RESAMPLES)
+    return statistics(np.tensordot(np.repeat(draws, tiles, axis=1), sums, 1))
+
+
+# ------------------------------------------------------------------------------------------------------------------ fit
+
+
+class Candidate(NamedTuple):
+    """Fitted parameters of a choice, sum of squares, and the matrix from residuals to changes of the parameters."""
+
+    choice: Choice
+    numbers: Float
+    square: float
+    inverse: Float
+
+
+SQUARE = operator.attrgetter("square")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Moments of the real noise, the statistics that are fitted, their errors, first parameters, and the simulation."""
+
+    sums: Float
+    kept: Any
+    errors: Float
+    start: Float
+    simulated: Callable[[Choice, Float], Float]
+
+    def fit(self, choice: Choice, start: Float) -> Candidate:
+        """Fit the parameters of a choice by Gauss-Newton steps."""
+        from scipy.optimize import nnls  # takes long to import
+
+        target = statistics(self.sums.sum(axis=0))[self.kept]
+
+        def residual(numbers: Float) -> Float:
+            model = statistics(self.simulated(choice, numbers).sum(axis=0))[self.kept]
+            return np.asarray((model - target) / self.errors)
+
+        levels = (len(target) - len(RATIOS)) // 2
+        numbers = np.r_[start[:2] * np.exp(-2 * np.median((residual(start) * self.errors)[:levels])), start[2:]]
+        scale, value = np.r_[numbers[:2], self.start[2:]], residual(numbers)
+        for _ in range(STEPS):
+            square, widths = float(value @ value), 0.1 * (numbers + scale)
+            slopes = np.transpose([residual(numbers + width) - value for width in np.diag(widths)])
+            aim = nnls(slopes, slopes @ (numbers / widths) - value)[0] * widths
+            trials = (numbers + share * (aim - numbers) for share in (1.0, 0.3))
+            better = ((trial, new) for trial in trials if (new := residual(trial)) @ new < square)
+            numbers, value = next(better, (numbers, value))
+            if value @ value > 0.98 * square:
+                break
+        return Candidate(choice, numbers, float(value @ value), widths[:, None] * np.linalg.pinv(slopes))
+
+
+def fit_pairs(
+    make: Callable[..., Any], pairs: Sequence[tuple[ArrayLike, ArrayLike]], config: Sequence[str], **options: Any
+) -> CameraFit:
+    """Fit the noise that ``make`` makes of a config and keyword arguments; see `CameraNoise.fit`."""
+    require("scipy", "CameraNoise.fit needs scipy", "calibrate")
+    if isinstance(config, str):
+        raise ConfigError(f"CameraNoise.fit: config={config!r}: is text; expected a list: [{config!r}]")
+    curves, cameras = ([w for w in config if w.startswith(key)] or tried for key, tried in TRIED.items())
+    sensor, pictures = load_config(config).sensor, read_pictures(pairs)
+    levels = [f"noise.{name}={getattr(sensor, name)}" for name in ("bits", "black_level_dn", "white_level_dn")]
+    shared = [*(w for w in config if w not in (*curves, *cameras)), "noise=heteroscedastic", *levels]
+
+    @functools.cache
+    def config_of(isp: str, camera: str) -> Config:
+        return load_config([*shared, "noise.a=1", "noise.b=1", isp, camera])
+
+    def simulated(choice: Choice, numbers: Float) -> Float:
+        config, (a, b, *squares) = config_of(*choice[:2]), numbers.tolist()
+        reduction = dict(zip(NUMBERS[2:], map(math.sqrt, squares), strict=False))
+        config = replace(config, noise=replace(config.noise, a=a, b=b))
+        model = make(config, demosaic=choice[2][9:], **options, **reduction)
+        made = (model(picture.clean, index=index) for index, picture in enumerate(pictures))
+        return np.concatenate(
+            [each.sums(_noise(noisy, clean)) for each, (clean, noisy) in zip(pictures, made, strict=True)]
+        )
+
+    span_dn = sensor.white_level_dn - sensor.black_level_dn
+    problem = _problem(simulated, pictures, np.array([span_dn, span_dn**2]))
+    demosaics = [f"demosaic={name}" for name in DEMOSAICS]
+    fits = [problem.fit(choice, problem.start) for choice in itertools.product(curves, cameras[:1], demosaics)]
+    (isp, _, demosaic), start, *_ = min(fits, key=SQUARE)
+    fits += [problem.fit((isp, camera, demosaic), start) for camera in cameras[1:]]
+    best, *others = sorted(fits, key=SQUARE)
+    margin = ALIKE * max(1.0, best.square / len(problem.errors))
+    alike = tuple(" ".join(other.choice) for other in others if other.square < best.square + margin)
+    numbers, table = _intervals(problem, pictures, best)
+    overrides = (*shared, *(f"noise.{key[0]}={rounded(numbers[key].value)}" for key in NUMBERS[:2]), *best.choice[:2])
+    options |= {"demosaic": best.choice[2][9:]} | {key: rounded(numbers[key].value, 4) for key in list(numbers)[2:]}
+    units = f"{len(pairs)} pairs" if len(pairs) >= LEAST_PAIRS else f"{len(problem.sums)} tiles"
+    return CameraFit(numbers, best.choice, alike, units, table, overrides, options, make)
+
+
+def _problem(simulated: Callable[[Choice, Float], Float], pictures: Sequence[Picture], units_dn: Float) -> Problem:
+    """Statistics of the real noise and their errors; ConfigError if they do not show a and b."""
+    sums = np.concatenate([picture.sums(picture.noise) for picture in pictures])
+    count, target = sums[..., 0, 0], statistics(sums.sum(axis=0))
+    used = ((count > 0).sum(axis=0) >= LEAST_TILES) & (count.sum(axis=0) >= LEAST_PIXELS)
+    kept = np.r_[used, used, np.ones(len(RATIOS), bool)]
+    if used.sum() < LEAST_BANDS or np.isnan(target[kept]).any():
+        levels = ", ".join(f"{BAND * band} to {BAND * (band + 1) - 1}" for band in np.flatnonzero(used)) or "none"
+        raise ConfigError(
+            f"CameraNoise.fit: pairs: levels of luma with enough pixels and noise: {levels}; expected {LEAST_BANDS} "
+            f"bands or more, all channels from {DARKEST} to {BRIGHTEST}; add darker and brighter pictures"
+        )
+    sampling = np.nanstd(_resampled(sums, [1] * len(sums))[:, kept], axis=0)
+    errors = np.hypot(sampling, np.repeat(MODEL_ERRORS, (2 * used.sum(), len(RATIOS))))
+    start = START * np.r_[units_dn, 1, np.exp(2 * np.nanmedian(target[:BANDS]))]
+    return Problem(sums, kept, errors, start[: 4 if len(pictures) >= LEAST_PAIRS else 3], simulated)
+
+
+def _intervals(
+    problem: Problem, pictures: Sequence[Picture], best: Candidate
+) -> tuple[dict[str, Estimate], dict[str, tuple[Estimate, Estimate]]]:
+    """Fitted numbers and the table, with 95 % intervals by bootstrap."""
+    single = [1] * len(problem.sums)
+    tiles = [picture.tiles for picture in pictures] if len(pictures) >= LEAST_PAIRS else single
+    count = len(tiles) - 1
+    # Student's t by its expansion, and the spread of resamples, which is too small by (n - 1)/n
+    wide = (1.96 + 2.37 / count + 2.82 / count**2) * math.sqrt(1 + 1 / count) * np.c_[[0, -1, 1]]
+    bands = BAND * np.flatnonzero(problem.kept[:BANDS])
+    names = [f"{kind} std, level {band}" for kind in ("luma", "chroma") for band in bands]
+    columns, resamples = [], []
+    for sums in (problem.sums, problem.simulated(best.choice, best.numbers)):
+        by_unit, by_tile = (_resampled(sums, units)[:, problem.kept] for units in (tiles, single))
+        resamples.append(by_unit)
+        spread = np.fmax(np.nanstd(by_unit, axis=0), np.nanstd(by_tile, axis=0))  # a band may be in one pair only
+        ends = statistics(sums.sum(axis=0))[problem.kept] + wide * spread
+        ends[:, : len(names)] = np.exp(ends[:, : len(names)])
+        columns.append(map(Estimate, *ends.tolist()))
+    changes = np.nan_to_num((resamples[1] - resamples[0]) / problem.errors) @ best.inverse.T
+    ends = (best.numbers + wide * changes.std(axis=0)).clip(0)
+    ends[:, 2:] **= 0.5
+    ends[:, 2] *= ends[:, 2] >= LEAST_BLUR
+    numbers = dict(zip(NUMBERS, map(Estimate, *ends.tolist()), strict=False))
+    return numbers, dict(zip([*names, *RATIOS], zip(*columns, strict=True), strict=True))
