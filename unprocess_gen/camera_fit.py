@@ -12,13 +12,11 @@ import functools
 import itertools
 import json
 import math
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike
 
 from unprocess_gen.api import array_pixels
@@ -102,6 +100,11 @@ class CameraFit:
         """Overrides with which a and b hold."""
         return " ".join(word for word in self.overrides if not word.startswith("noise"))
 
+    @property
+    def keywords(self) -> str:
+        """Keyword arguments as text."""
+        return ", ".join(f"{key}={value!r}" for key, value in self.options.items())
+
     def noise(self, seed: int = 0, **options: Any) -> Any:
         """Make the fitted `CameraNoise`.
 
@@ -135,26 +138,21 @@ def _text(number: Estimate) -> str:
 
 def fit_yaml(fit: CameraFit, name: str, source: str) -> str:
     """A fit as a noise profile; ``source`` describes the pairs."""
-    words = (word.removeprefix("noise.").partition("=") for word in fit.overrides if word.startswith("noise."))
-    numbers = {key: yaml.safe_load(value) for key, _, value in words}
-    lines = [
-        f"# Fitted {MARK} --srgb to {source}.",
-        f"# a and b are effective: they hold with {fit.settings}.",
-        f"# CameraNoise needs also {', '.join(f'{key}={value!r}' for key, value in fit.options.items())}.",
-        *(f"# Not excluded: {choice}." for choice in fit.alike),
-    ]
-    profile = {"name": name, "units": "dn", "black": "subtracted", **numbers, "negative_variance": "refuse"}
-    return "\n".join(lines) + "\n" + yaml.safe_dump(profile, sort_keys=False)
+    lines = [f"Fitted {MARK} --srgb to {source}.", f"a and b are effective: they hold with {fit.settings}."]
+    lines += [f"CameraNoise needs also {fit.keywords}.", *(f"Not excluded: {choice}." for choice in fit.alike)]
+    words = [word.removeprefix("noise.").replace("=", ": ") for word in fit.overrides if word.startswith("noise.")]
+    head = [f"name: {name}", "units: dn", "black: subtracted", "negative_variance: refuse"]
+    return "\n".join([*(f"# {line}" for line in lines), *head, *words]) + "\n"
 
 
 def fit_json(fit: CameraFit) -> str:
-    """Choice, numbers and table of a fit as a JSON list, an object a line."""
-    named = [*fit.numbers.items(), *((f"{name} (real)", real) for name, (real, _) in fit.table.items())]
-    named += [(f"{name} (model)", model) for name, (_, model) in fit.table.items()]
-    lines: list[tuple[str, Any, list[float]]] = [(word.split("=")[0], word.split("=")[1], []) for word in fit.choice]
-    lines += [(name, rounded(each.value), [rounded(each.low), rounded(each.high)]) for name, each in named]
-    objects = (json.dumps(dict(zip(("name", "value", "interval"), line, strict=True))) for line in lines)
-    return "[\n" + ",\n".join(objects) + "\n]\n"
+    """Numbers and table of a fit as a JSON list, an object a line."""
+    named = dict(fit.numbers)
+    for name, both in fit.table.items():
+        named |= zip((f"{name} (real)", f"{name} (model)"), both, strict=True)
+    ends = {name: [rounded(end) for end in (each.value, each.low, each.high)] for name, each in named.items()}
+    lines = [json.dumps({"name": name, "value": value, "interval": pair}) for name, (value, *pair) in ends.items()]
+    return "[\n" + ",\n".join(lines) + "\n]\n"
 
 
 # -------------------------------------------------------------------------------------------------------------- moments
@@ -230,15 +228,12 @@ def _resampled(sums: Float, tiles: Sequence[int]) -> Float:
 
 
 class Candidate(NamedTuple):
-    """Fitted parameters of a choice, sum of squares, and the matrix from residuals to changes of the parameters."""
+    """Sum of squares of a choice, fitted parameters, and the matrix from residuals to changes of the parameters."""
 
+    square: float
     choice: Choice
     numbers: Float
-    square: float
     inverse: Float
-
-
-SQUARE = operator.attrgetter("square")
 
 
 @dataclass(frozen=True)
@@ -273,7 +268,7 @@ class Problem:
             numbers, value = next(better, (numbers, value))
             if value @ value > 0.98 * square:
                 break
-        return Candidate(choice, numbers, float(value @ value), widths[:, None] * np.linalg.pinv(slopes))
+        return Candidate(float(value @ value), choice, numbers, widths[:, None] * np.linalg.pinv(slopes))
 
 
 def fit_pairs(
@@ -298,17 +293,16 @@ def fit_pairs(
         config = replace(config, noise=replace(config.noise, a=a, b=b))
         model = make(config, demosaic=choice[2][9:], **options, **reduction)
         made = (model(picture.clean, index=index) for index, picture in enumerate(pictures))
-        return np.concatenate(
-            [each.sums(_noise(noisy, clean)) for each, (clean, noisy) in zip(pictures, made, strict=True)]
-        )
+        noises = (_noise(noisy, clean) for clean, noisy in made)
+        return np.concatenate([picture.sums(noise) for picture, noise in zip(pictures, noises, strict=True)])
 
     span_dn = sensor.white_level_dn - sensor.black_level_dn
     problem = _problem(simulated, pictures, np.array([span_dn, span_dn**2]))
     demosaics = [f"demosaic={name}" for name in DEMOSAICS]
     fits = [problem.fit(choice, problem.start) for choice in itertools.product(curves, cameras[:1], demosaics)]
-    (isp, _, demosaic), start, *_ = min(fits, key=SQUARE)
+    _, (isp, _, demosaic), start, _ = min(fits)
     fits += [problem.fit((isp, camera, demosaic), start) for camera in cameras[1:]]
-    best, *others = sorted(fits, key=SQUARE)
+    best, *others = sorted(fits)
     margin = ALIKE * max(1.0, best.square / len(problem.errors))
     alike = tuple(" ".join(other.choice) for other in others if other.square < best.square + margin)
     numbers, table = _intervals(problem, pictures, best)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from unprocess_gen.calibration.captures import joined_sha256
 from unprocess_gen.core.arrays import Srgb
@@ -21,15 +20,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 MAX_PIXELS = 2**26
 
 
-class PicturePairs(NamedTuple):
-    """Noisy and clean pictures, and the digest of their files."""
-
-    pairs: list[tuple[Srgb, Srgb]]
-    sha256: str
-
-
-def read_picture_pairs(folder: Path) -> PicturePairs:
-    """Read all pairs below a folder; ConfigError or MachineError."""
+def read_picture_pairs(folder: Path) -> tuple[list[tuple[Srgb, Srgb]], str]:
+    """Read the noisy and clean pictures below a folder, and the digest of their files; ConfigError or MachineError."""
     if not folder.is_dir():
         raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of noisy and clean pictures")
     with machine_errors(folder):
@@ -38,7 +30,7 @@ def read_picture_pairs(folder: Path) -> PicturePairs:
             expected = f"expected {TABLE}, or names with {', '.join(f'{a} and {b}' for a, b in NAMES.items())}"
             raise ConfigError(f"calibrate: {folder}: contains no picture as {', '.join(SUFFIXES)}; {expected}")
         digests = [file_sha256(path) for pair in paths for path in pair]
-        return PicturePairs([(_read(noisy), _read(clean)) for noisy, clean in paths], joined_sha256(digests))
+        return [(_read(noisy), _read(clean)) for noisy, clean in paths], joined_sha256(digests)
 
 
 def _listed(folder: Path) -> Iterator[tuple[Path, Path]]:

@@ -27,10 +27,8 @@ def calibrate(call: Call) -> int:
     from unprocess_gen.calibration.profile import check_outputs
 
     folder, to, page = call.local_place("folder"), call.to, call.report
-    if (call.origin or call.srgb) and page is not None:
-        raise ConfigError(f"calibrate: --report {page}: draws measured raw frames only; leave it out")
-    if call.origin and call.srgb:
-        raise ConfigError("calibrate: --srgb --from noise_profile: tags have no pairs; expected one of them")
+    if bool(call.origin) + call.srgb + (page is not None) > 1:
+        raise ConfigError("calibrate: --from, --srgb, --report: exclude each other; expected one of them, or none")
     check_outputs(to)
     if call.srgb:
         return _fit(folder, to)
@@ -59,12 +57,11 @@ def _fit(folder: Path, to: Path) -> int:
     from unprocess_gen.camera_fit import fit_json, fit_yaml
     from unprocess_gen.camera_noise import CameraNoise
 
-    read = read_picture_pairs(folder)
-    fit = CameraNoise.fit(read.pairs)
-    source = f"{counted(len(read.pairs), 'pair')} of pictures, SHA-256 of the list of their SHA-256 {read.sha256}"
+    pairs, sha256 = read_picture_pairs(folder)
+    fit = CameraNoise.fit(pairs)
+    source = f"{counted(len(pairs), 'pair')} of pictures, SHA-256 of the list of their SHA-256 {sha256}"
     write_profile(to, fit_yaml(fit, to.stem, source), fit_json(fit))
-    also = ", ".join(f"{key}={value!r}" for key, value in fit.options.items())
-    print_results(fit, f"{to}: use it with {_usage(noise=to)} {fit.settings}; in CameraNoise with {also} too")
+    print_results(fit, f"{to}: use it with {_usage(noise=to)} {fit.settings}; in CameraNoise with {fit.keywords} too")
     return 0
 
 
