@@ -265,7 +265,7 @@ def real_pictures(name: str, results: dict[str, Any], steps: int) -> str:
 
     cells = []
     for model, psnr in results["psnr"].items():
-        noise = results["noise"]["real" if model == "noisy" else model]
+        noise = results["noise"]["judged" if model == "noisy" else model]
         facts = [f"{noise['luma_codes']:.1f}", f"{noise['red_green']:.2f}"]
         cells.append([NAMES[model], decibels(psnr), with_interval(results["ssim"][model]), *facts])
     differences = [
@@ -281,10 +281,13 @@ def real_pictures(name: str, results: dict[str, Any], steps: int) -> str:
         bound = f"at least {least:g} dB{' and an interval above 0' if least >= 1 else ''}"
         is_met = met(value >= least and (least < 1 or low > 0))
         lines.append(f"- {difference(pair)}, goal {bound}: {is_met} ({value:.2f} dB).")
-    changes = "keep" if sorted(seed_0, key=seed_0.__getitem__) == sorted(longer, key=longer.__getitem__) else "change"
-    lines.append(f"- Twice the steps {changes} the order of the models with seed 0.")
+    if longer:
+        kept = sorted(seed_0, key=seed_0.__getitem__) == sorted(longer, key=longer.__getitem__)
+        lines.append(f"- Twice the steps {'keep' if kept else 'change'} the order of the models with seed 0.")
     if results["not_run"]:
         lines.append(f"- Not run: {', '.join(NAMES[model] for model in results['not_run'])}.")
+    head = ["PSNR, dB, with seed 0", f"{steps:,} steps", f"{2 * steps:,} steps"]
+    longer_training = f"\n{table(head, more)}\n" if more else ""
     return f"""
 ### {SETS.get(name, name)}
 
@@ -296,9 +299,7 @@ training patches, in the first row of the judged pictures (medians). The best AW
 {table(["difference", "PSNR, dB", "SSIM"], differences)}
 
 {chr(10).join(lines)}
-
-{table(["PSNR, dB, with seed 0", f"{steps:,} steps", f"{2 * steps:,} steps"], more)}
-"""
+{longer_training}"""
 
 
 def training(results: dict[str, Any]) -> str:

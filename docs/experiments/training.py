@@ -352,10 +352,10 @@ def summary(judged_on: RealSet, found: dict[Training, dict[str, Any]]) -> dict[s
     best = max((model for model in WHITE if model in groups), key=lambda model: np.mean(groups[model][:, 0]))
     compared = {**groups, "best_awgn": groups[best]}
     differences = [pair for pair in DIFFERENCES if pair[0] in compared and pair[1] in compared]
-    noise = {"real": noise_facts([(pair.noisy, pair.clean) for pair in pairs])}
+    noise = {"judged": noise_facts([(pair.noisy, pair.clean) for pair in pairs])}
     for model in models:
         trained_on = [line for s in seeds[model] for line in lines[model, s, STEPS]]
-        noise[model] = {fact: float(np.median([line[fact] for line in trained_on])) for fact in noise["real"]}
+        noise[model] = {fact: float(np.median([line[fact] for line in trained_on])) for fact in noise["judged"]}
     measures = {"psnr": 0, "ssim": 1}
     return {
         "pairs": len(pairs),
