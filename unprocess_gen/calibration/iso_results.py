@@ -149,7 +149,7 @@ def _darks(captures: CaptureSet, iso: float, watch: Watch) -> tuple[list[Dark], 
     if not darks:
         raise ConfigError(f"calibrate: ISO {iso:g} has fewer than {LEAST_FRAMES} darks of one exposure; record them")
     if (share := float(defects.mean())) > NOTED_SHARE:
-        captures.notes.append(f"calibrate: ISO {iso:g}: {share:.2%} of the sites are hot or dead in darks; left out")
+        captures.notes.append(f"calibrate: ISO {iso:g}: {share:.2%} of sites are hot or dead; left out elsewhere")
     return darks, defects
 
 
