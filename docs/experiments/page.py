@@ -283,9 +283,11 @@ def real_pictures(name: str, results: dict[str, Any], steps: int) -> str:
         lines.append(f"- {difference(pair)}, goal {bound}: {is_met} ({value:.2f} dB).")
     if longer:
         kept = sorted(seed_0, key=seed_0.__getitem__) == sorted(longer, key=longer.__getitem__)
-        lines.append(f"- Twice the steps {'keep' if kept else 'change'} the order of the models with seed 0.")
-    if results["not_run"]:
-        lines.append(f"- Not run: {', '.join(NAMES[model] for model in results['not_run'])}.")
+        word = "keep" if kept else "change"
+        lines.append(f"- Twice the steps {word} the order of the {len(longer)} models in the last table.")
+    not_run = [NAMES[model] for model in results["not_run"] if model != "real"]
+    if not_run:
+        lines.append(f"- Not run: {', '.join(not_run)}.")
     head = ["PSNR, dB, with seed 0", f"{steps:,} steps", f"{2 * steps:,} steps"]
     longer_training = f"\n{table(head, more)}\n" if more else ""
     return f"""
