@@ -27,7 +27,7 @@ from unprocess_gen.simulation.reference.colour import CAMERAS
 from unprocess_gen.simulation.reference.light import camera_gains, planckian_xy
 
 CAMERA, CURVES = "nexus_6p", ("smoothstep_gamma22", "gamma22", "srgb")
-BAND, WIDTH = 16, 4
+BAND, WIDTH, GOAL = 16, 4, 0.02
 FIRST = (20.0, 100.0)
 """Numbers from which the fit starts: a (DN) and b (DN²) at 12 bits."""
 STEPS = 3
@@ -102,21 +102,30 @@ def patches_of(folder: Path) -> list[Patch]:
         files["GAN"] = place / "GAN" / f"{noisy.stem}_fake_B.png"
         found.append((noisy.stem, {kind: read(file) for kind, file in files.items() if file.exists()}))
     found += [(pair.name, {"samples_noisy": pair.noisy, "samples_gts": pair.clean}) for pair in real_pairs(folder)]
-    patches = []
-    for number, (name, kinds) in enumerate(found):
-        facts = NAME.search(name)
-        if facts is None or "samples_gts" not in kinds:
-            raise SystemExit(
-                f"{name}: no real pair of SIDD; expected a name as 0001_001_S6_00100_00060_3200_L, and GTs"
-            )
-        scene, phone, *numbers = facts.groups()
-        patches.append(Patch(number, scene, phone, *map(int, numbers), kinds))
-    return patches
+    return [patch for number, (name, kinds) in enumerate(found) if (patch := patch_of(number, name, kinds))]
+
+
+def patch_of(number: int, name: str, kinds: dict[str, Any]) -> Patch | None:
+    """Return a patch; None if a channel has no noise, as where it is saturated."""
+    facts = NAME.search(name)
+    if facts is None or "samples_gts" not in kinds:
+        raise SystemExit(
+            f"{name}: no real pair of SIDD; expected a name as 0001_001_S6_00100_00060_3200_L, and a clean one"
+        )
+    iso, speed, kelvin = (int(facts[key]) for key in ("iso", "speed", "kelvin"))
+    patch = Patch(number, facts["scene"], facts["phone"], iso, speed, kelvin, kinds)
+    if patch.real.std(axis=(0, 1)).all():
+        return patch
+    print(f"{name}: a channel without noise; not judged")
+    return None
 
 
 def read(file: Path) -> Any:
     """Read a picture as R, G, B."""
-    return np.ascontiguousarray(cv2.imread(str(file), cv2.IMREAD_COLOR)[..., ::-1])
+    pixels = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise SystemExit(f"{file}: unreadable; expected a PNG; unpack the patches again")
+    return np.ascontiguousarray(pixels[..., ::-1])
 
 
 def by_level(noise: Any, clean: Any) -> tuple[Any, Any]:
@@ -231,24 +240,22 @@ def level_error(noise: Any, patch: Patch) -> dict[str, float]:
 def summary(name: str, judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return medians and intervals of a model over the groups of the patches."""
     patches = [patch for patch in judged if name in patch]
-    groups = sorted({patch["group"] for patch in patches})
+    groups = np.array([patch["group"] for patch in patches])
 
-    def over_groups(value: Callable[[dict[str, Any]], float]) -> list[float]:
-        return interval([np.median([value(p[name]) for p in patches if p["group"] == group]) for group in groups])
+    def over_groups(values: Any) -> list[float]:
+        return interval([np.median(values[groups == group]) for group in sorted(set(groups))])
 
-    found: dict[str, Any] = {"patches": len(patches), "groups": len(groups)}
-    found["above_goal"] = sum(patch[name]["divergence"] > 0.02 for patch in patches)
-    for key, first in patches[0][name].items():
-        if isinstance(first, float):
-            found[key] = over_groups(lambda one, key=key: one[key])
-        elif key in RATIOS:
-            found[key] = {"to_real": over_groups(lambda one, key=key: one[key][0] / one[key][1])}
-        elif key not in ("fit", "fitted_patches"):
-            found[key] = {"difference": over_groups(lambda one, key=key: abs(one[key][0] - one[key][1]))}
-        if key in found and isinstance(first, list):
-            found[key] |= {
-                kind: over_groups(lambda one, key=key, n=n: one[key][n])[0] for n, kind in enumerate(("model", "real"))
-            }
+    found: dict[str, Any] = {"patches": len(patches), "groups": len(set(groups))}
+    found["above_goal"] = sum(patch[name]["divergence"] > GOAL for patch in patches)
+    for key in sorted(patches[0][name].keys() - {"fit", "fitted_patches"}):
+        values = np.array([patch[name][key] for patch in patches])
+        if values.ndim == 1:
+            found[key] = over_groups(values)
+        else:
+            model, real = values.T
+            ratio = {"to_real": over_groups(model / real)}
+            found[key] = ratio if key in RATIOS else {"difference": over_groups(np.abs(model - real))}
+            found[key] |= {"model": over_groups(model)[0], "real": over_groups(real)[0]}
     return found
 
 
