@@ -215,12 +215,24 @@ def judge(patch: Patch, patches: Sequence[Patch]) -> dict[str, Any]:
             noise = simulate(form, fit, patch, 3)
             levels = level_error(noise, patch)
             found[name] = {"fit": fit, "fitted_patches": len(others), **levels, **compared(noise, patch.real)}
+            if name == "camera_noise":
+                found["camera_fit"] = by_camera_fit(patch, others)
     found["white_oracle"] = compared(white(patch.real, patch.clean, patch.number), patch.real)
     for name, (noisy, clean) in LEARNED.items():
         if noisy in patch.kinds and clean in patch.kinds:
             real = patch.real if name == "GAN" else patch.noise("samples_noisyNF", clean)
             found[name] = compared(patch.noise(noisy, clean), real)
     return found
+
+
+def by_camera_fit(patch: Patch, others: Sequence[Patch]) -> dict[str, Any]:
+    """Compare the noise of `CameraNoise.fit`, with its chroma and luma reduction, on the same other patches."""
+    pairs = [(other.kinds["samples_noisy"], other.clean) for other in others]
+    fit = ug.CameraNoise.fit(pairs, [f"camera={CAMERA}", "gains=fixed"])
+    clean, noisy = fit.noise()(patch.clean, index=3000 + patch.number)
+    noise = noisy.astype(int) - clean
+    numbers = {name: number.value for name, number in fit.numbers.items()}
+    return {"fit": [*fit.choice, numbers], **level_error(noise, patch), **compared(noise, patch.real)}
 
 
 def compared(noise: Any, real: Any) -> dict[str, Any]:
@@ -267,7 +279,7 @@ def main() -> None:
     if not any("camera_noise" in patch for patch in judged):
         raise SystemExit(f"{options.data}: no two patches of one phone and ISO; expected LIGHT/ISO/PHONE/samples_noisy")
     with_partner = [patch for patch in judged if "camera_noise" in patch]
-    models = (*FORMS, *LEARNED, "white_oracle")
+    models = (*FORMS, "camera_fit", *LEARNED, "white_oracle")
     write(
         {
             "patches": len(patches),

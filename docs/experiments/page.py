@@ -30,6 +30,7 @@ NAMES = {
     "by_exposure": "by exposure",
     "fixed_gains": "fixed gains",
     "other_phone": "other phone",
+    "camera_fit": "`CameraNoise.fit`",
     "noise_flow": "Noise Flow",
     "GAN": "GAN",
     "white_oracle": "white, oracle",
