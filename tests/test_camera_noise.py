@@ -69,6 +69,23 @@ def test_codes_return_for_every_camera(camera: str, gains: str, isp: str) -> Non
         assert largest_error([f"camera={camera}", chosen, f"isp={isp}", f"sensor.pattern={pattern}"], dtype, 256) <= 1
 
 
+ALL_GAINS = ("brooks2019", "paper_literal", "paper_min", "paper_max", "fig6_top", "fig6_bottom", "unity", "by_light")
+
+
+@pytest.mark.parametrize("gains", ALL_GAINS)
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_codes_return_for_all_gains(camera: str, gains: str) -> None:
+    assert largest_error([f"camera={camera}", f"gains={gains}"], np.uint8, 48) <= 1
+
+
+def test_negative_light_of_a_colour_is_black() -> None:
+    blue, settings = np.full((8, 8, 3), (20, 40, 184), np.uint8), ["camera=nexus_6p", "gains=paper_max", "noise=none"]
+    assert ug.CameraNoise(settings)(blue, 1)[0][4, 4].tolist() != [20, 40, 184]
+    pair = ug.make_pair(blue, ug.load_config(settings), seed=0, key=1)
+    assert pair.counts.clean_clipped_low == 16
+    assert (pair.clean[::2, ::2] == pair.row["black_level_dn"]).all()  # red sites
+
+
 def test_every_demosaicking_restores_flat_colours() -> None:
     picture = np.full((12, 15, 3), (40, 130, 90), np.uint8)
     for demosaic, pattern in itertools.product(("malvar", "bilinear"), ("RGGB", "BGGR", "GRBG", "GBRG")):
@@ -181,9 +198,75 @@ def test_drawn_options_are_pure_in_seed_and_index(picture: np.ndarray) -> None:
     exponents = np.log2([value["strength"] for value in values])
     assert -1 <= exponents.min() < exponents.max() <= 1
     assert abs(exponents.mean()) < 3 * 2 / np.sqrt(12 * 400)
-    assert {value["jpeg"] for value in values} == set(range(70, 96))
+    assert {round(value["jpeg"]) for value in values} == set(range(70, 96))
     assert noise.drawn(7) != ug.CameraNoise(ISO_12800, seed=4, **drawn).drawn(7)
     assert ug.CameraNoise(jpeg=80).drawn(0) == {"strength": 1, "jpeg": 80}
+
+
+GREYS = [2, 10, 40, 90, 150, 200, 235, 250]
+COLOURS = np.array([*((grey,) * 3 for grey in GREYS), (208, 171, 60), (65, 157, 195)], np.uint16) * 257
+
+
+def draws_of(overrides: list[str], picture: np.ndarray, count: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy pictures and their mean picture, in 8-bit codes."""
+    noise = ug.CameraNoise(overrides, clean="mean", **options)
+    pairs = [noise(picture, index) for index in range(count)]
+    return np.stack([noisy for _, noisy in pairs]) / 257, pairs[0][0] / 257
+
+
+@pytest.mark.parametrize(
+    ("overrides", "options"),
+    [
+        (["noise=imx385_iso12800"], {}),
+        (["noise=imx385_iso12800", "isp=srgb"], {"demosaic": "bilinear"}),
+        (["noise=imx385_iso6400", "isp=gamma22", "gains.highlight=none"], {"strength": 2}),
+        (["noise=imx385_iso12800", "sensor.pattern=MONO", "sensor.saturated=white"], {"strength": 0.5}),
+        (["noise=sony_a7s2", "scene=low_light", "scene.iso=25600", "scene.exposure_ratio=4"], {}),
+    ],
+)
+def test_mean_picture_is_the_mean_of_noisy_pictures(overrides: list[str], options: dict) -> None:
+    picture = np.repeat(np.repeat(COLOURS[None], 40, axis=0), 32, axis=1)
+    noisy, mean = draws_of(["camera=nexus_6p", "gains=fixed", *overrides], picture, 40, **options)
+    inner = [cells.reshape(*cells.shape[:-2], len(COLOURS), 32, 3)[..., 4:-4, :, 4:-4, :] for cells in (noisy, mean)]
+    averages = inner[0].mean(axis=(1, 3))
+    error = averages.mean(axis=0) - inner[1].mean(axis=(0, 2))
+    allowed = 4 * averages.std(axis=0) / np.sqrt(len(noisy)) + 0.2  # skewness of counts, interpolation
+    assert (np.abs(error) < allowed).all()
+    developed = ug.CameraNoise(["camera=nexus_6p", "gains=fixed", *overrides], **options)(picture, 0)[0] / 257
+    assert np.abs(averages.mean(axis=0)[0] - developed[20, 16]).max() > 1  # so that the test can fail
+
+
+def test_mean_picture_holds_at_edges() -> None:
+    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 65536, (96, 96, 3)).astype(np.uint16), (0, 0), 1.0)
+    noisy, mean = draws_of([*ISO_12800, "gains=fixed"], picture, 60)
+    squared = (noisy.mean(axis=0) - mean)[2:-2, 2:-2] ** 2 / (noisy.var(axis=0)[2:-2, 2:-2] / 59)
+    # 59 degrees of freedom: the mean of t² is 59 / 57; of 25,392 values at least a tenth are independent
+    assert abs(np.minimum(squared, 25).mean() - 59 / 57) < 4 * np.sqrt(2 / 2539)
+
+
+@pytest.mark.parametrize("options", [{"chroma_nr": 2}, {"luma_nr": 20}])
+def test_mean_picture_has_the_noise_reduction(options: dict) -> None:
+    picture = np.repeat(np.repeat(COLOURS[None, 3:6], 40, axis=0), 32, axis=1)
+    noisy, mean = draws_of(["camera=nexus_6p", "gains=fixed", "noise=imx385_iso3200"], picture, 40, **options)
+    averages = noisy.reshape(40, 40, 3, 32, 3)[:, 8:-8, :, 8:-8].mean(axis=(1, 3))
+    allowed = 4 * averages.std(axis=0) / np.sqrt(40) + 0.3
+    assert (np.abs(averages.mean(axis=0) - mean[20, 16::32]) < allowed).all()
+
+
+def test_mean_picture_without_noise_is_the_noisy_one(picture: np.ndarray) -> None:
+    clean, noisy = ug.CameraNoise(["noise=none"], clean="mean")(picture, 1)
+    assert np.abs(clean.astype(int) - noisy).max() <= 1
+
+
+def test_mean_picture_has_fixed_patterns_where_clean_frames_have() -> None:
+    grey = np.full((64, 64, 3), 128, np.uint8)
+    prnu = ["noise=sony_a7s2", "noise.prnu_std=0.05", "effects.prnu=on"]
+    deviations = [
+        ug.CameraNoise([*prnu, f"clean.includes_fixed_pattern={included}"], clean="mean")(grey, 1)[0].std(axis=(0, 1))
+        for included in ("false", "true")
+    ]
+    assert (deviations[0] == 0).all()
+    assert (deviations[1] > 1).all()
 
 
 def luma_and_chroma(picture: np.ndarray) -> list[np.ndarray]:
@@ -232,10 +315,9 @@ def test_flat_colours_return_from_noise_reduction(shape: tuple[int, int], dtype:
     ("arguments", "problem"),
     [
         ({"demosaic": "ahd"}, "CameraNoise: demosaic=ahd: not allowed; expected one of malvar, bilinear"),
-        ({"clean": "none"}, "clean='none': unknown; expected one of developed, source"),
+        ({"clean": "none"}, "clean='none': unknown; expected one of developed, source, mean"),
         ({"jpeg": 0}, "CameraNoise: jpeg=0: expected 1 to 100"),
         ({"jpeg": True}, "jpeg=true: expected a finite number or a distribution: [uniform, lowest, highest]"),
-        ({"jpeg": 75.5}, "jpeg=75.5: not allowed; expected an integer from 1 to 100, a distribution, or None"),
         ({"jpeg": ["uniform", 95, 70]}, "jpeg=[uniform, 95, 70]: expected the lowest value below the highest"),
         ({"jpeg_sampling": "4:1:1"}, "jpeg_sampling=4:1:1: not allowed; expected one of 4:2:0, 4:2:2, 4:4:4"),
         ({"strength": -1}, "strength=-1: expected 0 to 100"),
@@ -252,6 +334,7 @@ def test_flat_colours_return_from_noise_reduction(shape: tuple[int, int], dtype:
         ({"config": ["output.layout=packed"]}, "output.layout=packed: CameraNoise"),
         ({"config": ["noise.draws=2"]}, "noise.draws=2: 2 pairs of an image"),
         ({"seed": -1}, "seed=-1"),
+        ({"config": ["gains.highlight=gray_mean"], "clean": "mean"}, "gains.highlight=gray_mean: mixes the channels'"),
     ],
 )
 def test_wrong_arguments_are_refused(arguments: dict, problem: str) -> None:

@@ -21,16 +21,14 @@ from unprocess_gen.camera_fit import CameraFit, fit_pairs
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import refusal
-from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Frame, Srgb
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.forks import SharedCount
-from unprocess_gen.picture_isp import IspOptions, compressed, render
+from unprocess_gen.picture_isp import IspOptions, compressed, light_of, render, with_strength
+from unprocess_gen.picture_mean import mean_picture
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference import isp
-from unprocess_gen.simulation.reference.sensor import noisy_limits
 
-CLEANS = ("developed", "source")
+CLEANS = ("developed", "source", "mean")
 
 
 class CameraNoise:
@@ -52,6 +50,7 @@ class CameraNoise:
         Seed of all that is drawn. The config has none of its own.
     clean : str
         ``"developed"``: the frame without noise, developed like the noisy one. ``"source"``: the picture itself.
+        ``"mean"``: the mean of the noisy pictures before JPEG; not with ``gains.highlight=gray_mean``.
     strength : float or list
         Factor of the noise, 0 to 100, or its distribution, such as ``["log_uniform", 0.58, 1.7]``. The noisy light is
         clean + strength · (noisy - clean), clipped where the sensor clips.
@@ -79,7 +78,11 @@ class CameraNoise:
     ``noise(picture, index=7)`` depends only on the picture, the config, the seed and the index. It develops the frames
     of ``make_pair(picture, config, seed=seed, key=7)``, whose ``row`` states all parameters. Only the noisy frame is
     rounded to DN, and only if noise is simulated. So a flat picture without noise returns with each code within 1,
-    except where the sensor is saturated.
+    except where the sensor is saturated or the light of a colour is negative, which sensors record as black.
+
+    The mean takes the light of a channel as normally distributed, and offsets of rows and columns as independent. Fixed
+    patterns are averaged unless ``clean.includes_fixed_pattern`` is set. Noise reduction is applied to the mean; other
+    clean pictures do not get it.
 
     Examples
     --------
@@ -114,6 +117,9 @@ class CameraNoise:
             raise ConfigError(f"CameraNoise: config={config!r}: is text; expected a list: [{config!r}]")
         if not isinstance(config, Config):
             config = load_config(config)
+        if clean == "mean" and config.gains.highlight == "gray_mean":
+            problem = "mixes the channels' noise; expected per_channel or none with clean=mean of CameraNoise"
+            raise refusal("gains.highlight", "gray_mean", problem)
         self._settings = array_settings(_config_of_pictures(config, seed))
         self._clean, self._seed = clean, seed
         self._calls, self._process, self._told = 0, os.getpid(), SharedCount()
@@ -170,11 +176,11 @@ class CameraNoise:
         return fit_pairs(cls, pairs, config, **options)
 
     def __repr__(self) -> str:
-        name = self._settings.config.noise.name
-        return f"CameraNoise(noise={name}, {self._options}, clean={self._clean}, seed={self._seed})"
+        noise = f"noise={self._settings.config.noise.name}"
+        return f"CameraNoise({noise}, {self._options}, clean={self._clean}, seed={self._seed})"
 
-    def drawn(self, index: int) -> dict[str, float | int | None]:
-        """Strength of the noise and quality of the JPEG compression that an index selects.
+    def drawn(self, index: int) -> dict[str, Any]:
+        """Draw the strength of the noise and the quality of the JPEG compression of a picture.
 
         Parameters
         ----------
@@ -184,10 +190,9 @@ class CameraNoise:
         Returns
         -------
         dict
-            ``strength``, a factor, and ``jpeg``, an integer or None.
+            ``strength``, a factor, and ``jpeg``, a quality that is rounded to an integer, or None.
         """
-        strength, quality = self._options.drawn(self._seed, operator.index(index))
-        return {"strength": strength, "jpeg": quality}
+        return self._options.drawn(self._seed, operator.index(index))
 
     def __call__(self, picture: ArrayLike, index: int | None = None) -> tuple[Srgb, Srgb]:
         """Make a clean and a noisy picture.
@@ -220,19 +225,17 @@ class CameraNoise:
         if self._settings.config.self_test == "stop":
             self_test.check(image.plans[:1])
         _, plan, pair = next(image.pairs())
-        strength, quality = self._options.drawn(self._seed, index)
-        has_noise = set(plan.noise.effects) != {"quantise"}
-        clean = noisy = _light(pair.clean, plan)
-        if has_noise:
-            noisy = _light(pair.noisy, plan)
-            noisy = noisy if strength == 1 else _with_strength(clean, noisy, strength, plan)
-        codes = int(np.iinfo(pixels.dtype).max) + 1
-        noisy_picture = _develop(noisy, plan, self._options, codes)
-        if quality is not None:
-            noisy_picture = compressed(noisy_picture, quality, self._options.jpeg_sampling)
+        drawn, codes = self._options.drawn(self._seed, index), int(np.iinfo(pixels.dtype).max) + 1
+        strength = 0.0 if set(plan.noise.effects) == {"quantise"} else drawn["strength"]
+        clean = light_of(pair.clean, plan)
+        noisy = render(with_strength(clean, light_of(pair.noisy, plan), strength, plan), plan, self._options, codes)
+        if drawn["jpeg"] is not None:
+            noisy = compressed(noisy, round(drawn["jpeg"]), self._options.jpeg_sampling)
         if self._clean == "source":
-            return pixels.copy(), noisy_picture
-        return _develop(clean, plan, self._options.without_reduction(), codes), noisy_picture
+            return pixels.copy(), noisy
+        if self._clean == "mean":
+            return mean_picture(pair.clean, plan, self._options, strength, codes), noisy
+        return render(clean, plan, replace(self._options, chroma_nr=0, luma_nr=0), codes), noisy
 
 
 def _config_of_pictures(config: Config, seed: int) -> Config:
@@ -245,25 +248,5 @@ def _config_of_pictures(config: Config, seed: int) -> Config:
         ("output.layout", config.output.layout, MOSAIC),
     ):
         if value != expected:
-            problem = f"CameraNoise keeps the geometry of pictures; expected {expected}"
-            raise refusal(key, value, problem)
+            raise refusal(key, value, f"CameraNoise keeps the geometry of pictures; expected {expected}")
     return replace(config, seed=seed, output=replace(config.output, clean_dtype=FLOAT32))
-
-
-def _develop(light: Any, plan: Plan, options: IspOptions, codes: int) -> Srgb:
-    """Develop a mosaic of light to codes."""
-    return render(isp.white_balanced(light, plan, method=options.demosaic), plan, options, codes)
-
-
-def _light(frame: Frame, plan: Plan) -> Any:
-    """Light of a frame in float32, before the scene's darkening."""
-    light: Any = frame.astype(np.float32)
-    return isp.to_light(light, plan) if frame.dtype == np.uint16 else light * np.float32(plan.scene.exposure_ratio)
-
-
-def _with_strength(clean: Any, noisy: Any, strength: float, plan: Plan) -> Any:
-    """Light whose difference from the clean light is multiplied, clipped where the sensor clips."""
-    sensor, span_dn = plan.sensor, plan.sensor.span_dn
-    limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, sensor.sensor_clip)
-    low, high = ((limit - sensor.black_level_dn) / span_dn * plan.scene.exposure_ratio for limit in limits_dn)
-    return np.clip(clean + np.float32(strength) * (noisy - clean), low, high)

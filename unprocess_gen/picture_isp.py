@@ -7,39 +7,37 @@ reduced in luma and chroma of the displayed values, before they are rounded to c
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
-from unprocess_gen.config.distributions import Drawn
-from unprocess_gen.core.arrays import Float, Srgb
+from unprocess_gen.config.distributions import DISTRIBUTIONS, Drawn, parse_distribution
+from unprocess_gen.core.arrays import Frame, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import Choice, Limit, Numbers, value_text
 from unprocess_gen.core.random_streams import PARAMETERS, stream_key, words
 from unprocess_gen.planning.parameters import draw_parameter
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
+from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 SAMPLINGS = {
-    "4:2:0": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
-    "4:2:2": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422,
-    "4:4:4": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    name: int(getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{name.replace(':', '')}"))
+    for name in ("4:2:0", "4:2:2", "4:4:4")
 }
 """Chroma sampling of JPEG files."""
 
-STRENGTH = Drawn(("uniform", "log_uniform", "choice"), Numbers(0, 100))
-QUALITY = Drawn(("uniform", "choice"), Numbers(1, 100))
-"""Quality of JPEG; draws are rounded."""
-
 LIMITS: dict[str, Limit] = {
     "demosaic": Choice(*isp.DEMOSAICS),
+    "strength": Drawn(("uniform", "log_uniform", "choice"), Numbers(0, 100)),
     "chroma_nr": Numbers(0, 100),
     "luma_nr": Numbers(0, 255),
+    "jpeg": Drawn(("uniform", "choice"), Numbers(1, 100)),
     "jpeg_sampling": Choice(*SAMPLINGS),
 }
-"""Allowed values of the other options."""
+"""Allowed values of the options; ``jpeg`` may also be None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,49 +51,55 @@ class IspOptions:
     jpeg: Any
     jpeg_sampling: str
 
-    def __str__(self) -> str:
-        return ", ".join(f"{name}={value_text(getattr(self, name))}" for name in self.__slots__)
-
     def __post_init__(self) -> None:
         for name, limit in LIMITS.items():
             value = getattr(self, name)
-            if not limit.allows(value):
+            if isinstance(limit, Drawn) and (name, value) != ("jpeg", None):
+                limit.parse(f"CameraNoise: {name}", value)
+            elif not limit.allows(value):
                 raise ConfigError(f"CameraNoise: {name}={value_text(value)}: not allowed; expected {limit}")
-        STRENGTH.parse("CameraNoise: strength", self.strength)
-        if isinstance(self.jpeg, float):
-            problem = "not allowed; expected an integer from 1 to 100, a distribution, or None"
-            raise ConfigError(f"CameraNoise: jpeg={self.jpeg}: {problem}")
-        if self.jpeg is not None:
-            QUALITY.parse("CameraNoise: jpeg", self.jpeg)
 
-    def without_reduction(self) -> IspOptions:
-        """Options of pictures without noise."""
-        return replace(self, chroma_nr=0, luma_nr=0)
-
-    def drawn(self, seed: int, index: int) -> tuple[float, int | None]:
-        """Strength, and quality of JPEG if there is one, of a picture: a pure function of seed and index."""
-        uniforms = (words(stream_key(seed, f"CameraNoise {index}"), PARAMETERS, (1, 2))[0] + 0.5) / 2**32
-        strength = draw_parameter(STRENGTH.parse("strength", self.strength), float(uniforms[0]))
-        if self.jpeg is None:
-            return strength, None
-        return strength, round(draw_parameter(QUALITY.parse("jpeg", self.jpeg), float(uniforms[1])))
+    def drawn(self, seed: int, index: int) -> dict[str, Any]:
+        """Strength, and quality of JPEG or None, of a picture: a pure function of seed and index."""
+        values = {"strength": self.strength, "jpeg": self.jpeg}
+        if any(isinstance(value, list | tuple) for value in values.values()):
+            random = words(stream_key(seed, f"CameraNoise {index}"), PARAMETERS, (1, 2))[0]
+            for (name, value), word in zip(values.items(), random.tolist(), strict=True):
+                if value is not None:
+                    distribution = parse_distribution(name, value, tuple(DISTRIBUTIONS))
+                    values[name] = draw_parameter(distribution, (word + 0.5) / 2**32)
+        return values
 
 
-def render(camera_rgb: Float, plan: Plan, options: IspOptions, codes: int) -> Srgb:
-    """Render white-balanced camera RGB to codes: matrix, gamma and tone curve, noise reduction."""
+def light_of(frame: Frame, plan: Plan) -> Any:
+    """Light of a frame in float32, before the scene's darkening."""
+    light: Any = frame.astype(np.float32)
+    return isp.to_light(light, plan) if frame.dtype == np.uint16 else light * np.float32(plan.scene.exposure_ratio)
+
+
+def light_limits(plan: Plan) -> tuple[float, float]:
+    """Least and greatest light that the sensor records, before the scene's darkening."""
+    limits_dn = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.sensor_clip)
+    low, high = isp.to_light(np.array(limits_dn), plan).tolist()
+    return low, high
+
+
+def with_strength(clean: Any, noisy: Any, strength: float, plan: Plan) -> Any:
+    """Multiply the difference of noisy from clean light, and clip the result where the sensor clips."""
+    return noisy if strength == 1 else np.clip(clean + strength * (noisy - clean), *light_limits(plan))
+
+
+def render(light: Any, plan: Plan, options: IspOptions, codes: int) -> Srgb:
+    """Develop a mosaic of light, float32 [H, W], to codes."""
     reduces = bool(options.chroma_nr or options.luma_nr)
     table = table_of_roots(plan.isp.tone, plan.isp.gamma, codes, not reduces)
-    positions: Any = cv2.transform(camera_rgb, cam2rgb(plan))
+    camera_rgb = isp.white_balanced(light, plan, method=options.demosaic)
+    positions: Any = cv2.transform(camera_rgb, np.reshape(isp.cam2rgb(plan), (3, 3)).astype(np.float32))
     np.sqrt(np.clip(positions, 0, 1, out=positions), out=positions)
     positions *= np.float32(len(table) - 1)
     positions += np.float32(0.5)
     picture: Any = table.take(positions.astype(np.int32))
-    return to_picture(picture, options, codes) if reduces else picture
-
-
-def cam2rgb(plan: Plan) -> Any:
-    """Matrix from camera RGB to linear sRGB, float32."""
-    return np.reshape(isp.cam2rgb(plan), (3, 3)).astype(np.float32)
+    return finish(picture, options, codes) if reduces else picture
 
 
 ROOTS_PER_CODE = {256: 64, 65536: 4}
@@ -119,15 +123,16 @@ LUMA_SIDE, LUMA_STD = 5, 1.5
 """Side and spatial standard deviation of the bilateral filter of luma, pixels."""
 
 
-def to_picture(picture: Any, options: IspOptions, codes: int) -> Srgb:
-    """Reduce the noise of unrounded codes, float32 [H, W, 3], in Y, Cb and Cr and round them."""
-    luma, *chroma = cv2.split(cv2.transform(picture, YCBCR))
-    if options.chroma_nr:
-        chroma = [cv2.GaussianBlur(plane, (0, 0), options.chroma_nr) for plane in chroma]
-    if options.luma_nr:
-        luma = cv2.bilateralFilter(luma, LUMA_SIDE, options.luma_nr * (codes - 1) / 255, LUMA_STD)
-    reduced: Any = cv2.transform(cv2.merge((luma, *chroma)), np.linalg.inv(YCBCR))
-    rounded: Srgb = np.rint(np.clip(reduced, 0, codes - 1)).astype(np.uint8 if codes == 256 else np.uint16)
+def finish(picture: Any, options: IspOptions, codes: int) -> Srgb:
+    """Reduce the noise of unrounded codes, float32 [H, W, 3], in Y, Cb and Cr, and round them."""
+    if options.chroma_nr or options.luma_nr:
+        luma, *chroma = cv2.split(cv2.transform(picture, YCBCR))
+        if options.chroma_nr:
+            chroma = [cv2.GaussianBlur(plane, (0, 0), options.chroma_nr) for plane in chroma]
+        if options.luma_nr:
+            luma = cv2.bilateralFilter(luma, LUMA_SIDE, options.luma_nr * (codes - 1) / 255, LUMA_STD)
+        picture = cv2.transform(cv2.merge((luma, *chroma)), np.linalg.inv(YCBCR))
+    rounded: Srgb = np.rint(np.clip(picture, 0, codes - 1)).astype(np.uint8 if codes == 256 else np.uint16)
     return rounded
 
 

@@ -34,6 +34,7 @@ OUTSIDE_OUTPUT = {
         "camera_noise.py",
         "camera_fit.py",
         "picture_isp.py",
+        "picture_mean.py",
     ),
 }
 """Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables

@@ -66,7 +66,7 @@ ONLY_IN = {
     "numba": {"simulation.kernels.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
-        *("reports.explorer.views", "reports.panels", "picture_isp"),
+        *("reports.explorer.views", "reports.panels", "picture_isp", "picture_mean"),
     },
     "PIL": {"reports.pictures", "sources.image.decode", "sources.image.headers"},
     "tarfile": {"dataset.shards"},
