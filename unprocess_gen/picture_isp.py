@@ -21,7 +21,6 @@ from unprocess_gen.core.random_streams import PARAMETERS, stream_key, words
 from unprocess_gen.planning.parameters import draw_parameter
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
-from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 SAMPLINGS = {
     name: int(getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{name.replace(':', '')}"))
@@ -79,7 +78,7 @@ def light_of(frame: Frame, plan: Plan) -> Any:
 
 def light_limits(plan: Plan) -> tuple[float, float]:
     """Least and greatest light that the sensor records, before the scene's darkening."""
-    limits_dn = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.sensor_clip)
+    limits_dn = plan.sensor.limits_dn
     low, high = isp.to_light(np.array(limits_dn), plan).tolist()
     return low, high
 

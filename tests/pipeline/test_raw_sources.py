@@ -9,16 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.commands import RunMain
 
 import unprocess_gen as ug
 from unprocess_gen.core.errors import ConfigError, SourceChangedError
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset import dng
-from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
+from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels, targets_of
 from unprocess_gen.pipeline.replay import PairRegenerator
-from unprocess_gen.simulation.frames import Pair
+from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.reference.cfa import mosaic
+from unprocess_gen.simulation.reference.electrons import noise_variance
+from unprocess_gen.simulation.reference.sensor import in_dn
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.raw.frames import read_raw_source
 
@@ -78,12 +82,22 @@ def test_exported_clean_frames_keep_every_dn(tmp_path: Path, pattern: str, bits:
     assert plan.camera.rgb2cam == pytest.approx(recorded, abs=1e-7)
 
 
-@pytest.mark.parametrize(("noise", "shrink"), [((), 1), (("noise=sony_a7s2",), 2)])
+FIXED = ("noise=sony_a7s2", "noise.lens_shading=[-0.3,-0.1,0]", "noise.prnu_std=0.05", "noise.dsnu_std_e=3",
+         "effects.lens_shading=on", "effects.prnu=on", "effects.dsnu=on", "clean.includes_fixed_pattern=true",
+         "output.dtype=float32", "sensor.clip=none")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("noise", "shrink"),
+    [((), 1), (("noise=sony_a7s2",), 2), (("output.dtype=float32", "noise.law=poisson"), 1), (FIXED, 1),
+     (("noise=sony_a7s2", "effects.shot=off", "sensor.black_level_dn=1"), 1), (("sensor.clip=black",), 2)],
+)  # fmt: skip
 def test_kernels_equal_the_reference(tmp_path: Path, noise: tuple[str, ...], shrink: int) -> None:
     levels = "source.raw.black_dn=500", "source.raw.white_dn=16000", "source.raw.pattern=GRBG"
-    overrides = *levels, f"source.shrink={shrink}", *noise, "scene.exposure_ratio=150", "sensor=generic_14bit"
+    overrides = *levels, f"source.shrink={shrink}", "scene.exposure_ratio=15", "sensor=generic_14bit", *noise
     config = raw_config(tmp_path, *overrides)
-    dn = np.random.default_rng(5).integers(300, 16384, (36, 50)).astype(np.uint16)
+    dn = np.random.default_rng(5).integers(100, 16384, (36, 50)).astype(np.uint16)
+    dn[:, ::3] = dn[:, ::3] // 16  # half of these sites are below black
     photograph = by_site(mosaics(config, dn))
     pair, plan = simulated(config, photograph)
     reference = reference_pair(photograph.srgb, plan)
@@ -94,6 +108,15 @@ def test_kernels_equal_the_reference(tmp_path: Path, noise: tuple[str, ...], shr
     assert (crop.clean == pair.clean[inside]).all()
 
 
+def test_fast_frames_have_light_below_black(tmp_path: Path) -> None:
+    config = raw_config(tmp_path, *LEVELS, *NOISE, "accuracy=fast", "scene.exposure_ratio=7")
+    photograph = mosaics(config, np.random.default_rng(3).integers(0, 1100, (64, 90)).astype(np.uint16))
+    pair, plan = simulated(config, photograph)
+    reference = reference_pair(photograph.srgb, plan)
+    assert np.abs(pair.clean.astype(int) - reference.clean).max() <= 1 and pair.counts.clean_clipped_low == 0
+    assert np.abs(pair.noisy.astype(int) - reference.noisy).max() <= 1
+
+
 def test_light_is_exact_before_the_exposure(tmp_path: Path) -> None:
     levels = "source.raw.black_dn=500", "source.raw.white_dn=16000", "source.raw.pattern=RGGB"
     scene = "scene.exposure_ratio=100", "output.clean_dtype=float32"
@@ -101,7 +124,7 @@ def test_light_is_exact_before_the_exposure(tmp_path: Path) -> None:
     dn = np.random.default_rng(6).integers(400, 16384, (20, 20)).astype(np.uint16)
     pair, _ = simulated(config, by_site(mosaics(config, dn)))
     black = np.tile([[500.0, 509.0], [511.0, 523.0]], (10, 10))
-    light = np.clip((dn - black) / (16000 - black), 0, 1) / 100
+    light = np.minimum((dn - black) / (16000 - black), 1) / 100
     assert np.abs(pair.clean - light).max() < 1e-9
 
 
@@ -144,6 +167,37 @@ def test_subtracting_own_noise_leaves_the_target_variance(tmp_path: Path) -> Non
         assert variances(pair) == pytest.approx((target + share * own / 4)[:, 0], rel=0.02)
 
 
+MODELS = {
+    "two numbers": (NOISE, (4, 90)),
+    "subtract": ((*NOISE, "source.own_noise=subtract"), (3, 50)),
+    "poisson": ((*NOISE, "noise.law=poisson"), (4, 90)),
+    "physical": (("noise=sony_a7s2", "scene.iso=6400", "noise.prnu_std=0.1", "effects.all=off", "effects.prnu=on",
+                  "effects.shot=on", "effects.read=on"), None),
+}  # fmt: skip
+"""Settings of a noise model, and its variance line at exposure ratio 1."""
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("ratio", [1, 10])
+@pytest.mark.parametrize("dtype", ["uint16", "float32"])
+def test_noise_at_black_is_complete(tmp_path: Path, model: str, ratio: int, dtype: str) -> None:
+    """Noise of a source, whose standard deviation at black is 6.3 DN, keeps its mean and its variance."""
+    settings, line = MODELS[model]
+    own = "source.raw.a_dn=1", "source.raw.b_dn2=40", f"scene.exposure_ratio={ratio}", f"output.dtype={dtype}"
+    signal = np.array([0.0, 3.0, 400.0])[:, None]
+    dn = np.rint(1000 + signal + np.sqrt(signal + 40) * np.random.default_rng(1).standard_normal((3, BAND)))
+    config = raw_config(tmp_path, *LEVELS, *settings, *own)
+    pair, plan = simulated(config, mosaics(config, dn.astype(np.uint16).reshape(-1, 256)))
+    (a, b), u = plan.noise.variance_line, (dn - 1000) / ratio
+    assert line is None or ratio > 1 or (a, b) == pytest.approx(line)
+    clean, noisy = (in_dn(frame, (1000, 16000)).reshape(3, BAND) - 1000 for frame in (pair.clean, pair.noisy))
+    prnu, rounding = plan.physics.prnu_std if plan.physics else 0, 0 if dtype == "float32" else 1 / 12
+    variance = u.var(axis=1) + (a * np.maximum(u, 0) + (prnu * u) ** 2).mean(axis=1) + b + rounding
+    assert np.abs(clean - u).max() <= (0.5 if rounding else 1e-3) and pair.counts.clean_clipped_low == 0
+    assert (np.abs((noisy - u).mean(axis=1)) < 5 * np.sqrt(variance / BAND)).all()
+    assert noisy.var(axis=1) == pytest.approx(variance, rel=5 * np.sqrt(2.2 / BAND))
+
+
 def test_sites_of_noisier_sources_are_counted(tmp_path: Path) -> None:
     settings = "source.raw.a_dn=9", "source.raw.b_dn2=20", "source.own_noise=subtract"
     config = raw_config(tmp_path, *LEVELS, *NOISE, *settings)
@@ -152,6 +206,43 @@ def test_sites_of_noisier_sources_are_counted(tmp_path: Path) -> None:
     assert (plan.noise.a_dn, plan.noise.b_dn2) == (-5.0, 70.0)
     assert pair.counts.zero_variance == (dn >= 1014).sum()  # 5 · 14 = 70
     assert reference_pair(mosaics(config, dn).srgb, plan).counts == pair.counts
+
+
+def test_noise_maps_are_those_of_black_below_it(tmp_path: Path) -> None:
+    config = raw_config(tmp_path, *LEVELS, *NOISE)
+    frame = np.arange(900, 1100, dtype=np.uint16).reshape(10, 20)
+    pair, plan = simulated(config, mosaics(config, frame))
+    target = targets_of(["variance"], mosaics(config, frame).srgb, plan, Patch(20, 10), pair)["variance"]
+    assert target == pytest.approx(noise_variance(frame.astype(float), plan)) and target.min() == pytest.approx(90)
+
+
+# ------------------------------------------------------------------------------------------------- clipped below black
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+@pytest.mark.parametrize(("sensor", "lowest"), [(("sensor.clip=black",), 0), (("sensor.black_level_dn=10",), -10),
+                                                (("output.dtype=float32", "sensor.clip=none"), -np.inf)])  # fmt: skip
+def test_light_that_is_clipped_low_is_counted(
+    tmp_path: Path, run_main: RunMain, sensor: tuple[str, ...], lowest: float, shrink: int
+) -> None:
+    """The span of the file is just below a power of two, at which codes of cells would have no space below black."""
+    raw = "source.raw.pattern=RGGB", "source.raw.black_dn=1024", "source.raw.white_dn=17407"
+    dn = np.rint(np.random.default_rng(2).normal(1024, 9, (64, 64))).astype(np.uint16)
+    (tmp_path / "in").mkdir()
+    np.save(tmp_path / "in" / "a.npy", dn)
+    levels = "sensor=generic_14bit", "sensor.white_level_dn=16383", *sensor, f"source.shrink={shrink}"
+    root = "source.kind=raw", f"source.root={tmp_path / 'in'}", *raw, *levels, f"out={tmp_path / 'ds'}", "n_jobs=1"
+    code, out, _ = run_main(*root, "noise=none")
+    ((clean, _, row),) = ug.RawPairs(tmp_path / "ds")
+    black, span = row["black_level_dn"], 16383 - row["black_level_dn"]
+    green = dn[0::2, 1::2] / 2 + dn[1::2, 0::2] / 2
+    cells = np.stack([dn[0::2, 0::2], green, dn[1::2, 1::2]], axis=-1)
+    u = ((dn if shrink == 1 else mosaic(cells, "RGGB")) - 1024.0) / (17407 - 1024) * span
+    found = in_dn(clean, (black, 16383)) - black
+    assert np.abs(found - np.maximum(u, lowest)).max() <= (1e-3 if clean.dtype == np.float32 else 0.5)
+    assert row["clean_clipped_low"] == (u < lowest).sum()
+    assert ("clipped low" in out) == (row["clean_clipped_low"] > 0.01 * clean.size) and code == 0
+    assert ("clipped low" in run_main("plan", *root, "noise=none")[1]) == ("clipped low" in out)
 
 
 # ------------------------------------------------------------------------------------------------------------ datasets

@@ -26,7 +26,6 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 Law = Callable[[Plan, float], tuple[float, float]]
 """Mean and standard deviation before rounding and clipping, at the clean value x."""
@@ -84,7 +83,7 @@ def promised(plan: Plan, x: float) -> tuple[float, float]:
 
 
 def exact_moments(plan: Plan, x: float, law: Law) -> Moments:
-    low, high = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.sensor_clip)
+    low, high = plan.sensor.limits_dn
     centre, std = law(plan, x)
     return moments(centre, std, int(low), int(high))
 

@@ -60,9 +60,12 @@ def manifest(call: Call) -> int:
 
 def outcome(summary: Summary, max_failed: int) -> tuple[int, list[str]]:
     """Exit code of a generated dataset, and the lines to print about it."""
+    from unprocess_gen.planning.advice import clipped_low_warning
     from unprocess_gen.sources.listing import unmatched_sentence
 
-    lines = [summary.sentence(max_failed), unmatched_sentence(summary.unmatched)]
+    lines, sites = [summary.sentence(max_failed), unmatched_sentence(summary.unmatched)], summary.sites
+    if summary.is_raw and (warning := clipped_low_warning(sites["clean_clipped_low"], sites["all"])):
+        lines.append(f"{summary.out} {warning}")
     return TOO_MANY_FAILED if sum(summary.failed.values()) > max_failed else DONE, list(filter(None, lines))
 
 
@@ -101,7 +104,7 @@ def merge(call: Call) -> int:
     from unprocess_gen.pipeline.generate import merge
 
     code, lines = outcome(*merge(str(call.place)))
-    print_results(*lines[:1])
+    print_results(*lines)
     return code
 
 

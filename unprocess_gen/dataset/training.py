@@ -83,8 +83,8 @@ def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
     Returns
     -------
     ndarray of float32, same shape
-        √max(0, a_dn · u + dark_variance_dn2 + (prnu_std · u)²), DN, with u = noisy - black. Divide by white - black for
-        the scale of `to_light`.
+        √max(0, a_dn · u + dark_variance_dn2 + (prnu_std · u)²), DN, with u = max(0, noisy - black). Divide by
+        white - black for the scale of `to_light`.
 
     Raises
     ------
@@ -101,14 +101,14 @@ def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
     --------
     >>> import unprocess_gen as ug
     >>> row = {"black_level_dn": 240, "white_level_dn": 4095, "a_dn": 2.0, "dark_variance_dn2": 25.0}
-    >>> ug.noise_std([240, 340], row).tolist()
-    [5.0, 15.0]
+    >>> ug.noise_std([200, 240, 340], row).tolist()
+    [5.0, 5.0, 15.0]
     """
     intercept = row.get("dark_variance_dn2")
     if intercept is None:
         raise ValueError("dark_variance_dn2 is missing from the row; expected a row of a pair, with all of its columns")
     black, _ = _levels(row)
-    signal = np.asarray(noisy).astype(np.float32) - np.float32(black)
+    signal = np.maximum(np.asarray(noisy).astype(np.float32) - np.float32(black), 0)
     skipped = {reason.partition(":")[0] for reason in str(row.get("skipped") or "").split(";")}
     slope: Any = np.float32(0 if skipped & {"shot", "heteroscedastic"} else row["a_dn"] or 0)
     has_prnu = "prnu" not in skipped and not int(row.get("fixed_pattern_in_clean") or 0)

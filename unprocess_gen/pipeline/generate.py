@@ -69,6 +69,8 @@ class Summary:
         Rows of images that ``source.min_side`` leaves out.
     noted : int
         Rows of pairs with a note about their source (column ``detail``).
+    is_raw : bool
+        True for raw sources.
     shards, bytes : int
         Number of shards and the sum of their sizes.
     seconds : float
@@ -93,6 +95,7 @@ class Summary:
     times: StageTimes = field(default_factory=StageTimes)
     filtered: int = 0
     noted: int = 0
+    is_raw: bool = False
 
     @classmethod
     def of(cls, out: AnyPath, facts: dict[str, Any], started: float, **made: Any) -> Summary:
@@ -107,6 +110,7 @@ class Summary:
             seconds=time.monotonic() - started,
             filtered=facts.get("filtered", 0),
             noted=facts.get("noted", 0),
+            is_raw=facts["source"]["kind"] == "raw",
             **made,
         )
 

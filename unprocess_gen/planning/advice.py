@@ -16,6 +16,9 @@ from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 LEVEL_NAMES = ("bits", "black_level_dn", "white_level_dn")
 
+MOST_CLIPPED_LOW = 0.01
+"""Fraction of the sites of clean frames of raw sources that may be clipped low without a warning."""
+
 NOUNS = {"camera": "colour matrix", "sensor": "set of raw levels", "noise": "noise profile"}
 """What the options of a body's groups contain."""
 
@@ -77,6 +80,17 @@ def fitting_sensor(levels: dict[str, Any], camera: str = "") -> list[str]:
 
 def _levels_text(levels: dict[str, Any]) -> str:
     return f"{levels['bits']} bits, black {levels['black_level_dn']}, white {levels['white_level_dn']} DN"
+
+
+def clipped_low_warning(clipped: int, sites: int) -> str:
+    """Return the end of a sentence about sources whose clean frames are often clipped low; else an empty text."""
+    if clipped <= MOST_CLIPPED_LOW * sites:
+        return ""
+    return (
+        f"has {clipped / sites:.1%} of the sites of clean frames clipped low, which makes dark areas too bright; "
+        f"expected at most {MOST_CLIPPED_LOW:.0%}; choose sensor.clip=sensor, a sensor with a higher black level, or "
+        "float32 frames (output.dtype=float32 sensor.clip=none)"
+    )
 
 
 def body_sentence(config: Config) -> str:

@@ -71,7 +71,7 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     else:
         light = camera_light(codes[quiet], plan)[..., 1]
     span = float(plan.sensor.white_level_dn - plan.sensor.black_level_dn)
-    steps = np.rint(np.clip(light, 0, 1) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
+    steps = np.rint(np.clip(light, plan.darkest, 1) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
     _, height, width = steps.shape
     sites = (height - 2) * (width - 2)
     std_dn = _laplacian_sums(steps) * (LAPLACIAN_SCALE / (sites * STEPS_PER_DN))
@@ -88,7 +88,7 @@ def noise_ratio(srgb: Srgb, plan: Plan) -> float | None:
     """Return the noise of a source relative to the simulated shot and read noise at the same signal."""
     tiles = tile_noise(srgb, plan)
     slope, intercept = plan.noise.variance_line
-    variance = np.maximum(slope * tiles.signal_dn + intercept, 0)
+    variance = np.maximum(slope * np.maximum(tiles.signal_dn, 0) + intercept, 0)
     ratios = np.sort(tiles.std_dn[variance > 0] / np.sqrt(variance[variance > 0]))
     return float(ratios[(ratios.size - 1) // 2]) if ratios.size else None
 

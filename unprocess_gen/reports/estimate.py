@@ -22,6 +22,7 @@ from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import source_bytes
+from unprocess_gen.planning.advice import clipped_low_warning
 from unprocess_gen.planning.effect_selection import Prediction
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.planning.source_noise import noise_ratio
@@ -124,12 +125,14 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     seconds = time.perf_counter() - started
     levels = predicted_levels(settings, image, source, sha256)
     _compile_kernels([plan for plan, _ in levels])
-    started = time.perf_counter()
+    started, clipped, sites = time.perf_counter(), 0, 0
     for patch, plan, pair in image.pairs():
+        clipped, sites = clipped + pair.counts.clean_clipped_low, sites + patch.width * patch.height
         targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair).values()
         for frame in (*((pair.clean, *targets) if plan is image.plans[0] else ()), pair.noisy):
             array_xxh3(frame)
             hashlib.sha256(frame.data)
+    warning = clipped_low_warning(clipped, sites) if photograph.raw is not None else ""
     return SourceEstimate(
         source,
         seconds=seconds + (time.perf_counter() - started) * config.output.frames,
@@ -138,7 +141,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         patches=len(image.patches),
         pairs=len(image.patches) * len(image.plans),
         noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, image.plans[0]),
-        note=photograph.note,
+        note="; ".join(filter(None, (photograph.note, warning))),
     )
 
 

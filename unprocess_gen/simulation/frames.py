@@ -46,7 +46,8 @@ class Counts(PlanRecord, frozen=True):
     """
 
     # fmt: off
-    clean_clipped_low: Annotated[int, _sites("clean sites below black before clipping")]
+    clean_clipped_low: Annotated[int, _sites(
+        "clean sites below black before clipping; of raw sources, below the lowest DN")]
     clean_clipped_high: Annotated[int, _sites("clean sites above white before clipping")]
     noisy_clipped_low: Annotated[int, _sites("noisy sites below the lowest DN before clipping")]
     noisy_clipped_high: Annotated[int, _sites("noisy sites above the highest DN before clipping")]

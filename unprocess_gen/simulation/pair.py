@@ -26,7 +26,7 @@ from unprocess_gen.simulation.plan import EXACT, REFERENCE, Plan
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
-from unprocess_gen.simulation.reference.sensor import in_dn, noisy_limits, normalise, quantise, to_dn
+from unprocess_gen.simulation.reference.sensor import in_dn, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
 
 
@@ -190,19 +190,19 @@ def reference_pair(
         light = np.minimum(light, 1) * plan.scene.exposure
     factor = electrons.light_factor(plan, (light.shape[0], light.shape[1]), origin)
     light = light if factor is None else light * factor
-    clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest)
+    clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest, plan.darkest)
     noisy_dn = electrons.noisy(clean_dn, plan, origin, dark_pixels)
     if plan.pins_saturated:
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
 
-    limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, plan.sensor.sensor_clip)
-    levels_dn = sensor.black_level_dn, sensor.white_level_dn
+    limits_dn, levels_dn = sensor.limits_dn, (sensor.black_level_dn, sensor.white_level_dn)
     averaged_dn = electrons.average(clean_dn, plan, origin) if plan.averaged else clean_dn
-    clean = _frame_of(averaged_dn, limits_dn if plan.averaged else levels_dn, output.clean_normalised, levels_dn)
+    clean_limits_dn = limits_dn[0], limits_dn[1] if plan.averaged else sensor.white_level_dn
+    clean = _frame_of(averaged_dn, clean_limits_dn, output.clean_normalised, levels_dn)
     noisy = _frame_of(noisy_dn, limits_dn, output.normalised, levels_dn)
     read_dn = noisy_dn if output.normalised else np.rint(noisy_dn)
     counts = Counts(
-        clean_clipped_low=int((light < 0).sum()),
+        clean_clipped_low=int((light < plan.darkest).sum()),
         clean_clipped_high=int((light > plan.brightest).sum()),
         noisy_clipped_low=int((read_dn < limits_dn[0]).sum()),
         noisy_clipped_high=int((read_dn > limits_dn[1]).sum()),

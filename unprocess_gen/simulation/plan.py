@@ -7,6 +7,7 @@ parameter is a new field.
 """
 
 import functools
+import math
 from typing import Annotated, Any, Self, get_args, get_type_hints
 
 import msgspec
@@ -266,17 +267,16 @@ class SourcePlan(PlanRecord, frozen=True):
     def code_levels(self) -> tuple[Levels, Levels]:
         """Codes of a raw source at black and at white, by plane: DN, or after averaging the finest binary steps of it.
 
-        The steps are powers of two of a DN, so that means of 2, 4 and 8 sites of up to 12 bits are exact.
+        The steps are powers of two of a DN, so that means of 2, 4 and 8 sites of up to 12 bits are exact. Codes begin
+        at DN 0, so that light below black is kept.
         """
         if self.shrink == 1:
             return self.raw_black_dn, self.raw_white_dn
         span = min(white - black for black, white in zip(self.raw_black_dn, self.raw_white_dn, strict=True))
         steps = 1.0
-        while span * steps * 2 <= CODE_RANGE:
+        while max(self.raw_white_dn) * steps * 2 <= CODE_RANGE:
             steps *= 2
-        while span * steps > CODE_RANGE:
-            steps /= 2
-        black = float(int((CODE_RANGE - span * steps) / 2))
+        black = float(int(max(self.raw_black_dn) * steps))
         return (black,) * 4, (black + span * steps,) * 4
 
 
@@ -306,6 +306,13 @@ class SensorPlan(PlanRecord, frozen=True):
         """White level minus black level, DN."""
         return self.white_level_dn - self.black_level_dn
 
+    @property
+    def limits_dn(self) -> tuple[float, float]:
+        """Lowest and highest DN of noisy frames: 0 and 2**bits - 1, which keep the pedestal; see ``sensor_clip``."""
+        if self.sensor_clip == "none":
+            return -math.inf, math.inf
+        return float(self.black_level_dn if self.sensor_clip == "black" else 0), float(2**self.bits - 1)
+
 
 class ScenePlan(PlanRecord, frozen=True):
     """Light of the scene."""
@@ -332,7 +339,7 @@ class NoisePlan(PlanRecord, frozen=True):
         "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a "
         "plus a normal distribution of variance b", Choice("gaussian", "poisson"))]
     a_dn: Annotated[float, Field(
-        "slope of the noise variance a_dn u + dark_variance_dn2 + (prnu_std u)², where u is x - black; the last term "
+        "slope of the noise variance a_dn u + dark_variance_dn2 + (prnu_std u)², u is max(0, x - black); the last term "
         "only with prnu in effects, and not if the clean frame has the fixed patterns", Numbers(-1e30, 1e30), "DN")]
     b_dn2: Annotated[float, Field(
         "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE, "DN²")]
@@ -538,7 +545,7 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         return (
             *(self.stream_key, self.source, self.scene, self.camera, self.isp, self.output),
             *(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn),
-            *(self.clean_accuracy, self.brightest),
+            *(self.clean_accuracy, self.darkest, self.brightest),
             (self.numbers.lens_shading, self.numbers.frame_size) if has_shading else None,
             (physics, effects, sensor.sensor_clip) if self.averaged else None,
         )
@@ -561,9 +568,24 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         return min(1.0, physics.full_well_e * physics.dn_per_e / self.sensor.span_dn)
 
     @property
+    def darkest(self) -> float:
+        """Light below which the clean frame is clipped: 0; for raw sources, that of the lowest DN of noisy frames.
+
+        Read noise of a raw source is below black too. Clipped there, its mean would rise and its variance fall.
+        """
+        if not self.source.is_raw:
+            return 0.0
+        return (self.sensor.limits_dn[0] - self.sensor.black_level_dn) / self.sensor.span_dn
+
+    @property
     def brightest_dn(self) -> float:
         """Value of `brightest` in DN, unrounded."""
         return self.brightest * float(self.sensor.span_dn) + float(self.sensor.black_level_dn)
+
+    @property
+    def darkest_dn(self) -> float:
+        """Value of `darkest` in DN, unrounded."""
+        return self.darkest * float(self.sensor.span_dn) + float(self.sensor.black_level_dn)
 
     @property
     def pins_saturated(self) -> bool:

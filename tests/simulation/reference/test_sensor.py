@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.simulation.reference.sensor import noise_in_dn, noisy_limits, quantise, to_dn
+from unprocess_gen.simulation.plan import SensorPlan
+from unprocess_gen.simulation.reference.sensor import noise_in_dn, quantise, to_dn
 
 IMX385, GENERIC_14 = (240, 4095), (1024, 16383)
 
@@ -67,7 +68,7 @@ def test_values_are_rounded_then_clipped_then_cast(
 def test_noisy_frames_keep_the_pedestal_unless_clipped_at_black(
     bits: int, black: int, clip: str, limits: tuple[int, int]
 ) -> None:
-    assert noisy_limits(bits, black, clip) == limits
+    assert SensorPlan("RGGB", bits, black, 2**bits - 1, clip).limits_dn == limits
 
 
 # Noise profiles -------------------------------------------------------------------------------------------------------

@@ -22,7 +22,6 @@ from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.reference import electrons
-from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 EPOCH = 2**14 - 1
 """Epoch of the random numbers; that of datasets is 0."""
@@ -98,13 +97,12 @@ def _hot_sites(plan: Plan, patch: Patch, weight: Float) -> NDArray[np.bool_]:
 def _usable_std(clean_dn: Float, plan: Plan) -> Float:
     """Standard deviation of shot and read noise, [H, W] DN; 0 at sites that are not used.
 
-    These are at black and at clipped light, where many sites can have exactly the same light before rounding.
+    These are at clipped light, of photographs at black, where many sites can have the same light before rounding.
     """
-    slope, intercept = plan.noise.variance_line
     black_dn, brightest_dn = plan.sensor.black_level_dn, plan.brightest_dn
-    std = np.sqrt(np.maximum(slope * (clean_dn - black_dn) + intercept, 0))
+    std = np.sqrt(electrons.noise_variance(clean_dn, plan))
     is_used = std >= (0.0 if plan.output.clean_normalised and plan.output.normalised else LEAST_STD_DN)
-    for end_dn in (black_dn, brightest_dn, black_dn + (brightest_dn - black_dn) * plan.scene.exposure):
+    for end_dn in (plan.darkest_dn, brightest_dn, black_dn + (brightest_dn - black_dn) * plan.scene.exposure):
         is_used &= np.abs(clean_dn - end_dn) > 0.5
     return np.asarray(std * is_used)
 
@@ -117,10 +115,9 @@ def _repetition(clean_dn: Float, plan: Plan, patch: Patch, dark_pixels: DarkPixe
         light_dn = clean_dn + np.random.default_rng(plan.stream_key).uniform(-0.5, 0.5, clean_dn.shape)
     if plan.averaged:  # the clean frame contains the fixed patterns
         light_dn = light_dn - (electrons.average(np.full_like(clean_dn, black_dn), plan, origin) - black_dn)
-    noisy_dn = electrons.noisy(np.clip(light_dn, black_dn, plan.brightest_dn), again, origin, dark_pixels)
+    noisy_dn = electrons.noisy(np.clip(light_dn, plan.darkest_dn, plan.brightest_dn), again, origin, dark_pixels)
     own_dn, other_dn = (
         electrons.columns_dn(slots_of(drawn).columns, (1, clean_dn.shape[1]), origin) for drawn in (plan, again)
     )
     noisy_dn += own_dn - other_dn
-    low_dn, high_dn = noisy_limits(plan.sensor.bits, black_dn, plan.sensor.sensor_clip)
-    return np.clip(noisy_dn if plan.output.normalised else np.rint(noisy_dn), low_dn, high_dn)
+    return np.clip(noisy_dn if plan.output.normalised else np.rint(noisy_dn), *plan.sensor.limits_dn)

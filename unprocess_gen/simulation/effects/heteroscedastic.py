@@ -12,7 +12,7 @@ STREAM = declare_stream("heteroscedastic", 1)
 
 
 class Heteroscedastic(Effect):
-    """Noise with the variance max(0, a·(x - black) + b); the only effect of a two-parameter profile.
+    """Noise with the variance max(0, a·u + b), u = max(0, x - black); the only effect of a two-parameter profile.
 
     For ``law="gaussian"``, it is one normal deviate of this variance. For ``"poisson"``, it is a times a Poisson count
     of mean (x - black) / a, plus a normal deviate of variance b.

@@ -78,6 +78,7 @@ class Unprocessing(NamedTuple):
     one: float  # 1 and 3 in the precision of the frame
     three: float
     exposure: float
+    darkest: float
     brightest: float
     clipped: float  # light above it counts as clipped
     white: float  # light above it counts as clipped before the exposure; infinity without an exposure ratio
@@ -92,7 +93,7 @@ class Unprocessing(NamedTuple):
 
 
 class Unprocessing32(Unprocessing):
-    """Parameters of a clean frame in float32; DN count from the black level, and ``clipped`` has a margin.
+    """Parameters of a clean frame in float32; DN count from black, ``darkest`` and ``clipped`` have a margin.
 
     ``products`` are scaled to DN, except with gray_mean, which compares channels.
     """
@@ -131,6 +132,7 @@ def unprocessing_of(
         one=f(1),
         three=f(3),
         exposure=f(exposure),
+        darkest=f(plan.darkest * (1 + FLOAT32_MARGIN) if in_float32 else plan.darkest),
         brightest=f(brightest),
         clipped=f(brightest * (1 + FLOAT32_MARGIN) if in_float32 else brightest),
         white=f(np.inf if exposure == 1 else 1 + FLOAT32_MARGIN if in_float32 else 1),
@@ -284,9 +286,9 @@ _store_clean = by_class({Unprocessing: _store_clean64, Unprocessing32: _store_cl
 _linear_dn = by_class(
     {
         Unprocessing: lambda inverse, signal, gains: (
-            simd.maximum(signal * gains * inverse.exposure, 0.0) * inverse.span_dn
+            simd.maximum(signal * gains * inverse.exposure, inverse.darkest) * inverse.span_dn
         ),
-        Unprocessing32: lambda inverse, signal, gains: simd.maximum(signal, 0.0),
+        Unprocessing32: lambda inverse, signal, gains: simd.maximum(signal, inverse.darkest * inverse.span_dn),
     }
 )
 """Return DN above black of signals that are not bright."""
@@ -320,9 +322,21 @@ def fill_clean(inverse: Any, codes: Pointer, strip: Strip, buffers: Buffers, cou
         counts[strips.LIGHT_HIGH] += _recompute_bright(inverse, strip, buffers)
         counts[strips.CLEAN_HIGH] += count_outside(strip, buffers.bright_light, 0.0, inverse.clipped)[1]
     if has_negative:
-        light = buffers.bright_light if inverse.response.steps[1] else buffers.signal
-        counts[strips.CLEAN_LOW] += count_outside(strip, light, 0.0, np.inf)[0]
+        exposure = inverse.light_per_signal[0] * inverse.exposure  # of raw sources; of others the sign is enough
+        if inverse.response.steps[1]:
+            counts[strips.CLEAN_LOW] += _count_below(strip, buffers.bright_light, inverse.one, inverse.darkest)
+        else:
+            counts[strips.CLEAN_LOW] += _count_below(strip, buffers.signal, exposure, inverse.darkest)
     return bool(has_bright)
+
+
+@inner
+def _count_below(strip: Strip, values: Pointer, factor: float, low: float) -> int:
+    """Return the number of values of a strip that are below a limit once multiplied."""
+    below = 0
+    for x in range(strip.first, strip.after):
+        below += values[x] * factor < low
+    return below
 
 
 @inner
@@ -364,5 +378,6 @@ def _recompute_bright(inverse: Any, strip: Strip, buffers: Buffers) -> int:
                     above_white += buffers.bright_light[site] > inverse.white
         light = _with_response(inverse, simd.minimum(light, most) * inverse.exposure, x, strip)
         simd.store(buffers.bright_light, x, light)
-        _store_clean(inverse, simd.minimum(simd.maximum(light, 0.0), inverse.brightest) * inverse.span_dn, x, buffers)
+        clipped = simd.minimum(simd.maximum(light, inverse.darkest), inverse.brightest)
+        _store_clean(inverse, clipped * inverse.span_dn, x, buffers)
     return above_white

@@ -55,7 +55,7 @@ def electron_noise(
     has_columns = any(slots.columns or slots.fixed_columns for slots in frames)
     end = -(-max(left + columns, reach) // _COLUMNS) * _COLUMNS if has_columns else columns
     noise = _electron_noise(frames, end, origin[0] % 2)
-    members: dict[str, Any] = {"patterns": patterns, "padded_width": columns}
+    members: dict[str, Any] = {"patterns": patterns, "padded_width": columns, "has_negative": plans[0].darkest < 0}
     if has_columns:
         cut = slice(left, left + columns)
         members["columns_dn"] = np.ascontiguousarray(noise.columns_dn[:, cut])
@@ -104,6 +104,7 @@ def _electron_noise(frames: tuple[Slots, ...], columns: int, top: int) -> Electr
         sites_step=0,
         padded_width=columns,
         black_dn=first.black_dn,
+        has_negative=False,
         full_dn=first.full_well_e * first.dn_per_e + first.black_dn,
         dead_dn=first.patterns.dead.value_dn if first.patterns.dead else 0.0,
         patterns=WITHOUT_PATTERNS,

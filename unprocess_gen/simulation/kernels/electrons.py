@@ -82,6 +82,7 @@ class Electrons(NamedTuple):
     dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
     black_dn: float
+    has_negative: bool  # whether light can be below black
     full_dn: float  # DN of the full well in a clean frame with fixed patterns
     dead_dn: float  # value of dead pixels
     patterns: SitePatterns
@@ -163,13 +164,7 @@ def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, buff
     fill_word_blocks(key, strip, frame.light_stream, buffers.words)
     fill_word_blocks(key, strip, frame.site_stream, buffers.site_words)
     _fill_rates(noise, n, strip, buffers)
-    rates, light_e, light_error_e = buffers.rates, buffers.light_e, buffers.light_error_e
-    if frame.counts_light:
-        fill_counts(strip.total, buffers.words, rates, noise.tables, buffers, light_e, light_error_e)
-    else:
-        for x in range(strip.total):
-            light_e[x] = rates[x]
-            light_error_e[x] = rates[x] * _RATE_ERROR32
+    _count_light(noise, frame, strip, buffers)
     if frame.has_dark:
         fill_word_blocks(key, strip, frame.dark_stream, buffers.dark_words)
         _count_dark(noise, n, frame, strip, buffers)
@@ -193,6 +188,23 @@ def _fill_rates(noise: Electrons, n: int, strip: Strip, buffers: Buffers) -> Non
         x = np.uint64(v) * _8
         light_dn = (simd.load(buffers.rounded_dn, x) - noise.black_dn) + simd.load(buffers.residual_dn, x)
         simd.store(buffers.rates, x, light_dn * e_per_dn * simd.load(response, x))
+
+
+@inner
+def _count_light(noise: Electrons, frame: FrameNumbers, strip: Strip, buffers: Buffers) -> None:
+    """Fill ``light_e`` with counts of ``rates``; negative light, and all light without shot noise, stays as it is."""
+    rates, means_e, light_e, light_error_e = buffers.rates, buffers.noise_dn, buffers.light_e, buffers.light_error_e
+    has_means = noise.has_negative or not frame.counts_light
+    if has_means:
+        for x in range(strip.total):
+            means_e[x], rates[x] = rates[x], simd.maximum(rates[x], _ZERO32)
+    if frame.counts_light:
+        fill_counts(strip.total, buffers.words, rates, noise.tables, buffers, light_e, light_error_e)
+    if has_means:
+        for x in range(strip.total):
+            if means_e[x] < _ZERO32 or not frame.counts_light:
+                light_e[x] = means_e[x]
+                light_error_e[x] = abs(means_e[x]) * _RATE_ERROR32
 
 
 @inner
@@ -331,12 +343,12 @@ def exact_electrons_site(noise: Electrons, n: int, x: int, strip: Strip, buffers
 def _exact_light(
     noise: Electrons, frame: FrameNumbers, dn_per_e: float, x: int, strip: Strip, buffers: Buffers
 ) -> float:
-    """Return the electrons of light of one site: a count, or the mean."""
+    """Return the electrons of light of one site: a count, or the mean, also if that is negative."""
     if buffers.light_error_e[x] == _ZERO32:
         return float(buffers.light_e[x])
     response = np.float64(strip_values(noise.patterns.response, strip)[x])
     rate = (buffers.unrounded_dn[x] - noise.black_dn) / dn_per_e * response
-    return float(exact_count(buffers.words[x], rate, noise.tables) if frame.counts_light else rate)
+    return float(exact_count(buffers.words[x], rate, noise.tables) if frame.counts_light and rate > 0.0 else rate)
 
 
 @inner

@@ -86,7 +86,8 @@ def approximate_gaussian(noise: Gaussian, n: int, strip: Strip, buffers: Buffers
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         residual = simd.load(buffers.residual_dn, x)
-        variance = ((simd.load(buffers.rounded_dn, x) - noise.black_dn) + residual) * a + b
+        signal_dn = (simd.load(buffers.rounded_dn, x) - noise.black_dn) + residual
+        variance = simd.maximum(signal_dn, 0.0) * a + b
         std = simd.square_root(simd.maximum(variance, 0.0))
         simd.store(buffers.noise_dn, x, residual + std * simd.load(buffers.normals, x))
         cancelled = simd.less_than(simd.absolute(variance), cancellation) & _ONE_BITS
@@ -99,7 +100,7 @@ def approximate_gaussian(noise: Gaussian, n: int, strip: Strip, buffers: Buffers
 def exact_gaussian_site(noise: Gaussian, n: int, x: int, strip: Strip, buffers: Buffers) -> float:
     """Return the noisy DN of one site, in the reference's order of operations."""
     a, b, clean_dn = noise.line[2 * n], noise.line[2 * n + 1], buffers.unrounded_dn[x]
-    std = np.sqrt(simd.maximum(a * (clean_dn - noise.black_dn) + b, 0.0))
+    std = np.sqrt(simd.maximum(a * simd.maximum(clean_dn - noise.black_dn, 0.0) + b, 0.0))
     return float(clean_dn + std * normal.exact_value(buffers.words[x], noise.quadratics))
 
 
@@ -111,7 +112,7 @@ def exact_gaussian(noise: Gaussian, n: int, strip: Strip, buffers: Buffers) -> N
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         clean_dn = simd.load(buffers.unrounded_dn, x)
-        std = simd.square_root(simd.maximum((clean_dn - noise.black_dn) * a + b, 0.0))
+        std = simd.square_root(simd.maximum(simd.maximum(clean_dn - noise.black_dn, 0.0) * a + b, 0.0))
         deviate = normal.exact_values(buffers.words, buffers.scratch, x, noise.quadratics)
         simd.store(buffers.exact_dn, x, clean_dn + std * deviate)
 
@@ -124,7 +125,7 @@ def approximate_gaussian32(noise: Gaussian32, n: int, strip: Strip, buffers: Buf
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         clean_dn = simd.load(buffers.unrounded_dn, x)
-        std = simd.square_root(simd.maximum(clean_dn * a + b, 0.0))
+        std = simd.square_root(simd.maximum(simd.maximum(clean_dn, 0.0) * a + b, 0.0))
         deviate = normal.apply_signs(
             std * normal.coarse_normal(simd.load(buffers.depths, x)), simd.load(buffers.words, x)
         )

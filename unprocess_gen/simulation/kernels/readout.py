@@ -44,7 +44,6 @@ from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer
 from unprocess_gen.simulation.kernels.strips import Buffers, Strip, count_outside, list_lanes
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import plane_sites
-from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 _8 = np.uint64(8)
 
@@ -110,11 +109,7 @@ def _readout_of(
     plans: tuple[Plan, ...], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
 ) -> ReadOut:
     first = plans[0]
-    limits_dn = [
-        noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.sensor_clip)
-        + _pinned_dn(plan, counts_from_black)
-        for plan in plans
-    ]
+    limits_dn = [plan.sensor.limits_dn + _pinned_dn(plan, counts_from_black) for plan in plans]
     packed = first.output.layout == PACKED
     planes = _plane_order(first.sensor.pattern, origin)
     kind = Unrounded if first.output.normalised else FloatClean if first.output.clean_normalised else Rounded
@@ -306,11 +301,9 @@ def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip:
 
 @inner
 def _write_normalised(readout: Any, output: Output, strip: Strip, buffers: Buffers) -> None:
-    low, high = readout.black_dn, readout.black_dn + readout.span_dn
-    if readout.averaged:
-        limits = load_limits(readout, np.int64(0))
-        low, high = limits.low, limits.high
-    _normalise(readout, buffers.unrounded_dn, low, high, strip, buffers.normalised)
+    limits = load_limits(readout, np.int64(0))
+    high = limits.high if readout.averaged else readout.black_dn + readout.span_dn
+    _normalise(readout, buffers.unrounded_dn, limits.low, high, strip, buffers.normalised)
     if output.may_saturate:
         output.counts[strips.SATURATED] += _count_equal(strip, buffers.normalised, np.float32(readout.white))
     _write(readout, strip, buffers.normalised, output.sites)
@@ -335,12 +328,12 @@ def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
 
 @inner
 def count_zero_variance(readout: Any, n: int, output: Output, strip: Strip, buffers: Buffers) -> None:
-    """Count sites with a·(clean - black) + b <= 0."""
+    """Count sites with a·max(0, clean - black) + b <= 0."""
     a, b = readout.variance_lines[2 * n], readout.variance_lines[2 * n + 1]
     if simd.minimum(a, b) <= 0.0:
         count = 0
         for x in range(strip.first, strip.after):
-            count += a * (buffers.unrounded_dn[x] - readout.black_dn) + b <= 0.0
+            count += a * simd.maximum(buffers.unrounded_dn[x] - readout.black_dn, 0.0) + b <= 0.0
         output.counts[strips.ZERO_VARIANCE] += count
 
 

@@ -54,7 +54,8 @@ def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: Dark
     if patterns.electrons and not plan.averaged:  # otherwise the light of the clean frame has the factor
         electrons = electrons * normal_pattern(patterns.electrons, shape, origin)
     if slots.light_stream:
-        electrons = poisson(frame_words(plan, slots.light_stream, shape, origin), electrons)
+        counts = poisson(frame_words(plan, slots.light_stream, shape, origin), electrons)
+        electrons = counts + np.minimum(electrons, 0)  # light of a raw source below black is not counted, but kept
     if uniform := slots.uniform:
         count = poisson(frame_words(plan, uniform.stream, shape, origin), np.full(shape, uniform.rate_e))
         electrons = electrons + (count - uniform.removed_e)
@@ -76,7 +77,7 @@ def noisy(clean_dn: Float, plan: Plan, origin: Shape = (0, 0), dark_pixels: Dark
 
 
 def noise_variance(clean_dn: Float, plan: Plan) -> Float:
-    """Return the variance of shot and read noise, max(0, a·(x - black) + b).
+    """Return the variance of shot and read noise, max(0, a·u + b) with u = max(0, x - black).
 
     Parameters
     ----------
@@ -91,7 +92,7 @@ def noise_variance(clean_dn: Float, plan: Plan) -> Float:
         Variance, DN².
     """
     a_dn, b_dn2 = plan.noise.variance_line
-    return np.asarray(np.maximum(a_dn * (clean_dn - plan.sensor.black_level_dn) + b_dn2, 0))
+    return np.asarray(np.maximum(a_dn * np.maximum(clean_dn - plan.sensor.black_level_dn, 0) + b_dn2, 0))
 
 
 def light_factor(plan: Plan, shape: Shape, origin: Shape = (0, 0)) -> Float | None:

@@ -11,32 +11,11 @@ import numpy as np
 from unprocess_gen.core.arrays import FLOAT32, Float, Frame, Normalised, Raw
 
 
-def to_dn(light: Float, black_level_dn: int, white_level_dn: int, brightest: float = 1.0) -> Float:
-    """Clip light to 0 and ``brightest``, at most 1, and convert it to DN between the levels, without rounding."""
-    return np.clip(light, 0, brightest) * float(white_level_dn - black_level_dn) + float(black_level_dn)
-
-
-def noisy_limits(bits: int, black_level_dn: int, clip: str) -> tuple[float, float]:
-    """Return the lowest and highest DN of the noisy frame.
-
-    Parameters
-    ----------
-    bits : int
-        Bit depth of the sensor.
-    black_level_dn : int
-        Black level.
-    clip : str
-        ``"sensor"``: 0 to 2**bits - 1, which keeps the pedestal. ``"black"``: from the black level. ``"none"``: no
-        limits.
-
-    Returns
-    -------
-    (float, float)
-        Limits in DN.
-    """
-    if clip == "none":
-        return -np.inf, np.inf
-    return float(black_level_dn if clip == "black" else 0), float(2**bits - 1)
+def to_dn(
+    light: Float, black_level_dn: int, white_level_dn: int, brightest: float = 1.0, darkest: float = 0.0
+) -> Float:
+    """Clip light to ``darkest``, at most 0, and ``brightest``, at most 1; convert it to DN, without rounding."""
+    return np.clip(light, darkest, brightest) * float(white_level_dn - black_level_dn) + float(black_level_dn)
 
 
 def quantise(value_dn: Float, low: float, high: float) -> Raw:
