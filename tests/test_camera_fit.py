@@ -70,6 +70,15 @@ def test_simulated_noise_has_the_statistics_of_the_pairs() -> None:
     assert (fit.noise(strength=0)(picture, index=3)[1] == clean).all()
 
 
+def test_noise_without_shot_noise_is_fitted_for_all_cameras() -> None:
+    noise = ug.CameraNoise([*CAMERA, "isp=srgb", "noise=heteroscedastic", "noise.a=0", "noise.b=3000"])
+    clean, noisy = noise(scene(0, 64, (120, 230)), index=0)
+    fit = ug.CameraNoise.fit([(noisy, clean)], ["gains=fixed", "isp=srgb"])
+    assert fit.choice[1] == "camera=nexus_6p"
+    assert fit.numbers["a_dn"].value < 0.1
+    assert fit.numbers["b_dn2"].value == pytest.approx(3000, rel=0.01)
+
+
 def test_one_pair_of_16_bits_is_resampled_by_tiles() -> None:
     fit = ug.CameraNoise.fit(simulated("srgb", [scene(0, 160, top=65535)]), [*CAMERA, "isp=srgb"])
     assert (fit.resampled, fit.choice[2]) == ("25 tiles", "demosaic=malvar")

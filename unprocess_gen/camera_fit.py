@@ -55,6 +55,8 @@ START = (0.0026, 7e-5, 2.0, 0.5)
 STEPS, RESAMPLES, ALIKE, LEAST_BLUR = 6, 200, 4.0, 0.3
 """Most steps; resamples; excess of a sum of squares, in mean squares, that does not exclude a choice (two standard
 errors); least standard deviation of a Gaussian filter that changes a picture, pixels."""
+NOISELESS = math.log(0.01)
+"""Logarithm of the deviation in place of that of bands which rounding leaves without simulated noise."""
 TO_YCC = np.array([[0.299, -0.1687, 0.5], [0.587, -0.3313, -0.4187], [0.114, 0.5, -0.0813]], np.float32)
 ALL = np.zeros((8, 5))
 """R, G, B, Y, Cb, Cr, and Y and Cb of the right neighbour, from R, G, B, and Y and Cb of the right neighbour."""
@@ -254,8 +256,10 @@ class Problem:
 
         def residual(numbers: Float) -> Float:
             model = statistics(self.simulated(choice, numbers).sum(axis=0))[self.kept]
+            model = np.nan_to_num(model, nan=NOISELESS)
             return np.asarray((model - target) / self.errors)
 
+        start = np.maximum(start, 1e-3 * self.start)  # what another choice set to 0 has no slope
         levels = (len(target) - len(RATIOS)) // 2
         numbers = np.r_[start[:2] * np.exp(-2 * np.median((residual(start) * self.errors)[:levels])), start[2:]]
         scale, value = np.r_[numbers[:2], self.start[2:]], residual(numbers)
