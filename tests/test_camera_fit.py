@@ -76,7 +76,7 @@ def test_noise_without_shot_noise_is_fitted_for_all_cameras() -> None:
     fit = ug.CameraNoise.fit([(noisy, clean)], ["gains=fixed", "isp=srgb"])
     assert fit.choice[1] == "camera=nexus_6p"
     assert fit.numbers["a_dn"].value < 0.1
-    assert fit.numbers["b_dn2"].value == pytest.approx(3000, rel=0.01)
+    assert fit.numbers["b_dn2"].value == pytest.approx(3000, rel=0.06)  # three standard errors
 
 
 def test_one_pair_of_16_bits_is_resampled_by_tiles() -> None:
