@@ -12,7 +12,7 @@ import functools
 import itertools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -34,11 +34,13 @@ Choice = tuple[str, str, str]
 """Curve, camera and demosaicking; the first two are overrides."""
 
 NUMBERS = ("a_dn", "b_dn2", "chroma_nr", "luma_nr")
+FITTED = {"demosaic", "chroma_nr", "luma_nr", "seed"}
+"""Keyword arguments of `CameraNoise` that are fitted, or that `CameraFit.noise` takes."""
 TRIED = {
     "isp=": ("isp=smoothstep_gamma22", "isp=gamma22", "isp=srgb"),
-    "camera=": ("camera=convex", "camera=nexus_6p", "camera=sony_a7r", "camera=olympus_em10", "camera=sony_rx100"),
+    "camera=": ("camera=nexus_6p", "camera=sony_a7r", "camera=olympus_em10", "camera=sony_rx100"),
 }
-"""Overrides that are tried unless the config has one of the group."""
+"""Overrides tried unless the config has one of the group; without convex, which draws a matrix for each picture."""
 PIXELS, TILE, BAND, BANDS = 2**19, 32, 16, 16
 """Most pixels of all pairs, which are cut to their middle; side of a tile; codes of a band of clean luma; bands."""
 DARKEST, BRIGHTEST = 8, 247
@@ -55,8 +57,8 @@ START = (0.0026, 7e-5, 2.0, 0.5)
 STEPS, RESAMPLES, ALIKE, LEAST_BLUR = 6, 200, 4.0, 0.3
 """Most steps; resamples; excess of a sum of squares, in mean squares, that does not exclude a choice (two standard
 errors); least standard deviation of a Gaussian filter that changes a picture, pixels."""
-NOISELESS = math.log(0.01)
-"""Logarithm of the deviation in place of that of bands which rounding leaves without simulated noise."""
+NOISELESS, SEED = math.log(0.01), 2**31 - 1
+"""Logarithm of the deviation of noise that is none; seed of the simulated noise, other than that of any pair."""
 TO_YCC = np.array([[0.299, -0.1687, 0.5], [0.587, -0.3313, -0.4187], [0.114, 0.5, -0.0813]], np.float32)
 ALL = np.zeros((8, 5))
 """R, G, B, Y, Cb, Cr, and Y and Cb of the right neighbour, from R, G, B, and Y and Cb of the right neighbour."""
@@ -178,12 +180,15 @@ class Picture(NamedTuple):
         return np.moveaxis(total.reshape(6, 6, self.tiles, BANDS), (0, 1), (2, 3))
 
 
-def read_pictures(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[Picture]:
+def read_pictures(pairs: Iterable[tuple[ArrayLike, ArrayLike]]) -> list[Picture]:
     """Check the pairs, cut them to the middle, and find the cell of each pixel; ConfigError."""
-    if not len(pairs):
-        raise ConfigError("CameraNoise.fit: pairs=[]: no pair; expected one or more pairs (noisy, clean)")
-    side, pictures = math.isqrt(PIXELS // len(pairs)), []
-    for number, (noisy, clean) in enumerate((array_pixels(noisy), array_pixels(clean)) for noisy, clean in pairs):
+    both = [(*pair,) for pair in pairs]
+    if not both or any(len(pair) != 2 for pair in both):
+        lengths = ", ".join(str(len(pair)) for pair in both) or "none"
+        problem = f"lengths of the pairs are {lengths}" if both else "no pair"
+        raise ConfigError(f"CameraNoise.fit: pairs: {problem}; expected a list of pairs [(noisy, clean), ...]")
+    side, pictures = math.isqrt(PIXELS // len(both)), []
+    for number, (noisy, clean) in enumerate((array_pixels(noisy), array_pixels(clean)) for noisy, clean in both):
         kinds = [f"{picture.dtype} {list(picture.shape)}" for picture in (noisy, clean)]
         if kinds[0] != kinds[1] or np.array_equal(noisy, clean):
             problem = f"noisy is {kinds[0]}, clean {kinds[1]}" if kinds[0] != kinds[1] else "noisy equals clean"
@@ -276,12 +281,15 @@ class Problem:
 
 
 def fit_pairs(
-    make: Callable[..., Any], pairs: Sequence[tuple[ArrayLike, ArrayLike]], config: Sequence[str], **options: Any
+    make: Callable[..., Any], pairs: Iterable[tuple[ArrayLike, ArrayLike]], config: Sequence[str], **options: Any
 ) -> CameraFit:
     """Fit the noise that ``make`` makes of a config and keyword arguments; see `CameraNoise.fit`."""
     require("scipy", "CameraNoise.fit needs scipy", "calibrate")
-    if isinstance(config, str):
-        raise ConfigError(f"CameraNoise.fit: config={config!r}: is text; expected a list: [{config!r}]")
+    if isinstance(config, str | Config):
+        raise ConfigError(f"CameraNoise.fit: config is a {type(config).__name__}; expected a list of overrides")
+    given = [word for word in config if word.lstrip("+~").startswith("noise")] + [*(FITTED & set(options))]
+    if given:
+        raise ConfigError(f"CameraNoise.fit: {', '.join(given)}: is fitted; expected other settings; leave it out")
     curves, cameras = ([w for w in config if w.startswith(key)] or tried for key, tried in TRIED.items())
     sensor, pictures = load_config(config).sensor, read_pictures(pairs)
     levels = [f"noise.{name}={getattr(sensor, name)}" for name in ("bits", "black_level_dn", "white_level_dn")]
@@ -295,7 +303,7 @@ def fit_pairs(
         config, (a, b, *squares) = config_of(*choice[:2]), numbers.tolist()
         reduction = dict(zip(NUMBERS[2:], map(math.sqrt, squares), strict=False))
         config = replace(config, noise=replace(config.noise, a=a, b=b))
-        model = make(config, demosaic=choice[2][9:], **options, **reduction)
+        model = make(config, demosaic=choice[2][9:], seed=SEED, **options, **reduction)
         made = (model(picture.clean, index=index) for index, picture in enumerate(pictures))
         noises = (_noise(noisy, clean) for clean, noisy in made)
         return np.concatenate([picture.sums(noise) for picture, noise in zip(pictures, noises, strict=True)])
@@ -312,7 +320,7 @@ def fit_pairs(
     numbers, table = _intervals(problem, pictures, best)
     overrides = (*shared, *(f"noise.{key[0]}={rounded(numbers[key].value)}" for key in NUMBERS[:2]), *best.choice[:2])
     options |= {"demosaic": best.choice[2][9:]} | {key: rounded(numbers[key].value, 4) for key in list(numbers)[2:]}
-    units = f"{len(pairs)} pairs" if len(pairs) >= LEAST_PAIRS else f"{len(problem.sums)} tiles"
+    units = f"{len(pictures)} pairs" if len(pictures) >= LEAST_PAIRS else f"{len(problem.sums)} tiles"
     return CameraFit(numbers, best.choice, alike, units, table, overrides, options, make)
 
 
@@ -322,11 +330,13 @@ def _problem(simulated: Callable[[Choice, Float], Float], pictures: Sequence[Pic
     count, target = sums[..., 0, 0], statistics(sums.sum(axis=0))
     used = ((count > 0).sum(axis=0) >= LEAST_TILES) & (count.sum(axis=0) >= LEAST_PIXELS)
     kept = np.r_[used, used, np.ones(len(RATIOS), bool)]
-    if used.sum() < LEAST_BANDS or np.isnan(target[kept]).any():
+    has_noise = (target[kept][: -len(RATIOS)] > NOISELESS).all()  # also chroma, which gray pictures lack
+    if used.sum() < LEAST_BANDS or not has_noise:
         levels = ", ".join(f"{BAND * band} to {BAND * (band + 1) - 1}" for band in np.flatnonzero(used)) or "none"
         raise ConfigError(
             f"CameraNoise.fit: pairs: levels of luma with enough pixels and noise: {levels}; expected {LEAST_BANDS} "
-            f"bands or more, all channels from {DARKEST} to {BRIGHTEST}; add darker and brighter pictures"
+            f"bands or more, with noise in luma and chroma, all channels from {DARKEST} to {BRIGHTEST}; add larger, "
+            "darker or brighter pictures"
         )
     sampling = np.nanstd(_resampled(sums, [1] * len(sums))[:, kept], axis=0)
     errors = np.hypot(sampling, np.repeat(MODEL_ERRORS, (2 * used.sum(), len(RATIOS))))

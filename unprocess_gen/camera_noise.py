@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -110,7 +110,7 @@ class CameraNoise:
         luma_nr: float = 0,
         jpeg_sampling: str = "4:2:0",
     ) -> None:
-        self._options = IspOptions(demosaic, strength, chroma_nr, luma_nr, jpeg, jpeg_sampling)
+        self._options = IspOptions(*map(_as_python, (demosaic, strength, chroma_nr, luma_nr, jpeg, jpeg_sampling)))
         if clean not in CLEANS:
             raise ConfigError(f"CameraNoise: clean={clean!r}: unknown; expected one of {', '.join(CLEANS)}")
         if isinstance(config, str):
@@ -126,15 +126,15 @@ class CameraNoise:
 
     @classmethod
     def fit(
-        cls, pairs: Sequence[tuple[ArrayLike, ArrayLike]], config: Sequence[str] = ("gains=fixed",), **options: Any
+        cls, pairs: Iterable[tuple[ArrayLike, ArrayLike]], config: Sequence[str] = ("gains=fixed",), **options: Any
     ) -> CameraFit:
         """Fit the noise to real pairs of a noisy and a clean picture.
 
         Parameters
         ----------
-        pairs : sequence of (array_like, array_like)
-            Noisy and clean picture of one scene, uint8 or uint16 [H, W, 3], of one camera and ISO. All pairs together
-            are cut to 2**19 pixels, each to its middle.
+        pairs : iterable of (array_like, array_like)
+            Noisy and clean picture of one scene, in this order, uint8 or uint16 [H, W, 3], of one camera and ISO. All
+            pairs together are cut to 2**19 pixels, each to its middle.
         config : sequence of str
             Hydra overrides of everything but noise. ``isp=`` and ``camera=`` fix what is fitted otherwise.
         **options : Any
@@ -148,8 +148,8 @@ class CameraNoise:
         Raises
         ------
         ConfigError
-            If there is no pair, shapes or dtypes of a pair differ, its pictures are equal, or the pictures have too few
-            levels.
+            If there is no pair, shapes or dtypes of a pair differ, its pictures are equal, the pictures have too few
+            levels or no noise in chroma, or an argument names what is fitted.
         ValueError
             If a picture has another dtype or shape.
 
@@ -169,7 +169,7 @@ class CameraNoise:
         >>> known = ug.CameraNoise(["noise=imx385_iso6400", "camera=sony_a7r", "gains=fixed"])
         >>> clean, noisy = known(ramp, index=0)
         >>> fit = ug.CameraNoise.fit([(noisy, clean)], ["gains=fixed", "camera=sony_a7r", "isp=smoothstep_gamma22"])
-        >>> fit.demosaic, fit.numbers["a_dn"].low < 13.5 < fit.numbers["a_dn"].high
+        >>> fit.options["demosaic"], fit.numbers["a_dn"].low < 13.5 < fit.numbers["a_dn"].high
         ('malvar', True)
         >>> noise = fit.noise(seed=1)
         """
@@ -236,6 +236,11 @@ class CameraNoise:
         if self._clean == "mean":
             return mean_picture(pair.clean, plan, self._options, strength, codes), noisy
         return render(clean, plan, replace(self._options, chroma_nr=0, luma_nr=0), codes), noisy
+
+
+def _as_python(value: Any) -> Any:
+    """Scalars and arrays of NumPy as Python's numbers and lists."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def _config_of_pictures(config: Config, seed: int) -> Config:

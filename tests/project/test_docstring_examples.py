@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import inspect
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ FIRST = ("generate", "verify", "replay")
 """Functions whose examples write or read the dataset ``ds``, in the order of its use."""
 
 NAMES = [*FIRST, *(name for name in ug.__all__ if inspect.isfunction(getattr(ug, name)) and name not in FIRST)]
-NAMES.append("RawPairs")
+NAMES += ["RawPairs", "CameraNoise", "CameraNoise.fit"]
 
 
 def test_examples_of_the_api_give_their_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -22,7 +23,7 @@ def test_examples_of_the_api_give_their_results(tmp_path: Path, monkeypatch: pyt
     report: list[str] = []
     runner, parser = doctest.DocTestRunner(verbose=False), doctest.DocTestParser()
     for name in NAMES:
-        examples = parser.get_doctest(inspect.getdoc(getattr(ug, name)) or "", {}, name, None, None)
+        examples = parser.get_doctest(inspect.getdoc(attrgetter(name)(ug)) or "", {}, name, None, None)
         assert examples.examples, f"{name} has no example"
         runner.run(examples, out=report.append)
     assert report == []
