@@ -198,7 +198,7 @@ def test_drawn_options_are_pure_in_seed_and_index(picture: np.ndarray) -> None:
     exponents = np.log2([value["strength"] for value in values])
     assert -1 <= exponents.min() < exponents.max() <= 1
     assert abs(exponents.mean()) < 3 * 2 / np.sqrt(12 * 400)
-    assert {round(value["jpeg"]) for value in values} == set(range(70, 96))
+    assert {value["jpeg"] for value in values} == set(range(70, 96))
     assert noise.drawn(7) != ug.CameraNoise(ISO_12800, seed=4, **drawn).drawn(7)
     assert ug.CameraNoise(jpeg=80).drawn(0) == {"strength": 1, "jpeg": 80}
 
@@ -317,6 +317,7 @@ def test_flat_colours_return_from_noise_reduction(shape: tuple[int, int], dtype:
         ({"demosaic": "ahd"}, "CameraNoise: demosaic=ahd: not allowed; expected one of malvar, bilinear"),
         ({"clean": "none"}, "clean='none': unknown; expected one of developed, source, mean"),
         ({"jpeg": 0}, "CameraNoise: jpeg=0: expected 1 to 100"),
+        ({"jpeg": 75.5}, "CameraNoise: jpeg=75.5: no integer; expected 1 to 100 or a distribution"),
         ({"jpeg": True}, "jpeg=true: expected a finite number or a distribution: [uniform, lowest, highest]"),
         ({"jpeg": ["uniform", 95, 70]}, "jpeg=[uniform, 95, 70]: expected the lowest value below the highest"),
         ({"jpeg_sampling": "4:1:1"}, "jpeg_sampling=4:1:1: not allowed; expected one of 4:2:0, 4:2:2, 4:4:4"),

@@ -190,7 +190,7 @@ class CameraNoise:
         Returns
         -------
         dict
-            ``strength``, a factor, and ``jpeg``, a quality that is rounded to an integer, or None.
+            ``strength``, a factor, and ``jpeg``, an integer, or None.
         """
         return self._options.drawn(self._seed, operator.index(index))
 
@@ -230,7 +230,7 @@ class CameraNoise:
         clean = light_of(pair.clean, plan)
         noisy = render(with_strength(clean, light_of(pair.noisy, plan), strength, plan), plan, self._options, codes)
         if drawn["jpeg"] is not None:
-            noisy = compressed(noisy, round(drawn["jpeg"]), self._options.jpeg_sampling)
+            noisy = compressed(noisy, drawn["jpeg"], self._options.jpeg_sampling)
         if self._clean == "source":
             return pixels.copy(), noisy
         if self._clean == "mean":

@@ -57,6 +57,8 @@ class IspOptions:
                 limit.parse(f"CameraNoise: {name}", value)
             elif not limit.allows(value):
                 raise ConfigError(f"CameraNoise: {name}={value_text(value)}: not allowed; expected {limit}")
+        if isinstance(self.jpeg, float):
+            raise ConfigError(f"CameraNoise: jpeg={self.jpeg}: no integer; expected 1 to 100 or a distribution")
 
     def drawn(self, seed: int, index: int) -> dict[str, Any]:
         """Strength, and quality of JPEG or None, of a picture: a pure function of seed and index."""
@@ -66,7 +68,8 @@ class IspOptions:
             for (name, value), word in zip(values.items(), random.tolist(), strict=True):
                 if value is not None:
                     distribution = parse_distribution(name, value, tuple(DISTRIBUTIONS))
-                    values[name] = draw_parameter(distribution, (word + 0.5) / 2**32)
+                    drawn = draw_parameter(distribution, (word + 0.5) / 2**32)
+                    values[name] = round(drawn) if name == "jpeg" else drawn
         return values
 
 
