@@ -50,7 +50,8 @@ class CameraNoise:
         Seed of all that is drawn. The config has none of its own.
     clean : str
         ``"developed"``: the frame without noise, developed like the noisy one. ``"source"``: the picture itself.
-        ``"mean"``: the mean of the noisy pictures before JPEG; not with ``gains.highlight=gray_mean``.
+        ``"mean"``: the mean of the noisy pictures before JPEG; not with ``gains.highlight=gray_mean``. It takes light
+        as normally distributed: 1 code off where white has 60 electrons, 4 at 10, and 18 at 3.
     strength : float or list
         Factor of the noise, 0 to 100, or its distribution, such as ``["log_uniform", 0.58, 1.7]``. The noisy light is
         clean + strength · (noisy - clean), clipped where the sensor clips.
