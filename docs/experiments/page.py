@@ -34,11 +34,11 @@ NAMES = {
     "noise_flow": "Noise Flow",
     "GAN": "GAN",
     "white_oracle": "white, oracle",
-    "awgn_1.6": "AWGN, 1.6 times as strong",
-    "awgn_2.5": "AWGN, 2.5 times as strong",
+    "awgn_1.6": "AWGN × 1.6",
+    "awgn_2.5": "AWGN × 2.5",
     "best_awgn": "best AWGN",
     "bilinear": "`CameraNoise`, bilinear",
-    "malvar": "`CameraNoise` as it comes (Malvar)",
+    "malvar": "`CameraNoise`, default",
     "fitted": "`CameraNoise`, fitted",
     "fitted_isp": "`CameraNoise`, fitted with ISP",
 }
@@ -106,10 +106,10 @@ def ladder(results: dict[str, Any]) -> str:
     ]
     return f"""# The ladder on raw frames
 
-{results["judged_levels"]} levels of a sensor were judged, which was calibrated on
-{results["calibrating_levels"]} others.{saturated} Ratios are simulated to real deviations; medians over levels with
-95 % intervals. Real neighbours in a row correlate by {number(results["next_in_row"]["real"])}, in a column by
-{number(results["next_in_column"]["real"])}.
+A sensor was calibrated on frames of {results["calibrating_levels"]} levels and judged on other frames, of
+{results["judged_levels"]} levels.{saturated} Values are medians over levels with 95 % intervals. Pixels, row means and
+column means are ratios of simulated to real standard deviations. Real neighbours correlate by
+{number(results["next_in_row"]["real"])} in a row and by {number(results["next_in_column"]["real"])} in a column.
 
 {table(["model", "divergence", "pixels", "row means", "column means", "next in row", "next in column"], cells)}
 
@@ -117,9 +117,9 @@ def ladder(results: dict[str, Any]) -> str:
 - Row means of physical, 0.95 to 1.05 of the real ones: {met(0.95 <= physical <= 1.05)} ({number(physical)}).
 - Row means of two numbers, less than a third of the real ones: {met(two < 1 / 3)} ({number(two)}).
 
-On darks alone, which the protocol does not separate, row means of two numbers are {dark["two_numbers"]} of the real
-ones, those of physical {dark["physical"]}: there the light hides nothing. On flats alone, the median divergence of two
-numbers is {flat["two_numbers"]}, that of physical {flat["physical"]}. All simulated frames are of one body.
+The protocol does not separate darks and flats. On darks alone, the ratio of row means is {dark["two_numbers"]} for two
+numbers and {dark["physical"]} for physical. On flats alone, the median divergence is {flat["two_numbers"]} for two
+numbers and {flat["physical"]} for physical. All simulated frames are of one body.
 
 ![divergence by level, and power of row means by frequency, real and simulated](ladder.png)
 """
@@ -142,22 +142,22 @@ def classifier(results: dict[str, Any]) -> str:
         best = min((one["accuracy"][0], model) for model, one in found.items())
         two = found["two_numbers"]["accuracy"][0]
         goals.append(
-            f"- On {kind}s, recognised least: {NAMES[best[1]]}, {number(100 * best[0])} %."
+            f"- Best model on {kind}s: {NAMES[best[1]]}, {number(100 * best[0])} %."
             f" Goal, at most 55 %: {met(best[0] <= 0.55)}."
             f" Two numbers exceed 55 %: {met(two > 0.55)}."
         )
     return f"""# A classifier as judge
 
 A network of {results["parameters"]} parameters was trained to distinguish real from simulated tiles of
-{results["tile"]} x {results["tile"]} sites, and judged on frames that neither calibrated the sensor nor trained it. At
-50 % it cannot distinguish them. Accuracy in %, mean of three seeds, with 95 % intervals over frames:
+{results["tile"]} x {results["tile"]} sites. It was judged on frames that neither calibrated the sensor nor trained it.
+Accuracy is the mean of three seeds with 95 % intervals over frames; chance is 50 %.
 
 {table(["frames", "model", "accuracy, %", "judged frames"], cells)}
 
 {chr(10).join(goals)}
 
-The flats of other levels differ: an independent measurement on 214 further frames of the same CCD gave 66.5 % for AWGN,
-68.8 % for two numbers, and 56.5 % (55.1 to 57.8) for physical. Those frames are not part of this experiment.
+An independent measurement on 214 other flats of this CCD, at other levels, is not part of this experiment. It gave
+66.5 % for AWGN, 68.8 % for two numbers, and 56.5 % (55.1 to 57.8) for physical.
 """
 
 
@@ -214,15 +214,18 @@ def learned_noise(results: dict[str, Any]) -> str:
     return f"""# Against learned noise
 
 {results["judged"]} of {results["patches"]} patches of SIDD were judged, in {camera["groups"]} groups of one scene,
-phone and ISO. `CameraNoise` was fitted on other patches of the same phone and ISO; the white noise has the deviation
-of the judged patch at each level. Medians over groups with 95 % intervals.
+phone and ISO. `CameraNoise` was fitted on other patches of the same phone and ISO. Values are medians over groups with
+95 % intervals.
 
 {table(head, cells)}
 
-- By exposure: noise scaled as by digital brightening. Fixed gains: the same for all lights. Other phone: fitted on the
-  other phone, scaled by ISO.
-- The variance of `CameraNoise` differs from the real one by {100 * camera["variance_by_level_error"][0]:.0f} % at the
-  median level.
+- By exposure: noise is scaled as by digital brightening.
+- Fixed gains: all lights have the same gains.
+- Other phone: the noise was fitted on the other phone and scaled by ISO.
+- White, oracle: the standard deviation at each level is that of the judged patch.
+- At the median level, the variance of `CameraNoise` differs from the real variance by
+  {100 * camera["variance_by_level_error"][0]:.0f} %.
+- Noise Flow is compared with the real noise of its own pipeline, whose colours differ.
 
 Goals of `CameraNoise`:
 
@@ -230,18 +233,16 @@ Goals of `CameraNoise`:
 
 ## Colours
 
-Correlations between channels, and variance of chroma relative to luma; after the colon, the absolute difference from
-real or the ratio to it:
+Correlations between channels, with their absolute differences from real after the colon. The last column is the
+variance of chroma divided by that of luma, with its ratio to real.
 
 {colour}
 
 ## Neighbours
 
-Correlation with the next pixel in a row, and its absolute difference from real:
+Correlations with the next pixel in a row, with their absolute differences from real after the colon.
 
 {neighbours}
-
-Noise Flow is compared with the real noise of its own pipeline, whose colours differ.
 """
 
 
@@ -294,8 +295,7 @@ def real_pictures(name: str, results: dict[str, Any], steps: int) -> str:
     return f"""
 ### {SETS.get(name, name)}
 
-{results["pairs"]} pairs of {results["groups"]} groups. Luma and R–G are deviation and correlation of the noise of the
-training patches, in the first row of the judged pictures (medians). The best AWGN is chosen on the judged pictures.
+{results["pairs"]} pairs of {results["groups"]} groups.
 
 {table(["training noise", "PSNR, dB", "SSIM", "luma, codes", "R–G"], cells)}
 
@@ -315,9 +315,15 @@ def training(results: dict[str, Any]) -> str:
             sections += "".join(real_pictures(name, found, results["steps"]) for name, found in sets)
     page = f"""# Does it train better
 
-One network of {results["parameters"]:,} parameters was trained with each kind of noise, in {results["steps"]:,} steps,
-with {results["seeds"]} seeds (real pairs with one). It was judged on real sRGB pairs. Means over groups with 95 %
-intervals over groups; an interval of a difference that contains 0 shows no difference.
+A network of {results["parameters"]:,} parameters was trained with each kind of noise: {results["steps"]:,} steps,
+{results["seeds"]} seeds (one for real pairs). It was judged on real sRGB pairs. The [protocol](protocol.md) describes
+the models; [Experiments](index.md) summarises the results.
+
+- PSNR and SSIM are means over groups, with 95 % intervals over groups. An interval of a difference that contains 0
+  shows no difference.
+- Luma and R–G are medians for the noise of training patches: standard deviation, and correlation of R and G. The first
+  row describes the judged pictures instead.
+- The best AWGN is chosen on the judged pictures.
 {sections}"""
     if "raw" not in results:
         return page
@@ -330,8 +336,8 @@ intervals over groups; an interval of a difference that contains 0 shows no diff
     return f"""{page}
 ## On raw frames
 
-Squared error that is left, as a share of the noise variance, on {raw["judged_levels"]} judged levels of the sensor; it
-is measured on pairs of exposures, without clean frames. Medians over levels:
+Remaining squared error divided by the noise variance, measured on pairs of exposures without clean frames. Values are
+medians over {raw["judged_levels"]} judged levels of the sensor:
 
 {table(["training noise", "error / noise"], cells)}
 
