@@ -56,6 +56,7 @@ DIFFERENCES = (
     ("fitted", "malvar"),
     ("fitted", "best_awgn"),
     ("fitted_isp", "fitted"),
+    ("fitted_isp", "malvar"),
     ("fitted_isp", "best_awgn"),
     ("real", "best_awgn"),
 )
