@@ -51,14 +51,14 @@ LEAST_PIXELS, LEAST_TILES, LEAST_BANDS, LEAST_PAIRS = 400, 3, 2, 4
 Fewer pairs are resampled tile by tile.
 """
 MODEL_ERRORS = (0.03, 0.02)
-"""Errors of the model, added to those of sampling: of logarithms of deviations, and of correlations. Chosen."""
+"""Chosen errors of the model, in addition to sampling: of logarithms of standard deviations, and of correlations."""
 START = (0.0026, 7e-5, 2.0, 0.5)
 """First a and b for light from 0 to 1 (their size follows from the luma), chroma_nr², luma_nr² in luma variances."""
 STEPS, RESAMPLES, ALIKE, LEAST_BLUR = 6, 200, 4.0, 0.3
 """Most steps; resamples; excess of a sum of squares, in mean squares, that does not exclude a choice (two standard
 errors); least standard deviation of a Gaussian filter that changes a picture, pixels."""
 NOISELESS, SEED = math.log(0.01), 2**31 - 1
-"""Logarithm of the deviation of noise that is none; seed of the simulated noise, other than that of any pair."""
+"""Logarithm of the standard deviation, in codes, at or below which there is no noise; seed of the simulated noise."""
 TO_YCC = np.array([[0.299, -0.1687, 0.5], [0.587, -0.3313, -0.4187], [0.114, 0.5, -0.0813]], np.float32)
 ALL = np.zeros((8, 5))
 """R, G, B, Y, Cb, Cr, and Y and Cb of the right neighbour, from R, G, B, and Y and Cb of the right neighbour."""
@@ -88,6 +88,8 @@ class CameraFit:
         Hydra overrides of the fitted noise.
     options : dict
         Keyword arguments of `CameraNoise` in addition to the overrides.
+    make : callable
+        Class that `noise` makes an instance of.
     """
 
     numbers: Mapping[str, Estimate]
@@ -141,7 +143,7 @@ def _text(number: Estimate) -> str:
 
 
 def fit_yaml(fit: CameraFit, name: str, source: str) -> str:
-    """A fit as a noise profile; ``source`` describes the pairs."""
+    """Format a fit as a noise profile; ``source`` describes the pairs."""
     lines = [f"Fitted {MARK} --srgb to {source}.", f"a and b are effective: they hold with {fit.settings}."]
     lines += [f"CameraNoise needs also {fit.keywords}.", *(f"Not excluded: {choice}." for choice in fit.alike)]
     words = [word.removeprefix("noise.").replace("=", ": ") for word in fit.overrides if word.startswith("noise.")]
@@ -150,7 +152,7 @@ def fit_yaml(fit: CameraFit, name: str, source: str) -> str:
 
 
 def fit_json(fit: CameraFit) -> str:
-    """Numbers and table of a fit as a JSON list, an object a line."""
+    """Format numbers and table of a fit as a JSON list, one object per line."""
     named = dict(fit.numbers)
     for name, both in fit.table.items():
         named |= zip((f"{name} (real)", f"{name} (model)"), both, strict=True)
@@ -212,7 +214,7 @@ def _noise(noisy: Srgb, clean: Srgb) -> Any:
 
 
 def statistics(sums: Float) -> Float:
-    """Logarithms of the deviations of luma and of chroma by band, and `RATIOS`; NaN without noise."""
+    """Logarithms of the standard deviations of luma and of chroma by band, and `RATIOS`; NaN without noise."""
     count = sums[..., :1, :1]
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = sums / count

@@ -1,7 +1,7 @@
 """Add camera noise to sRGB pictures: make the raw pair of a picture, and develop both frames.
 
-The raw frames are made by `make_pair`, exact on every machine. Frames are developed in float32, so codes may differ by
-one between machines. No byte of a dataset depends on this module.
+Raw frames are the same on every machine. They are developed in float32, so codes may differ by one between machines. No
+byte of a dataset depends on this module.
 """
 
 from __future__ import annotations
@@ -44,29 +44,28 @@ class CameraNoise:
     demosaic : str
         ``"malvar"``, the filters of Malvar, He and Cutler, or ``"bilinear"``.
     jpeg : int or list, optional
-        Quality, 1 to 100, of the JPEG compression of noisy pictures, or its distribution, such as
-        ``["uniform", 70, 95]``, whose values are rounded to integers; by default none.
+        JPEG quality of noisy pictures, 1 to 100, or its distribution, such as ``["uniform", 70, 95]``, rounded to
+        integers. By default, pictures are not compressed.
     seed : int
         Seed of all that is drawn. The config has none of its own.
     clean : str
         ``"developed"``: the frame without noise, developed like the noisy one. ``"source"``: the picture itself.
-        ``"mean"``: the mean of the noisy pictures before JPEG; not with ``gains.highlight=gray_mean``. It takes light
-        as normally distributed: 1 code off where white has 60 electrons, 4 at 10, and 18 at 3.
+        ``"mean"``: the mean of the noisy pictures before JPEG; not with ``gains.highlight=gray_mean``.
     strength : float or list
         Factor of the noise, 0 to 100, or its distribution, such as ``["log_uniform", 0.58, 1.7]``. The noisy light is
         clean + strength · (noisy - clean), clipped where the sensor clips.
     chroma_nr : float
         Noise reduction of noisy pictures: standard deviation of the Gaussian blur of Cb and Cr, pixels; 0: none.
     luma_nr : float
-        Noise reduction of noisy pictures by a bilateral filter of luma: difference that it smooths, as the standard
-        deviation of its range, in codes of 8 bits; 0: none.
+        Noise reduction of noisy pictures: standard deviation of the range of the bilateral filter of luma, in 8-bit
+        codes; 0: none.
     jpeg_sampling : str
         Chroma sampling of JPEG: ``"4:2:0"``, ``"4:2:2"`` or ``"4:4:4"``.
 
     Raises
     ------
     ConfigError
-        If an argument is not allowed, the config is not allowed, changes the geometry or has another seed.
+        If an argument or the config is not allowed, or the config changes the geometry or has another seed.
     MachineError
         When a picture is made, if the self-test of the kernels fails.
     TypeError
@@ -78,12 +77,12 @@ class CameraNoise:
     -----
     ``noise(picture, index=7)`` depends only on the picture, the config, the seed and the index. It develops the frames
     of ``make_pair(picture, config, seed=seed, key=7)``, whose ``row`` states all parameters. Only the noisy frame is
-    rounded to DN, and only if noise is simulated. So a flat picture without noise returns with each code within 1,
-    except where the sensor is saturated or the light of a colour is negative, which sensors record as black.
+    rounded to DN, and only if noise is simulated. So each code of a flat picture without noise returns within 1, unless
+    the sensor is saturated or the light of a colour is negative, which sensors record as black.
 
-    The mean takes the light of a channel as normally distributed, and offsets of rows and columns as independent. Fixed
-    patterns are averaged unless ``clean.includes_fixed_pattern`` is set. Noise reduction is applied to the mean; other
-    clean pictures do not get it.
+    The mean takes the light of a channel as normally distributed, and offsets of rows and columns as independent. Its
+    error is up to 1 code if white has 60 electrons, 4 at 10, and 18 at 3. Fixed patterns are averaged unless
+    ``clean.includes_fixed_pattern`` is set. Of clean pictures, only the mean gets noise reduction.
 
     Examples
     --------
@@ -203,8 +202,8 @@ class CameraNoise:
         picture : array_like of uint8 or uint16, [H, W, 3]
             Display-referred codes, R, G, B; at least 2 x 2.
         index : int, optional
-            Number that selects the random values; by default the number of the call: 0, 1, … Copies of an instance,
-            such as in the workers of a DataLoader, count their calls separately, so state it there; they warn once.
+            Number that selects the random values; by default the number of the call: 0, 1, … Pass it in the workers of
+            a DataLoader, whose copies of an instance count their calls separately and warn once.
 
         Returns
         -------
@@ -240,7 +239,7 @@ class CameraNoise:
 
 
 def _as_python(value: Any) -> Any:
-    """Scalars and arrays of NumPy as Python's numbers and lists."""
+    """Convert scalars and arrays of NumPy to Python's numbers and lists."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 

@@ -41,7 +41,7 @@ LIMITS: dict[str, Limit] = {
 
 @dataclass(frozen=True, slots=True)
 class IspOptions:
-    """Options of `CameraNoise` behind the raw frame, as users give them; ConfigError if one is not allowed."""
+    """Options of `CameraNoise` that apply after the raw frame, as users give them; ConfigError if not allowed."""
 
     demosaic: str
     strength: Any
@@ -61,7 +61,7 @@ class IspOptions:
             raise ConfigError(f"CameraNoise: jpeg={self.jpeg}: no integer; expected 1 to 100 or a distribution")
 
     def drawn(self, seed: int, index: int) -> dict[str, Any]:
-        """Strength, and quality of JPEG or None, of a picture: a pure function of seed and index."""
+        """Draw strength and JPEG quality, or None, of a picture; they depend only on seed and index."""
         values = {"strength": self.strength, "jpeg": self.jpeg}
         if any(isinstance(value, list | tuple) for value in values.values()):
             random = words(stream_key(seed, f"CameraNoise {index}"), PARAMETERS, (1, 2))[0]

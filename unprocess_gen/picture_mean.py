@@ -32,7 +32,7 @@ LOOK_UP: Any = functools.partial(cv2.remap, interpolation=cv2.INTER_LINEAR, bord
 
 
 def mean_picture(clean: Frame, plan: Plan, options: IspOptions, strength: float, codes: int) -> Srgb:
-    """Mean of the noisy pictures of a clean frame, float32 [H, W], rounded to codes.
+    """Compute the mean of the noisy pictures of a clean frame, float32 [H, W], rounded to codes.
 
     Offsets of rows and columns are taken as independent from site to site. Fixed patterns are random too, unless the
     clean frame contains them. Hot and dead pixels are left out. Noise reduction is applied to the mean.
