@@ -109,9 +109,14 @@ def levels_of(plan: Plan) -> dict[str, Value]:
 def _noise(name: str, frame: Frame, plan: Plan, as_float: bool) -> NDArray[np.float32]:
     """Compute the variance (DN²) or the standard deviation (DN) of the noise at each site of a frame."""
     black, span = plan.sensor.black_level_dn, plan.sensor.span_dn
-    numbers = {**levels_of(plan), "a_dn": plan.noise.a_dn, "dark_variance_dn2": dark_variance_dn2(plan)}
-    numbers |= {"skipped": ";".join(plan.noise.skipped), "fixed_pattern_in_clean": plan.averaged}
-    numbers["prnu_std"] = 0.0 if plan.physics is None else plan.physics.prnu_std
+    numbers = {
+        **levels_of(plan),
+        "a_dn": plan.noise.a_dn,
+        "dark_variance_dn2": dark_variance_dn2(plan),
+        "prnu_std": 0.0 if plan.physics is None else plan.physics.prnu_std,
+        "skipped": ";".join(plan.noise.skipped),
+        "fixed_pattern_in_clean": plan.averaged,
+    }
     frame_dn = frame if frame.dtype == np.uint16 else frame * np.float32(span) + np.float32(black)
     std = noise_std(frame_dn, numbers) / np.float32(span if as_float else 1)
     return std * std if name == "variance" else std
