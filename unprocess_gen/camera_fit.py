@@ -27,10 +27,11 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.core.arrays import Float, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
+from unprocess_gen.picture_isp import YCBCR
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.simulation.reference.isp import DEMOSAICS
 
-Choice = tuple[str, str, str]
+Combination = tuple[str, str, str]
 """Curve, camera and demosaicking; the first two are overrides."""
 
 NUMBERS = ("a_dn", "b_dn2", "chroma_nr", "luma_nr")
@@ -59,7 +60,7 @@ STEPS, RESAMPLES, ALIKE, LEAST_BLUR = 6, 200, 4.0, 0.3
 errors); least standard deviation of a Gaussian filter that changes a picture, pixels."""
 NOISELESS, SEED = math.log(0.01), 2**31 - 1
 """Logarithm of the standard deviation, in codes, at or below which there is no noise; seed of the simulated noise."""
-TO_YCC = np.array([[0.299, -0.1687, 0.5], [0.587, -0.3313, -0.4187], [0.114, 0.5, -0.0813]], np.float32)
+TO_YCC = YCBCR.T.round(4).astype(np.float32)  # the digits with which published fits were made
 ALL = np.zeros((8, 5))
 """R, G, B, Y, Cb, Cr, and Y and Cb of the right neighbour, from R, G, B, and Y and Cb of the right neighbour."""
 ALL[:3, :3], ALL[3:6, :3], ALL[6:, 3:] = np.eye(3), TO_YCC.T, np.eye(2)
@@ -93,7 +94,7 @@ class CameraFit:
     """
 
     numbers: Mapping[str, Estimate]
-    choice: Choice
+    choice: Combination
     alike: tuple[str, ...]
     resampled: str
     table: Mapping[str, tuple[Estimate, Estimate]]
@@ -240,7 +241,7 @@ class Candidate(NamedTuple):
     """Sum of squares of a choice, fitted parameters, and the matrix from residuals to changes of the parameters."""
 
     square: float
-    choice: Choice
+    choice: Combination
     numbers: Float
     inverse: Float
 
@@ -253,9 +254,9 @@ class Problem:
     kept: Any
     errors: Float
     start: Float
-    simulated: Callable[[Choice, Float], Float]
+    simulated: Callable[[Combination, Float], Float]
 
-    def fit(self, choice: Choice, start: Float) -> Candidate:
+    def fit(self, choice: Combination, start: Float) -> Candidate:
         """Fit the parameters of a choice by Gauss-Newton steps."""
         from scipy.optimize import nnls  # takes long to import
 
@@ -301,7 +302,7 @@ def fit_pairs(
     def config_of(isp: str, camera: str) -> Config:
         return load_config([*shared, "noise.a=1", "noise.b=1", isp, camera])
 
-    def simulated(choice: Choice, numbers: Float) -> Float:
+    def simulated(choice: Combination, numbers: Float) -> Float:
         config, (a, b, *squares) = config_of(*choice[:2]), numbers.tolist()
         reduction = dict(zip(NUMBERS[2:], map(math.sqrt, squares), strict=False))
         config = replace(config, noise=replace(config.noise, a=a, b=b))
@@ -326,7 +327,7 @@ def fit_pairs(
     return CameraFit(numbers, best.choice, alike, units, table, overrides, options, make)
 
 
-def _problem(simulated: Callable[[Choice, Float], Float], pictures: Sequence[Picture], units_dn: Float) -> Problem:
+def _problem(simulated: Callable[[Combination, Float], Float], pictures: Sequence[Picture], units_dn: Float) -> Problem:
     """Statistics of the real noise and their errors; ConfigError if they do not show a and b."""
     sums = np.concatenate([picture.sums(picture.noise) for picture in pictures])
     count, target = sums[..., 0, 0], statistics(sums.sum(axis=0))

@@ -21,6 +21,7 @@ from unprocess_gen.calibration.calibrate import calibrate
 from unprocess_gen.calibration.captures import Capture, read_captures
 from unprocess_gen.calibration.iso_results import FULL_SHARE
 from unprocess_gen.calibration.profile import dark_variance, measured_yaml
+from unprocess_gen.picture_isp import YCBCR
 
 HERE = Path(__file__).parent
 SAMPLES = 2000
@@ -82,10 +83,6 @@ def divergence(real: Any, model: Any, width: int = 1) -> float:
     p, q = (np.histogram(values, edges)[0] + 0.5 for values in (real, model))
     p, q = p / p.sum(), q / q.sum()
     return float(np.sum(p * np.log(p / q)))
-
-
-YCBCR = np.array([[0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]])
-"""Rows of Y, Cb and Cr of BT.601, from R, G and B."""
 
 
 def colour(noise: Any) -> dict[str, float]:

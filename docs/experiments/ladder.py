@@ -10,7 +10,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from common import Level, Sensor, arguments, divergence, halves, interval, ratio_of_medians, run, smooth, write
+from common import (
+    Level,
+    Sensor,
+    arguments,
+    correlation,
+    divergence,
+    halves,
+    interval,
+    ratio_of_medians,
+    run,
+    smooth,
+    write,
+)
 
 import unprocess_gen as ug
 
@@ -32,11 +44,6 @@ def statistics(difference: Any) -> dict[str, float]:
         "next_in_column": correlation(noise[:-1], noise[1:]),
         "row_power_dn2": [float(band.mean()) for band in np.array_split(power, BANDS)],
     }
-
-
-def correlation(a: Any, b: Any) -> float:
-    """Return the correlation of two arrays."""
-    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
 
 
 def judge(sensor: Sensor, level: Level, number: int) -> dict[str, Any]:

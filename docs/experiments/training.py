@@ -28,6 +28,7 @@ from real_pairs import FORMS, PATCHES, RealPair, real_pairs
 from torch import nn
 
 import unprocess_gen as ug
+from unprocess_gen.picture_isp import YCBCR
 
 WIDTH, BATCH, RATE, SEEDS = 24, 8, 0.002, (0, 1, 2)
 SIDE, STEPS, STEPS_PER_PICTURE = 32, 1600, 20 / 3
@@ -60,7 +61,7 @@ DIFFERENCES = (
     ("fitted_isp", "best_awgn"),
     ("real", "best_awgn"),
 )
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+LUMA = YCBCR[0].astype(np.float32)
 RAW = ("awgn", "two_numbers", "physical")
 
 
