@@ -184,29 +184,43 @@ class Picture(NamedTuple):
 
 
 def read_pictures(pairs: Iterable[tuple[ArrayLike, ArrayLike]]) -> list[Picture]:
-    """Check the pairs, cut them to the middle, and find the cell of each pixel; ConfigError."""
-    both = [(*pair,) for pair in pairs]
-    if not both or any(len(pair) != 2 for pair in both):
-        lengths = ", ".join(str(len(pair)) for pair in both) or "none"
-        problem = f"lengths of the pairs are {lengths}" if both else "no pair"
+    """Check the pairs and cut them to the middle, each when it is read: many pairs of full size exceed the memory."""
+    lengths, cut = list[int](), list[tuple[Srgb, Srgb]]()
+    for number, pair in enumerate(pairs):
+        lengths.append(len(pair))
+        if len(pair) == 2:
+            cut.append(_checked(number, *pair))
+    if not lengths or set(lengths) != {2}:
+        problem = f"lengths of the pairs are {', '.join(map(str, lengths))}" if lengths else "no pair"
         raise ConfigError(f"CameraNoise.fit: pairs: {problem}; expected a list of pairs [(noisy, clean), ...]")
-    side, pictures = math.isqrt(PIXELS // len(both)), []
-    for number, (noisy, clean) in enumerate((array_pixels(noisy), array_pixels(clean)) for noisy, clean in both):
-        kinds = [f"{picture.dtype} {list(picture.shape)}" for picture in (noisy, clean)]
-        if kinds[0] != kinds[1] or np.array_equal(noisy, clean):
-            problem = f"noisy is {kinds[0]}, clean {kinds[1]}" if kinds[0] != kinds[1] else "noisy equals clean"
-            expected = "expected a noisy and a clean picture of one scene, shape and dtype"
-            raise ConfigError(f"CameraNoise.fit: pairs[{number}]: {problem}; {expected}")
-        y, x = (max(length - side, 0) // 2 for length in clean.shape[:2])
-        noisy, clean = (array_pixels(picture[y : y + side, x : x + side]) for picture in (noisy, clean))
-        codes: Any = clean * np.float32(255 / np.iinfo(clean.dtype).max)
-        used = ((codes >= DARKEST) & (codes <= BRIGHTEST)).all(axis=2)
-        rows, columns = (np.arange(length) // TILE for length in clean.shape[:2])
-        tiles = rows[:, None] * (columns[-1] + 1) + columns
-        cells = np.where(used, tiles * BANDS + (codes @ TO_YCC[:, 0] / BAND).astype(int), -1)[:, :-1]
-        cells[~used[:, 1:]] = -1  # the neighbour is left out
-        pictures.append(Picture(clean, _noise(noisy, clean), cells, int(tiles.max()) + 1))
-    return pictures
+    side = math.isqrt(PIXELS // len(cut))
+    return [_picture(*pair, side) for pair in cut]
+
+
+def _checked(number: int, noisy: ArrayLike, clean: ArrayLike) -> tuple[Srgb, Srgb]:
+    """Check a pair, and cut it evenly to the size of a single pair, so that its middle stays; ConfigError."""
+    both = array_pixels(noisy), array_pixels(clean)
+    kinds = [f"{picture.dtype} {list(picture.shape)}" for picture in both]
+    if kinds[0] != kinds[1] or np.array_equal(*both):
+        problem = f"noisy is {kinds[0]}, clean {kinds[1]}" if kinds[0] != kinds[1] else "noisy equals clean"
+        expected = "expected a noisy and a clean picture of one scene, shape and dtype"
+        raise ConfigError(f"CameraNoise.fit: pairs[{number}]: {problem}; {expected}")
+    y, x = (max(length - math.isqrt(PIXELS), 0) // 2 for length in both[0].shape[:2])
+    cut_noisy, cut_clean = (picture[y : len(picture) - y, x : picture.shape[1] - x].copy() for picture in both)
+    return cut_noisy, cut_clean
+
+
+def _picture(noisy: Srgb, clean: Srgb, side: int) -> Picture:
+    """Cut a pair to the middle, and find the cell of each pixel."""
+    y, x = (max(length - side, 0) // 2 for length in clean.shape[:2])
+    noisy, clean = (array_pixels(picture[y : y + side, x : x + side]) for picture in (noisy, clean))
+    codes: Any = clean * np.float32(255 / np.iinfo(clean.dtype).max)
+    used = ((codes >= DARKEST) & (codes <= BRIGHTEST)).all(axis=2)
+    rows, columns = (np.arange(length) // TILE for length in clean.shape[:2])
+    tiles = rows[:, None] * (columns[-1] + 1) + columns
+    cells = np.where(used, tiles * BANDS + (codes @ TO_YCC[:, 0] / BAND).astype(int), -1)[:, :-1]
+    cells[~used[:, 1:]] = -1  # the neighbour is left out
+    return Picture(clean, _noise(noisy, clean), cells, int(tiles.max()) + 1)
 
 
 def _noise(noisy: Srgb, clean: Srgb) -> Any:
@@ -306,7 +320,7 @@ def fit_pairs(
         config, (a, b, *squares) = config_of(*choice[:2]), numbers.tolist()
         reduction = dict(zip(NUMBERS[2:], map(math.sqrt, squares), strict=False))
         config = replace(config, noise=replace(config.noise, a=a, b=b))
-        model = make(config, demosaic=choice[2][9:], seed=SEED, **options, **reduction)
+        model = make(config, demosaic=choice[2].removeprefix("demosaic="), seed=SEED, **options, **reduction)
         made = (model(picture.clean, index=index) for index, picture in enumerate(pictures))
         noises = (_noise(noisy, clean) for clean, noisy in made)
         return np.concatenate([picture.sums(noise) for picture, noise in zip(pictures, noises, strict=True)])
@@ -322,7 +336,9 @@ def fit_pairs(
     alike = tuple(" ".join(other.choice) for other in others if other.square < best.square + margin)
     numbers, table = _intervals(problem, pictures, best)
     overrides = (*shared, *(f"noise.{key[0]}={rounded(numbers[key].value)}" for key in NUMBERS[:2]), *best.choice[:2])
-    options |= {"demosaic": best.choice[2][9:]} | {key: rounded(numbers[key].value, 4) for key in list(numbers)[2:]}
+    options |= {"demosaic": best.choice[2].removeprefix("demosaic=")} | {
+        key: rounded(numbers[key].value, 4) for key in list(numbers)[2:]
+    }
     units = f"{len(pictures)} pairs" if len(pictures) >= LEAST_PAIRS else f"{len(problem.sums)} tiles"
     return CameraFit(numbers, best.choice, alike, units, table, overrides, options, make)
 

@@ -20,8 +20,11 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 MAX_PIXELS = 2**26
 
 
-def read_picture_pairs(folder: Path) -> tuple[list[tuple[Srgb, Srgb]], str]:
-    """Read the noisy and clean pictures below a folder, and the digest of their files; ConfigError or MachineError."""
+def read_picture_pairs(folder: Path) -> tuple[Iterator[tuple[Srgb, Srgb]], int, str]:
+    """Find the noisy and clean pictures below a folder: pairs, read one by one, their number, and their files' digest.
+
+    ConfigError or MachineError.
+    """
     if not folder.is_dir():
         raise ConfigError(f"calibrate: {folder}: no such folder; expected a folder of noisy and clean pictures")
     with machine_errors(folder):
@@ -29,8 +32,8 @@ def read_picture_pairs(folder: Path) -> tuple[list[tuple[Srgb, Srgb]], str]:
         if not paths:
             expected = f"expected {TABLE}, or names with {', '.join(f'{a} and {b}' for a, b in NAMES.items())}"
             raise ConfigError(f"calibrate: {folder}: contains no picture as {', '.join(SUFFIXES)}; {expected}")
-        digests = [file_sha256(path) for pair in paths for path in pair]
-        return [(_read(noisy), _read(clean)) for noisy, clean in paths], joined_sha256(digests)
+        sha256 = joined_sha256([file_sha256(path) for pair in paths for path in pair])
+    return ((_read(noisy), _read(clean)) for noisy, clean in paths), len(paths), sha256
 
 
 def _listed(folder: Path) -> Iterator[tuple[Path, Path]]:
@@ -61,6 +64,7 @@ def _named(folder: Path) -> Iterator[tuple[Path, Path]]:
 def _read(path: Path) -> Srgb:
     """Decode a picture; ConfigError if it cannot be used."""
     try:
-        return decode(path.read_bytes(), max_pixels=MAX_PIXELS, icc="ignore", name=str(path)).srgb
+        with machine_errors(path):
+            return decode(path.read_bytes(), max_pixels=MAX_PIXELS, icc="ignore", name=str(path)).srgb
     except SourceError as error:
         raise ConfigError(f"calibrate: {path}: {error.text}; expected a picture of 8 or 16 bits") from error

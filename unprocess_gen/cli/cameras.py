@@ -57,9 +57,9 @@ def _fit(folder: Path, to: Path) -> int:
     from unprocess_gen.camera_fit import fit_json, fit_yaml
     from unprocess_gen.camera_noise import CameraNoise
 
-    pairs, sha256 = read_picture_pairs(folder)
+    pairs, count, sha256 = read_picture_pairs(folder)
     fit = CameraNoise.fit(pairs)
-    source = f"{counted(len(pairs), 'pair')} of pictures, SHA-256 of the list of their SHA-256 {sha256}"
+    source = f"{counted(count, 'pair')} of pictures, SHA-256 of the list of their SHA-256 {sha256}"
     write_profile(to, fit_yaml(fit, to.stem, source), fit_json(fit))
     print_results(fit, f"{to}: use it with {_usage(noise=to)} {fit.settings}; in CameraNoise with {fit.keywords} too")
     return 0
