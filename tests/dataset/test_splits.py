@@ -98,7 +98,7 @@ def test_pairs_of_a_split_are_read_and_an_unknown_one_names_those_there_are(made
         assert [pair.row["split"] for pair in pairs] == [name] * count
     with pytest.raises(ConfigError, match=r"split='vel': no pair is in it; expected one of test, train, val$"):
         ug.RawPairs(made, split="vel")
-    with pytest.raises(ConfigError, match=r"split='val': no pair is in it; there are no splits; generate with split="):
+    with pytest.raises(ConfigError, match=r"split='val': no pair is in it; there are no splits; set split="):
         ug.RawPairs(dataset, split="val")
 
 

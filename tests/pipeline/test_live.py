@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -188,8 +189,42 @@ def test_datasets_are_joined_and_split(make: Make, tmp_path: Path) -> None:
     assert_same(ug.LivePairs([*map(str, folders)], split="test"), ug.RawPairs(folders, split="test"))
     with pytest.raises(ConfigError, match="LivePairs: split='val': no pair is in it"):
         ug.LivePairs(folders, split="val")
-    with pytest.raises(ConfigError, match="expected the folder of a dataset"):
-        ug.LivePairs(["source.limit=2"], split="train")
+
+
+@pytest.mark.parametrize("setting", ["source.patch=null", "source.clips=true", "source.patch=[random,8,2]"])
+def test_split_of_overrides_is_that_of_their_dataset(setting: str, make: Make, tmp_path: Path) -> None:
+    for folder in range(4):
+        photos = fill(tmp_path / f"photos/{folder}", 2, 2 * folder).parent
+        shutil.copy(photos / "0/000.png", photos / f"{folder}/copy.png")
+    overrides = [setting, "split={a: 0.4, 1: 0.6}", "noise.draws=2"]
+    make(photos, tmp_path / "ds", *overrides)
+    for split in ("a", "1"):
+        assert_same(ug.LivePairs(overrides, photos, split=split), ug.RawPairs(tmp_path / "ds", split=split))
+
+
+def test_split_that_overrides_do_not_give_is_refused() -> None:
+    settings = ["source.limit=8", "split={train: 0.5, test: 0.5}"]
+    assert sum(len(ug.LivePairs(settings, split=split)) for split in ("train", "test")) == 8
+    with pytest.raises(ConfigError, match=r"split='val': no pair is in it; expected one of test, train$"):
+        ug.LivePairs(settings, split="val")
+    with pytest.raises(ConfigError, match="split='val': no pair is in it; there are no splits; set split="):
+        ug.LivePairs(settings[:1], split="val")
+
+
+def test_keys_and_columns_select_pairs_with_the_same_noise(night: Path) -> None:
+    live = ug.LivePairs(night, redraw="all", patch=16)
+    part = live[1:].select(patch=1)
+    assert [row["key"] for row in part.rows] == ["00000000-p0001", "00000001-p0001"]
+    for key, number in (("00000000-p0001", 1), ("00000001-p0001", 3)):
+        assert digests(part, (2, key)) == digests(live, (2, key)) == digests(live, (2, number))
+    planned = ug.LivePairs(LEVELS)
+    rows = [planned[number].row for number in range(len(planned))]
+    assert [planned[row["key"]].row for row in rows] == rows
+    for live, key in ((planned, "00000000-p0000"), (ug.LivePairs(night, patch=16, patches=3), "00000000-p0001")):
+        with pytest.raises(KeyError, match=r"names 4 pairs|names 3 patches; expected a number from 3 to 5"):
+            live[key]
+    with pytest.raises(ConfigError, match="gen-dataset manifest"):
+        planned.select(iso=1600)
 
 
 def test_several_patches_of_a_pair_are_consecutive_items(night: Path) -> None:

@@ -51,6 +51,12 @@ class ConfigError(UnprocessGenError):
     exit_code = 2
 
 
+class UnknownKeyError(ConfigError, KeyError):
+    """Key of a pair that a reader does not have, or that several of its pairs have."""
+
+    __str__ = Exception.__str__  # of a KeyError it is a `repr`
+
+
 class DamageError(UnprocessGenError):
     """Damaged dataset: its files differ from its manifest."""
 

@@ -6,8 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator
 
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.simulation.frames import Patch
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.plan import Place
 
 
 def key_text(index: int) -> str:
@@ -15,14 +14,14 @@ def key_text(index: int) -> str:
     return f"{index:08d}"
 
 
-def patch_key(index: int, patch: Patch, several: bool) -> str:
+def patch_key(index: int, patch: int, several: bool) -> str:
     """Key of a sample in its shard: ``00000003``, or ``00000003-p0007`` if images are cut into several patches."""
-    return f"{key_text(index)}-p{patch.patch:04d}" if several else key_text(index)
+    return f"{key_text(index)}-p{patch:04d}" if several else key_text(index)
 
 
-def pair_key(sample: str, plan: Plan, several: bool) -> str:
+def pair_key(sample: str, place: Place, several: bool) -> str:
     """Key of a row: the sample's, with for example ``-l01d02`` for level 1, draw 2 if there are several frames."""
-    return f"{sample}-l{plan.place.level:02d}d{plan.place.draw:02d}" if several else sample
+    return f"{sample}-l{place.level:02d}d{place.draw:02d}" if several else sample
 
 
 def image_key(row: Row) -> str:

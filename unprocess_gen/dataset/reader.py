@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import bisect
-import copy
 import csv
-import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,6 +30,7 @@ from unprocess_gen.dataset.shards import (
     read_index,
     shard_name,
 )
+from unprocess_gen.dataset.table import PairTable, first_of
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
 
@@ -125,14 +123,14 @@ def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
     return in_dn(mosaic, (int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)))
 
 
-class RawPairs:
+class RawPairs(PairTable["_Dataset"]):
     """Read the pairs of a dataset by number: a map-style dataset, for example for PyTorch's DataLoader.
 
-    ``pairs[i]`` is a `Sample`; negative numbers count from the end, and a slice is a `RawPairs` of those pairs. Pairs
-    are in the order of the manifest, without failed sources. Arrays are mapped from the shard. They can be written to;
-    the file does not change.
+    ``pairs[i]`` is a `Sample`; negative numbers count from the end, and a slice is a `RawPairs` of those pairs.
+    ``pairs["00000003"]`` is the pair with this key. Pairs are in the order of the manifest, without failed sources.
+    Arrays are mapped from the shard. They can be written to; the file does not change.
 
-    No file stays open and only the position of each row is kept (8 bytes), so an instance can be pickled, forked and
+    No file stays open and only the position of each row is kept (16 bytes), so an instance can be pickled, forked and
     shared between threads. Needs neither Numba nor OpenCV nor Hydra.
 
     A DataLoader receives rows with NaN instead of None. Its default ``collate_fn`` stacks frames of one size.
@@ -165,6 +163,8 @@ class RawPairs:
         If a manifest, a shard or ``sweep.csv`` is missing or damaged; for shards when a pair is read.
     IndexError
         If a number is out of range.
+    KeyError
+        If no pair has a key, or several have it; also a ConfigError.
 
     Examples
     --------
@@ -182,42 +182,35 @@ class RawPairs:
     def __init__(
         self, path: DatasetPath | Sequence[DatasetPath], *, arrays_only: bool = False, split: str | None = None
     ) -> None:
-        self._datasets = open_datasets("RawPairs", path, split, _Dataset)
+        super().__init__(open_datasets("RawPairs", path, split, _Dataset))
         self.path = any_path(path) if isinstance(path, DatasetPath) else tuple(map(any_path, path))
         self.arrays_only = arrays_only
         if arrays_only and isinstance(self.path, tuple):
             _check_formats(self._datasets)
-        self._starts = [0, *itertools.accumulate(map(len, self._datasets))]
-        self._numbers = range(self._starts[-1])
-
-    @property
-    def dataset(self) -> tuple[str, ...]:
-        """Folder name of each pair's dataset."""
-        return tuple(self._place(number)[0].name for number in self._numbers)
 
     def __len__(self) -> int:
         return len(self._numbers)
 
     def __repr__(self) -> str:
-        path = [*map(str, self.path)] if isinstance(self.path, tuple) else str(self.path)
-        return f"RawPairs({path!r}, length={len(self)})"
+        paths = self.path if isinstance(self.path, tuple) else (self.path,)
+        names = first_of([repr(str(path)) for path in paths])
+        return f"RawPairs({f'[{names}]' if isinstance(self.path, tuple) else names}, length={len(self)})"
 
     def __iter__(self) -> Iterator[Sample]:
         return (self[number] for number in range(len(self)))
 
     @overload
-    def __getitem__(self, number: SupportsIndex) -> Sample: ...
+    def __getitem__(self, number: SupportsIndex | str) -> Sample: ...
 
     @overload
     def __getitem__(self, number: slice) -> RawPairs: ...
 
-    def __getitem__(self, number: SupportsIndex | slice) -> Any:  # two arrays instead of a Sample with arrays_only
+    def __getitem__(self, number: SupportsIndex | str | slice) -> Any:  # arrays instead of a Sample with arrays_only
         if isinstance(number, slice):
-            part = copy.copy(self)
-            part._numbers = self._numbers[number]
-            return part
-        dataset, place = self._place(self._numbers[operator.index(number)])
-        sample = dataset.read(place)
+            return self._part(self._numbers[number])
+        position = self._position(number) if isinstance(number, str) else operator.index(number)
+        dataset, place = self._place(self._numbers[position])
+        sample = self._datasets[dataset].read(place)
         return (*sample[:2], *sample.targets.values()) if self.arrays_only else sample
 
     def __getitems__(self, numbers: Sequence[int]) -> list[Any]:
@@ -227,11 +220,6 @@ class RawPairs:
         if there are any; with ``arrays_only`` tuples of arrays.
         """
         return [self[number] if self.arrays_only else stackable(self[number]) for number in numbers]
-
-    def _place(self, number: int) -> tuple[_Dataset, int]:
-        """Dataset of a pair, and the number of the pair in it."""
-        place = bisect.bisect_right(self._starts, number) - 1
-        return self._datasets[place], number - self._starts[place]
 
 
 class DatasetRows:
@@ -249,6 +237,10 @@ class DatasetRows:
 
     def __len__(self) -> int:
         return len(self._offsets)
+
+    def key(self, number: int) -> str:
+        """Key of a pair."""
+        return str(self.row(number)["key"])
 
     def row(self, number: int) -> dict[str, Value]:
         """Row of a pair."""
@@ -321,11 +313,16 @@ def open_datasets(
     if not isinstance(places, DatasetPath) and len({dataset.name for dataset in datasets}) < len(datasets):
         for dataset in datasets:
             dataset.name = str(dataset.path)
-    names = sorted(set().union(*(dataset.splits for dataset in datasets)) - {""})
-    if split is not None and split not in names:
-        expected = f"expected one of {', '.join(names)}" if names else "there are no splits; generate with split={…}"
-        raise ConfigError(f"{reader}: split={split[:40]!r}: no pair is in it; {expected}")
+    check_split(reader, split, set().union(*(dataset.splits for dataset in datasets)))
     return datasets
+
+
+def check_split(reader: str, split: str | None, splits: set[str]) -> None:
+    """Raise ConfigError if a split is none of those that occur, where ``""`` means no split."""
+    names = sorted(splits - {""})
+    if split is not None and split not in names:
+        expected = f"expected one of {', '.join(names)}" if names else "there are no splits; set split={…}"
+        raise ConfigError(f"{reader}: split={split[:40]!r}: no pair is in it; {expected}")
 
 
 def _check_formats(datasets: Sequence[_Dataset]) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
-import itertools
 import operator
 import os
 import warnings
@@ -11,16 +9,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, SupportsIndex
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Srgb
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.errors import ConfigError, UnknownKeyError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.core.object_store import ObjectPath
@@ -32,22 +31,23 @@ from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.keys import pair_key, patch_key
-from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, open_datasets, stackable
+from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, check_split, open_datasets, stackable
 from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
+from unprocess_gen.dataset.table import PairTable, first_of
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.pairs import PairSettings, levels_of, plan_pixels, targets_of
 from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
-from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
+from unprocess_gen.planning.plan import draw_split, next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import CropMaker, crop_maker
-from unprocess_gen.simulation.plan import Plan, noisy_frames
+from unprocess_gen.simulation.plan import Place, Plan, noisy_frames
 from unprocess_gen.sources.image.decode import Photograph
-from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.loader import identity_sha256, load_source
 from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
 from unprocess_gen.sources.recorded_photographs import RecordedPhotographs
@@ -69,12 +69,13 @@ class LiveSample(Sample):
     """
 
 
-class LivePairs:
+class LivePairs(PairTable["LiveSource"]):
     """Make the pairs of datasets when they are read, with new noise in each epoch: a map-style dataset.
 
     ``live[epoch, i]`` depends only on the dataset, epoch and i, whatever process, worker or order reads it. ``live[i]``
     is epoch 0, which equals ``RawPairs(ds)[i]`` byte for byte. Fixed patterns of a camera body are the same in every
-    epoch. Only the patch is simulated. An instance can be pickled and forked.
+    epoch. Only the patch is simulated. An instance can be pickled and forked. ``live[epoch, "00000003"]`` is the pair
+    with this key, and a slice is a `LivePairs` of those pairs.
 
     Parameters
     ----------
@@ -91,7 +92,7 @@ class LivePairs:
         Folder for decoded pixels, 3 bytes a pixel, which worker processes share; ``"memory"`` for a temporary one. On a
         full disk, other pixels are decoded each time.
     split : str, optional
-        Only pairs of this split, by default all; needs a dataset.
+        Only pairs of this split, by default all. With overrides, photographs are read once to find theirs.
     cache_bytes : int
         Size up to which pixels are added to the cache.
     patch : int, optional
@@ -123,6 +124,8 @@ class LivePairs:
         If a source of a config cannot be used; when a pair is read.
     IndexError
         If an epoch or a number is out of range.
+    KeyError
+        If no pair has a key, or several items have it; also a ConfigError.
 
     Examples
     --------
@@ -163,8 +166,7 @@ class LivePairs:
             expected = "1 or more, and patch with more than 1"
             raise ConfigError(f"LivePairs: patches={patches}: out of range; expected {expected}")
         self._cache = None if cache is None else PixelCache(cache, cache_bytes)
-        self._sources = _live_sources(dataset, None if root is None else os.fspath(root), split)
-        self._ends = [*itertools.accumulate(map(len, self._sources))]
+        super().__init__(_live_sources(dataset, None if root is None else os.fspath(root), split))
         self._redraw, self._patch, self._patches, self._as_float = redraw, patch, patches, as_float
         self._targets, self._arrays_only = tuple(targets), arrays_only
         most = (NEW_CROPS if redraw == "all" else KEPT_CROPS), NEW_CROPS
@@ -173,22 +175,26 @@ class LivePairs:
         self._reads_of_epoch_0 = SharedCount()
 
     def __len__(self) -> int:
-        return (self._ends[-1] if self._ends else 0) * self._patches
+        return len(self._numbers) * self._patches
 
     def __repr__(self) -> str:
-        names = ", ".join(repr(source.name) for source in self._sources)
+        names = first_of([repr(source.name) for source in self._datasets])
         return f"LivePairs({names}, length={len(self)}, redraw={self._redraw!r})"
 
-    def __getitem__(self, item: int | tuple[int, int]) -> Any:  # arrays instead of a LiveSample with arrays_only
-        epoch, number = map(operator.index, item if isinstance(item, tuple) else (0, item))
+    def __getitem__(self, item: Any) -> Any:  # arrays instead of a LiveSample with arrays_only
+        if isinstance(item, slice):
+            return self._part(self._numbers[item])
+        epoch, number = item if isinstance(item, tuple) else (0, item)
+        epoch = operator.index(epoch)
         if not 0 <= epoch < EPOCHS:
             raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
-        number, crop = divmod(range(len(self))[number], self._patches)
-        if not isinstance(item, tuple) and self._redraw != "none":
+        position, crop = divmod(range(len(self))[self._item(number)], self._patches)
+        if not isinstance(item, tuple | str) and self._redraw != "none":
             self._warn_of_repetition()
-        place = bisect.bisect_right(self._ends, number)
-        source = self._sources[place]
-        image = source.image(number - (self._ends[place - 1] if place else 0))
+        number = int(self._numbers[position])
+        place, number_in_dataset = self._place(number)
+        source = self._datasets[place]
+        image = source.image(number_in_dataset)
         epoch = epoch if self._redraw != "none" else 0
         decode = partial(source.decode, image)
         srgb = decode() if self._cache is None else self._cache.get(image.cache_name, decode)
@@ -211,6 +217,21 @@ class LivePairs:
             return first, second, *targets.values()
         row: Any = LiveRow(partial(image.row, plan, epoch, patch, pair))
         return LiveSample(first, second, row, source.name, targets)
+
+    def _item(self, number: SupportsIndex | str) -> int:
+        """Number of the item of a number or key."""
+        if not isinstance(number, str):
+            return operator.index(number)
+        first = self._position(number) * self._patches
+        if self._patches > 1:
+            numbers = f"{first} to {first + self._patches - 1}"
+            raise UnknownKeyError(f"{number!r}: names {self._patches} patches; expected a number from {numbers}")
+        return first
+
+    def _part(self, numbers: NDArray[np.int64]) -> Self:
+        part = super()._part(numbers)
+        part._reads_of_epoch_0 = SharedCount()
+        return part
 
     def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
         """Make a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
@@ -236,7 +257,7 @@ class LivePairs:
         """Find the plan of an epoch, without its number, the patch, and what makes crops of the image."""
         redraws = self._redraw == "all"
         plan_epoch = epoch if redraws or image.plan.dark else 0
-        settings, patch, frame = self._sources[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
+        settings, patch, frame = self._datasets[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
         kept = self._kept[srgb.itemsize > 1 or image.plan.source.dequantize != "off"]
         shape = (self._patch, self._patch) if self._patch else (patch.height, patch.width)
         key = place, image.plan.stream_key, image.plan.place, plan_epoch, shape
@@ -296,16 +317,11 @@ def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[Liv
     places = [dataset] if isinstance(dataset, DatasetPath) else [] if isinstance(dataset, Config) else list(dataset)
     if isinstance(dataset, DatasetPath) or any(_is_dataset(place) for place in places):
         return [*open_datasets("LivePairs", dataset, split, partial(RecordedPairs, root))]
-    if split is not None:
-        raise ConfigError(
-            f"LivePairs: split={split!r}: splits follow from digests of the images; expected the folder of a "
-            "dataset; make one without frames by gen-dataset manifest"
-        )
     if not isinstance(dataset, Config):
         from unprocess_gen.config.composition import load_config
 
         dataset = load_config(dataset)
-    return [PlannedPairs(dataset, root)]
+    return [PlannedPairs(dataset, root, split)]
 
 
 def _is_dataset(place: Any) -> bool:
@@ -400,7 +416,7 @@ class PlannedPairs:
 
     name = ""
 
-    def __init__(self, config: Config, root: str | None) -> None:
+    def __init__(self, config: Config, root: str | None, split: str | None = None) -> None:
         config = config if root is None else replaced(config, {"source.root": root})
         validate_config(config)
         rule = patch_rule(config.source)
@@ -412,6 +428,12 @@ class PlannedPairs:
         run = resolve(config)
         self.settings = run.settings
         self._sources = [source for source in run.sources if source.reason is None]
+        if split is not None:
+            read = map if config.source.place is None else any_path(config.source.place).map
+            digests = read(partial(identity_sha256, config.source), self._sources)
+            splits = [draw_split(config, sha256) for sha256 in digests]
+            check_split("LivePairs", split, {*splits})
+            self._sources = [source for source, name in zip(self._sources, splits, strict=True) if name == split]
         self._patches = 1 if rule is None else rule.count
         self._plans = noisy_frames(config)
         self._planned: Recent[int, tuple[str, int, tuple[Plan, ...], tuple[Patch, ...]]] = Recent(KEPT)
@@ -423,7 +445,7 @@ class PlannedPairs:
     def image(self, number: int) -> LiveImage:
         """Plan a pair; raise as `load_source`."""
         index, rest = divmod(number, self._patches * self._plans)
-        source, config = self._sources[index], self.settings.config
+        source = self._sources[index]
         planned = self._planned.get(index)
         if planned is None:
             sha256, photograph = self._load(source)
@@ -431,10 +453,24 @@ class PlannedPairs:
             planned = self._planned.keep(index, (sha256, photograph.orientation, image.plans, image.patches))
         sha256, orientation, plans, patches = planned
         patch, plan = patches[rest // self._plans], plans[rest % self._plans]
-        sample = patch_key(source.index, patch, several=config.source.patch is not None)
-        key = pair_key(sample, plan, several=self._plans > 1)
         shard = source.index // self.settings.config.output.pairs_per_shard
-        return LiveImage(source, sha256, orientation, shard, key, plan, patch)
+        return LiveImage(source, sha256, orientation, shard, self.key(number), plan, patch)
+
+    def key(self, number: int) -> str:
+        """Key of a pair, without planning it."""
+        index, rest = divmod(number, self._patches * self._plans)
+        patch, plan = divmod(rest, self._plans)
+        config = self.settings.config
+        sample = patch_key(self._sources[index].index, patch, several=config.source.patch is not None)
+        level, draw = divmod(plan, config.noise.draws)
+        return pair_key(sample, Place(level=level, draw=draw), several=self._plans > 1)
+
+    def row(self, number: int) -> dict[str, Value]:
+        """Raise ConfigError: the rows of a table need every photograph."""
+        raise ConfigError(
+            "LivePairs: overrides give no table of rows, because each needs a decoded photograph; expected a dataset; "
+            "make one without frames: gen-dataset manifest OVERRIDES out=FOLDER"
+        )
 
     def decode(self, image: LiveImage) -> Srgb:
         """Decode the image of a pair; raise as `load_source`."""

@@ -115,10 +115,10 @@ def make_image(
     identity = source, sha256, photograph.orientation, shard
     rows = list[Row]()
     for patch in image.patches:
-        key, sample = patch_key(source.index, patch, several=config.source.patch is not None), list[Row]()
+        key, sample = patch_key(source.index, patch.patch, several=config.source.patch is not None), list[Row]()
         pairs = image.pairs_of(patch) if config.output.frames else itertools.repeat(None)
         for plan in image.plans:
-            row_key = pair_key(key, plan, several=len(image.plans) > 1)
+            row_key = pair_key(key, plan.place, several=len(image.plans) > 1)
             with timed("simulate_s"):
                 pair = next(pairs)
             if pair is None:

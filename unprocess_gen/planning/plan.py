@@ -125,9 +125,15 @@ def plan_levels(
 ) -> Iterator[tuple[Plan, Selection | None]]:
     """Yield the plan of one image at each noise level, and the selection of effects of a physical profile."""
     planner, key = _planner(config), stream_key(config.seed, source_sha256, occurrence)
-    split = planner.draw_split(config.seed, source_sha256)
-    image = planner.image(config.seed, key, split, facts, dark_frames)
+    image = planner.image(config.seed, key, draw_split(config, source_sha256), facts, dark_frames)
     return (planner.plan(image, Place(level=number)) for number in range(len(planner.levels)))
+
+
+def draw_split(config: Config, source_sha256: str) -> str:
+    """Name the split of an image, empty without splits; the last one takes what the others leave."""
+    splits: dict[str, float] = config.split or {"": 1.0}
+    names, ends = list(splits), list(itertools.accumulate(splits.values()))
+    return names[bisect.bisect_right(ends[:-1], split_uniform(config.seed, source_sha256))]
 
 
 def _planner(config: Config) -> Planner:
@@ -167,7 +173,6 @@ class Planner:
         isp, gains, sensor = config.isp, config.gains, config.sensor
         gamma = "srgb" if isp.gamma == "srgb" else float(isp.gamma)
         self._isp = IspPlan(isp.tone, gamma, gains.highlight, gains.threshold)
-        self._splits: dict[str, float] = config.split or {}
         levels_dn, saturated_as = (sensor.black_level_dn, sensor.white_level_dn), interpretation.saturated_as(config)
         self._sensor = SensorPlan(sensor.pattern, sensor.bits, *levels_dn, sensor.clip, saturated_as)
         clean_dtype = FLOAT32 if interpretation.has_float_clean(config) else ""
@@ -217,13 +222,6 @@ class Planner:
             isp=image.isp, source=image.source, sensor=self._sensor, scene=image.scene, noise=noise,
             accuracy=self._accuracy, physics=physics, dark=dark, output=self._output,
         ), selection  # fmt: skip
-
-    def draw_split(self, seed: int, source_sha256: str) -> str:
-        """Name the split of an image, empty without splits; the last one takes what the others leave."""
-        if not self._splits:
-            return ""
-        names, ends = list(self._splits), list(itertools.accumulate(self._splits.values()))
-        return names[bisect.bisect_right(ends[:-1], split_uniform(seed, source_sha256))]
 
 
 def without_filters(camera: CameraPlan) -> CameraPlan:

@@ -53,6 +53,17 @@ def load_source(
     return digest, photograph
 
 
+def identity_sha256(config: SourceConfig, source: Source) -> str:
+    """Digest that keys the random streams of a source, read from its file unless the listing has it.
+
+    Errors are those of `load_source`; the pixels of a photograph are not decoded.
+    """
+    known = source.clip_sha256 or source.sha256
+    if known is None and config.place is not None:
+        return hashlib.sha256(read_bytes(config.place, source)).hexdigest()
+    return known or load_source(config, source)[0]
+
+
 def _check_size(config: SourceConfig, srgb: Srgb, layout: str, digest: str) -> None:
     """Raise FilteredError below ``source.min_side``, SourceError if no square, patch or tile fits."""
     decoded = height, width = srgb.shape[:2]

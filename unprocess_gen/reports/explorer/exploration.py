@@ -133,7 +133,7 @@ class Exploration:
         image = plan_pixels(settings, photograph, source, sha256)
         is_cut, several = config.source.patch is not None, len(image.plans) > 1
         parts = {
-            pair_key(patch_key(source.index, patch, is_cut), plan, several): (patch, plan)
+            pair_key(patch_key(source.index, patch.patch, is_cut), plan.place, several): (patch, plan)
             for patch in image.patches
             for plan in image.plans
         }
