@@ -34,6 +34,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from unprocess_gen.config.composition_errors import explain
+from unprocess_gen.config.limits import OVERRIDDEN
 from unprocess_gen.config.option_files import (
     ADDED_GROUPS,
     OPTIONAL_GROUPS,
@@ -42,8 +43,9 @@ from unprocess_gen.config.option_files import (
     group_options,
 )
 from unprocess_gen.config.raw_validation import check_raw_overrides
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import CHOSEN, TWO_NUMBERS, Config, NoiseConfig
 from unprocess_gen.config.serialization import writable_node
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
@@ -65,6 +67,9 @@ PATH_KEYS = ("source.root", "source.list", "noise.dark_frames", "out")
 
 SHORTHANDS = {"source.kind=raw": "source=raw", "source.kind=srgb": "source=default"}
 """Overrides that choose an option, because patterns and sensor follow from the kind of the source."""
+
+NO_NUMBERS = ("name", "negative_variance", "assumed", "unsourced", "provenance")
+"""Keys of a noise profile that are no numbers; those of the section `CHOSEN` are none either."""
 
 MAX_JOBS = 100_000
 """Most jobs of one sweep: each takes 0.2 s to compose, so a larger number is a mistake."""
@@ -164,7 +169,7 @@ def compose_jobs(overrides: Sequence[str], folders: OptionFolders, multirun: boo
     is_sweep, params = _sweep_settings(node)
     if not (multirun or is_sweep):
         _refuse_values(choices, params)
-        yield Composition(node, tuple(overrides))
+        yield Composition(_marked(node, overrides, folders), tuple(overrides))
         return
     given = {choice.name for choice in choices}
     choices += [choice for choice in _parse(list(params.values()), folders) if choice.name not in given]
@@ -178,6 +183,7 @@ def compose_jobs(overrides: Sequence[str], folders: OptionFolders, multirun: boo
             if hidden := _sweep_settings(node)[1].keys() - params.keys():
                 problem = "found in an option that the sweep itself selects; expected it in one that all jobs have"
                 raise ConfigError(f"hydra.sweeper.params.{min(hidden)}: {problem}")
+            node = _marked(node, job, folders)
         yield Composition(node, job, swept)
 
 
@@ -281,6 +287,29 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
             return hydra.compose(name, given, return_hydra_config=True)
         except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
             raise ConfigError(explain(error, overrides)) from error
+
+
+def _marked(node: DictConfig, overrides: Sequence[str], folders: OptionFolders) -> DictConfig:
+    """Append ``*`` to the name of a noise profile if settings replace a number that its option file states."""
+    option = node.hydra.runtime.choices.get("noise")
+    if option is None or not (folders.name or any(text.startswith(("noise.", "+")) for text in overrides)):
+        return node
+    with _hydra_in(folders.main.absolute()):
+        search = [] if folders.own is None else [f"hydra.searchpath=[{quoted(f'file://{folders.own.absolute()}')}]"]
+        stated = hydra.compose(None, [f"+noise={option}", *search]).noise
+    profile: Any = OmegaConf.to_container(OmegaConf.merge(writable_node(NoiseConfig), stated))
+    used: Any = OmegaConf.to_container(node.noise)
+    if used["name"] == profile["name"] and any(used[key] != profile[key] for key in _stated_keys(profile)):
+        node.noise.name += OVERRIDDEN
+    return node
+
+
+def _stated_keys(profile: Mapping[str, Any]) -> list[str]:
+    """Keys of the numbers of a profile, without those that it leaves to the user (a, b) or takes from the sensor."""
+    sections = {key: setting.section for key, setting in settings_of(NoiseConfig).items()}
+    left = {key for key, value in profile.items() if value is None and sections[key] == TWO_NUMBERS}
+    taken = {key for key, value in profile.items() if isinstance(value, str) and value.startswith("${")}
+    return [key for key in profile if sections[key] != CHOSEN and key not in {*NO_NUMBERS, *left, *taken}]
 
 
 def typed_config(node: DictConfig, overrides: Sequence[str]) -> Config:

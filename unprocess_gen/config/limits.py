@@ -81,6 +81,15 @@ NAME = Limit(
 )
 """Names that rows of a manifest contain."""
 
+OVERRIDDEN = "*"
+"""End of the name of a noise profile of which a number is overridden."""
+
+PROFILE_NAME = Limit(
+    f"{NAME}, and {OVERRIDDEN} at the end if a number of the profile is overridden",
+    lambda value: NAME.allows(value.removesuffix(OVERRIDDEN)),
+    NAME.shown,
+)
+
 BODY_GROUPS = Limit("a list of camera, sensor, noise", lambda value: set(value) <= {"camera", "sensor", "noise"})
 
 OUTPUT_PLACE = Limit(

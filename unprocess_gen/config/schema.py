@@ -384,7 +384,7 @@ class NoiseConfig(EffectGroup):
     Attributes
     ----------
     name
-        name of the profile, recorded in each row
+        name of the profile, recorded in each row; it ends with * if a number of the profile is overridden
     units
         units of a and b: dn, or normalized (0 at black, 1 at white)
     black
@@ -429,7 +429,7 @@ class NoiseConfig(EffectGroup):
     """
 
     # fmt: off
-    name: str = key("none", limits.NAME, PROFILE)
+    name: str = key("none", limits.PROFILE_NAME, PROFILE)
     units: Optional[str] = key(None, Choice("dn", "normalized"), PROFILE)
     black: Optional[str] = key(None, Choice("subtracted", "included"), PROFILE)
     bits: Optional[int] = key(None, Integers(1, 32), PROFILE, null="with units=normalized")

@@ -40,7 +40,7 @@ from unprocess_gen.pipeline.deaths import DEATHS
 from unprocess_gen.pipeline.folder import WORK, OutFolder
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.tasks import ShardTask
-from unprocess_gen.planning.advice import body_sentence, dark_scene_warning, sensor_warning
+from unprocess_gen.planning.advice import body_sentence, warnings
 from unprocess_gen.sources.listing import Listing, list_photographs
 from unprocess_gen.sources.recorded import RecordedSources, recorded_text
 
@@ -104,9 +104,8 @@ class Run:
 
     def warnings(self) -> tuple[str, ...]:
         """Sentences that the user should read before the run begins."""
-        checks = body_sentence, dark_scene_warning, sensor_warning
-        warnings = *self.listing.warnings, *(check(self.config) for check in checks)
-        return tuple(dict.fromkeys(filter(None, warnings)))
+        sentences = *self.listing.warnings, body_sentence(self.config), *warnings(self.config)
+        return tuple(dict.fromkeys(filter(None, sentences)))
 
     @cached_property
     def listing_text(self) -> bytes:

@@ -1,4 +1,4 @@
-"""Warn about settings that are rarely meant: missing options of a body, noise that ignores the scene, other levels."""
+"""Warn about settings that are rarely meant, or that have no effect: a run and ``plan`` show the same sentences."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 from unprocess_gen.config.defaults import default_options, default_values
 from unprocess_gen.config.distributions import highest, lowest
 from unprocess_gen.config.interpretation import is_physical
-from unprocess_gen.config.limits import EXPOSURE_RATIO, ISO
+from unprocess_gen.config.limits import EXPOSURE_RATIO, ISO, OVERRIDDEN
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import value_range
 from unprocess_gen.config.yaml_files import read_yaml_mapping
+from unprocess_gen.core.fields import value_text
 
 LEVEL_NAMES = ("bits", "black_level_dn", "white_level_dn")
 
@@ -21,6 +22,12 @@ MOST_CLIPPED_LOW = 0.01
 
 NOUNS = {"camera": "colour matrix", "sensor": "set of raw levels", "noise": "noise profile"}
 """What the options of a body's groups contain."""
+
+
+def warnings(config: Config) -> list[str]:
+    """Return the sentences about a config that its user should read before a run."""
+    checks = dark_scene_warning, ignored_scene_warning, overridden_warning, sensor_warning, bits_warning
+    return [sentence for check in checks if (sentence := check(config))]
 
 
 def dark_scene_warning(config: Config) -> str:
@@ -35,6 +42,37 @@ def dark_scene_warning(config: Config) -> str:
     return (
         f"scene={config.scene.name}: light is divided by {ratios}, but noise={config.noise.name} ignores ISO {isos}; "
         f"physical profiles follow the scene: {', '.join(physical_profiles())}"
+    )
+
+
+def ignored_scene_warning(config: Config) -> str:
+    """Return a warning if a scene is described that a two-parameter profile ignores; else an empty text."""
+    default, scene = default_values("scene"), config.scene
+    given = {key: getattr(scene, key) for key in ("iso", "exposure_s", "temperature_c")}
+    changed = [f"scene.{key}={value_text(value)}" for key, value in given.items() if value != default[key]]
+    if is_physical(config.noise) or not changed or dark_scene_warning(config):
+        return ""
+    return (
+        f"{', '.join(changed)}: no effect on noise={config.noise.name}, which holds for one ISO; "
+        f"physical profiles follow the scene: {', '.join(physical_profiles())}"
+    )
+
+
+def overridden_warning(config: Config) -> str:
+    """Return a sentence if a number of the noise profile is overridden; else an empty text."""
+    profile, mark, _ = config.noise.name.partition(OVERRIDDEN)
+    sentence = f"noise={profile}: settings replace numbers of the profile; the column noise has {profile}{OVERRIDDEN}"
+    return sentence if mark else ""
+
+
+def bits_warning(config: Config) -> str:
+    """Return a warning if the white level of a sensor needs fewer bits than it has; else an empty text."""
+    sensor, needed = config.sensor, config.sensor.white_level_dn.bit_length()
+    if sensor.levels == "source" or needed == sensor.bits:
+        return ""
+    return (
+        f"sensor.bits={sensor.bits}: white_level_dn={sensor.white_level_dn} needs {needed} bits, so noisy values reach "
+        f"{2**sensor.bits - 1} DN; sensor.bits={needed} clips them at {2**needed - 1}"
     )
 
 
@@ -54,10 +92,11 @@ def sensor_warning(config: Config) -> str:
     default = {key: default_values("sensor")[key] for key in LEVEL_NAMES}
     if not is_physical(config.noise) or chosen != default or calibrated == default:
         return ""
+    name = config.noise.name.removesuffix(OVERRIDDEN)
     return (
-        f"noise={config.noise.name} was calibrated with {_levels_text(calibrated)}, but is simulated with "
+        f"noise={name} was calibrated with {_levels_text(calibrated)}, but is simulated with "
         f"{_levels_text(chosen)} of the default sensor={default_options()['sensor']}; "
-        f"{' '.join(fitting_sensor(calibrated, config.noise.name))} gives the calibrated levels"
+        f"{' '.join(fitting_sensor(calibrated, name))} gives the calibrated levels"
     )
 
 

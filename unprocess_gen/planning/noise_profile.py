@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
-from unprocess_gen.config.limits import EXPOSURE_S, ISO, TEMPERATURE_C
+from unprocess_gen.config.limits import EXPOSURE_S, ISO, OVERRIDDEN, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile
@@ -77,7 +77,9 @@ class PhysicalNoise:
 
         DN of the profile become DN of the sensor by the factor s = (W - B) / (W_profile - B_profile).
         """
-        noise, iso, key = self.noise, drawn.iso, body_key(drawn.seed, self.noise.name, drawn.unit)
+        noise, iso = self.noise, drawn.iso
+        # fixed patterns stay the same if a number is overridden
+        key = body_key(drawn.seed, noise.name.removesuffix(OVERRIDDEN), drawn.unit)
         number = next(n for n, branch in enumerate(noise.branches) if branch.iso[0] <= iso <= branch.iso[1])
         scatter = None if noise.scatter == "off" else _scatter_of_body(key)
         heat = _doublings(drawn.temperature_c, noise.dark_reference_c, noise.dark_doubling_c)

@@ -11,7 +11,7 @@ from unprocess_gen.config import interpretation
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import value_range
 from unprocess_gen.core.fields import value_text
-from unprocess_gen.planning.advice import body_sentence, dark_scene_warning, sensor_warning
+from unprocess_gen.planning.advice import body_sentence, warnings
 from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
 from unprocess_gen.reports.estimate import PlanAndPredictions, RunEstimate, SourceEstimate
 from unprocess_gen.reports.formatting import byte_size, counted
@@ -127,7 +127,7 @@ def noise_lines(
         *_labelled("dark", [_dark_frames_sentence(config, dark_frames) if dark_frames else ""]),
         *_labelled("numbers", _number_sources(config, plans) if with_numbers else []),
         *_labelled("source", [_source_noise_sentence(config, noise_ratios)]),
-        *_labelled("warning", [dark_scene_warning(config), _rounding_warning(plans), sensor_warning(config)]),
+        *_labelled("warning", [*warnings(config), _rounding_warning(plans)]),
         *_labelled("effects", [] if is_physical else [", ".join(noise.effects)]),
         *_labelled("skipped", [] if is_physical else noise.skipped),
         *(_effect_table(config, [predictions for _, predictions in levels]) if is_physical else []),

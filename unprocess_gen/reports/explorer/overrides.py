@@ -9,6 +9,7 @@ from typing import Any
 
 from unprocess_gen.config.composition import compose_node, load_config, quoted, typed_config
 from unprocess_gen.config.defaults import default_options
+from unprocess_gen.config.limits import OVERRIDDEN
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import recorded
@@ -24,11 +25,14 @@ NAMED_GROUPS = ("camera", "noise", "scene")
 
 def overrides_of(config: Config) -> dict[str, str]:
     """Overrides by key that compose the config of a dataset again, without the place of its sources, or ConfigError."""
-    names, wanted = {group: getattr(config, group).name for group in NAMED_GROUPS}, _deciding_values(config)
+    names = {group: getattr(config, group).name.removesuffix(OVERRIDDEN) for group in NAMED_GROUPS}
+    wanted = _deciding_values(config)
     given = {group: name for group, name in names.items() if (conf_dir() / group / f"{name}.yaml").is_file()}
     options = [f"{key}={text}" for key, text in given.items()]
     base = _deciding_values(typed_config(compose_node(options), options))
     given |= {key: override_text(value) for key, value in wanted.items() if value != base[key]}
+    if names["noise"] == base["noise.name"]:  # composing appends the mark of an overridden number
+        given.pop("noise.name", None)
     given = {key: text for key, text in given.items() if default_options().get(key) != text}
     composed = _deciding_values(load_config([f"{key}={text}" for key, text in given.items()]))
     if left := [key for key, value in wanted.items() if value != composed[key]]:
