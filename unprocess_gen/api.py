@@ -87,6 +87,11 @@ class RawPair:
     def __repr__(self) -> str:
         return f"RawPair({self.clean.dtype} {list(self.clean.shape)}, noise={self.plan.noise.noise})"
 
+    def _repr_html_(self) -> str:
+        from unprocess_gen.dataset.notebook import pair_html  # imports Pillow
+
+        return pair_html(mosaic_dn(self.clean, self.row), mosaic_dn(self.noisy, self.row), self.row)
+
 
 def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key: str | int | None = None) -> Plan:
     """Draw all parameters of one image.

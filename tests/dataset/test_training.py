@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,12 @@ def test_light_keeps_noise_below_black() -> None:
 
     assert light.dtype == np.float32
     assert light.tolist() == pytest.approx([-240 / 3855, 0, 1, 3960 / 3855], rel=1e-6)
+
+
+@pytest.mark.parametrize("row", [{}, {"black_level_dn": 0}, {"black_level_dn": 0, "white_level_dn": None}])
+def test_row_without_levels_is_refused_in_a_sentence(row: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="is missing from the row; expected the row of a pair"):
+        ug.to_light([1, 2], row)
 
 
 def test_noise_map_is_zero_where_a_fitted_variance_is_negative() -> None:

@@ -68,7 +68,7 @@ ONLY_IN = {
         *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
         *("reports.explorer.views", "reports.panels", "picture_isp", "picture_mean"),
     },
-    "PIL": {"reports.pictures", "sources.image.decode", "sources.image.headers"},
+    "PIL": {"dataset.notebook", "reports.pictures", "sources.image.decode", "sources.image.headers"},
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng", "sources.raw.tags"},
     "rawpy": {"sources.raw.decode"},

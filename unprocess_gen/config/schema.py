@@ -636,6 +636,11 @@ class Config(Group):
             shares = {str(name): float(share) if is_number(share) else share for name, share in self.split.items()}
             object.__setattr__(self, "split", FrozenMapping(shares))
 
+    def __repr__(self) -> str:
+        names = {name: getattr(self, name).name for name in ("body", "camera", "noise", "scene")}
+        settings = names | {"seed": self.seed, "source.root": self.source.root, "out": self.out}
+        return f"Config({', '.join(f'{name}={value}' for name, value in settings.items() if value is not None)})"
+
 
 GROUPS = groups_in(Config)
 """Dataclass of each config group, in the order of the config."""

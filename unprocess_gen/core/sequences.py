@@ -15,6 +15,11 @@ def evenly_spaced(items: Sequence[_Item], count: int) -> list[_Item]:
     return [items[i * len(items) // count] for i in range(count)]
 
 
+def first_of(items: Sequence[str], most: int = 5) -> str:
+    """Text that names the first items."""
+    return ", ".join(items[:most]) + ", …" * (len(items) > most)
+
+
 class Recent(dict[_Key, _Item]):
     """Keep values by key, up to the sum ``most`` of their sizes; copies and pickles, for other processes, are empty."""
 

@@ -47,6 +47,10 @@ class Clip(_Frames):
         clip.targets = {name: np.stack([frame.targets[name] for frame in frames]) for name in frames[0].targets}
         return clip
 
+    def __repr__(self) -> str:
+        name, frames = self.rows[0]["clip"], self.noisy
+        return f"Clip({frames.dtype} {list(frames.shape)}, clip={name}, dataset={self.dataset!r})"
+
 
 class RawClips:
     """Read the clips of a dataset by number: a map-style dataset.

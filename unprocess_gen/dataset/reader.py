@@ -13,12 +13,12 @@ from typing import Any, NamedTuple, Self, SupportsIndex, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import FLOAT32, PACKED, UINT16, Float, Frame
+from unprocess_gen.core.arrays import PACKED, Float, Frame
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
-from unprocess_gen.core.sequences import Recent
+from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
@@ -30,7 +30,7 @@ from unprocess_gen.dataset.shards import (
     read_index,
     shard_name,
 )
-from unprocess_gen.dataset.table import PairTable, first_of
+from unprocess_gen.dataset.table import PairTable
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
 
@@ -85,6 +85,15 @@ class Sample(_Frames):
         sample.dataset, sample.targets = dataset, dict(targets)
         return sample
 
+    def __repr__(self) -> str:
+        name, frame = type(self).__name__, self.noisy
+        return f"{name}({frame.dtype} {list(frame.shape)}, key={self.row.get('key')}, dataset={self.dataset!r})"
+
+    def _repr_html_(self, side: int | None = None) -> str:
+        from unprocess_gen.dataset.notebook import pair_html  # imports OpenCV
+
+        return pair_html(mosaic_dn(self.clean, self.row), mosaic_dn(self.noisy, self.row), self.row, side)
+
 
 class _FramesAndTargets(NamedTuple):
     clean: Frame
@@ -117,13 +126,12 @@ def row_of_batch(row: Row) -> Row:
 def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
     """Mosaic [H, W] of a frame in DN: uint16 values unchanged, float32 values scaled from 0 at black and 1 at white."""
     mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
-    is_float_clean = row.get("clean_dtype") == FLOAT32 and mosaic.dtype == np.float32
-    if row["dtype"] == UINT16 and not is_float_clean:
+    if mosaic.dtype == np.uint16:
         return mosaic
     return in_dn(mosaic, (int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)))
 
 
-class RawPairs(PairTable["_Dataset"]):
+class RawPairs(PairTable):
     """Read the pairs of a dataset by number: a map-style dataset, for example for PyTorch's DataLoader.
 
     ``pairs[i]`` is a `Sample`; negative numbers count from the end, and a slice is a `RawPairs` of those pairs.

@@ -6,43 +6,29 @@ import bisect
 import copy
 import itertools
 import re
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Generic, Protocol, Self, TypeVar, overload
+from collections.abc import Callable, Sequence
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, UnknownKeyError
+from unprocess_gen.core.sequences import evenly_spaced, first_of
 from unprocess_gen.core.suggestions import did_you_mean
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.row import COLUMN_NAMES, KEY_TEXT
 
-SHOWN = 5
-"""Keys and values that an error names, and datasets that a reader's `repr` names."""
+MANY = 64
+"""Keys of which an error names some; rows that the HTML of a reader is made from."""
 
 
-class KeyedRows(Protocol):
-    """Pairs of one dataset, in the order of their keys; ``name`` is that of the dataset."""
+class PairTable:
+    """Pairs of datasets, one dataset after the other, or some of the pairs.
 
-    name: str
+    A dataset has a name, a length, and ``key`` and ``row`` for the number of a pair; it is in the order of the keys.
+    """
 
-    def __len__(self) -> int: ...
-
-    def key(self, number: int) -> str:
-        """Key of a pair."""
-
-    def row(self, number: int) -> dict[str, Value]:
-        """Row of a pair."""
-
-
-_Dataset = TypeVar("_Dataset", bound=KeyedRows)
-
-
-class PairTable(Generic[_Dataset]):
-    """Pairs of datasets, one dataset after the other, or some of the pairs."""
-
-    def __init__(self, datasets: Sequence[_Dataset]) -> None:
+    def __init__(self, datasets: Sequence[Any]) -> None:
         self._datasets = datasets
         self._starts = [0, *itertools.accumulate(map(len, datasets))]
         self._numbers: NDArray[np.int64] = np.arange(self._starts[-1])
@@ -92,27 +78,42 @@ class PairTable(Generic[_Dataset]):
         RawPairs('ds', length=2)
         """
         known = (*COLUMN_NAMES, "dataset")
-        for name in columns:
-            if name not in known:
-                hint = did_you_mean(name, known)
-                raise ConfigError(f"select: {name}: no such column; expected one of the manifest, or dataset{hint}")
-        wanted = {name: _values(value) for name, value in columns.items()}
-        positions, missed, others = list[int](), Counter[str](), defaultdict[str, set[Value]](set)
-        for position, row in enumerate(self.rows):
-            misses = [name for name, values in wanted.items() if row[name] not in values]
-            for name in misses:
-                missed[name] += 1
-                if len(others[name]) <= SHOWN:
-                    others[name].add(row[name])
-            if not misses and (test is None or test(row)):
-                positions.append(position)
+        for name in columns.keys() - {*known}:
+            hint = did_you_mean(name, known)
+            raise ConfigError(f"select: {name}: no such column; expected one of the manifest, or dataset{hint}")
+        wanted = {
+            name: [value] if isinstance(value, str) or not np.iterable(value) else [*value]
+            for name, value in columns.items()
+        }
+        positions = [
+            position
+            for position, row in enumerate(self.rows)
+            if all(row[name] in values for name, values in wanted.items()) and (test is None or test(row))
+        ]
         if not positions:
             given = ", ".join(f"{name}={value!r:.60}" for name, value in columns.items())
-            never = [name for name in columns if missed[name] == len(self._numbers)]
-            occur = "; ".join(f"{name}={first_of(sorted(map(repr, others[name]), key=len))}" for name in never)
-            expected = occur or "values that occur together" if columns else "a test that is true for a row"
-            raise ConfigError(f"select: {given}: no pair of {len(self._numbers)} is selected; expected {expected}")
+            known_values = {name: {row[name] for row in self.rows} for name in columns}
+            never = {name: values for name, values in known_values.items() if values.isdisjoint(wanted[name])}
+            expected = "; ".join(
+                f"{name}={first_of(sorted(map(repr, values), key=len))}" for name, values in never.items()
+            )
+            raise ConfigError(f"select: {given}: no pair is selected; expected {expected or 'what occurs together'}")
         return self._part(self._numbers[positions])
+
+    def _repr_html_(self) -> str:
+        from unprocess_gen.dataset.notebook import SIDE_PX, pairs_html  # imports OpenCV
+
+        pairs = [self._example(number) for number in range(min(3, len(self._numbers)))]
+        try:
+            rows = evenly_spaced(self.rows, MANY)
+        except ConfigError:  # pairs of overrides have no table
+            rows = []
+        shown = [pair._repr_html_(SIDE_PX // 2) for pair in pairs if hasattr(pair, "_repr_html_")]
+        return pairs_html(repr(self), rows, shown)
+
+    def _example(self, number: int) -> Any:
+        """Pair that the HTML shows."""
+        return self[number]  # type: ignore[index]
 
     def _part(self, numbers: NDArray[np.int64]) -> Self:
         """Reader of some of the pairs."""
@@ -125,12 +126,6 @@ class PairTable(Generic[_Dataset]):
         place = bisect.bisect_right(self._starts, number) - 1
         return place, int(number) - self._starts[place]
 
-    def _key(self, number: int) -> str:
-        """Key of a pair, with the name of its dataset if there are several."""
-        place, number = self._place(number)
-        dataset = self._datasets[place]
-        return dataset.key(number) + f" of {dataset.name}" * (len(self._datasets) > 1)
-
     def _position(self, key: str) -> int:
         """Position of the pair with a key; UnknownKeyError if no pair has it, or several have it."""
         starts = zip(self._starts, self._datasets, strict=False)
@@ -138,32 +133,26 @@ class PairTable(Generic[_Dataset]):
         positions = np.flatnonzero(np.isin(self._numbers, numbers))
         if len(positions) == 1:
             return int(positions[0])
-        shown = self._numbers[positions[: SHOWN + 1]] if len(positions) else self._numbers[[0, -1]]
-        keys = [self._key(number) for number in shown]
-        if len(positions):
-            raise UnknownKeyError(
-                f"{key!r}: names {len(positions)} pairs ({first_of(keys)}); expected one; give its complete key, after "
-                "select(dataset=…) if several datasets have it"
-            )
-        raise UnknownKeyError(f"{key[:40]!r}: no pair has this key; expected one from {keys[0]} to {keys[-1]}")
+        shown = positions[:MANY] if len(positions) else [0, -1]
+        keys = [self._datasets[place].key(number) for place, number in map(self._place, self._numbers[shown])]
+        if not len(positions):
+            raise UnknownKeyError(f"{key!r:.40}: no pair has this key; expected one from {keys[0]} to {keys[1]}")
+        raise UnknownKeyError(
+            f"{key!r}: names {len(positions)} pairs ({first_of(keys)}); expected one; give its complete key, after "
+            "select(dataset=…) if several datasets have it"
+        )
 
 
 class Rows(Sequence[dict[str, Value]]):
     """Rows of the pairs of a reader, read when they are used."""
 
-    def __init__(self, pairs: PairTable[Any]) -> None:
+    def __init__(self, pairs: PairTable) -> None:
         self._pairs = pairs
 
     def __len__(self) -> int:
         return len(self._pairs._numbers)
 
-    @overload
-    def __getitem__(self, number: int) -> dict[str, Value]: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[dict[str, Value]]: ...
-
-    def __getitem__(self, number: int | slice) -> Any:
+    def __getitem__(self, number: Any) -> Any:
         if isinstance(number, slice):
             return [self[position] for position in range(len(self))[number]]
         place, number = self._pairs._place(self._pairs._numbers[number])
@@ -174,27 +163,17 @@ class Rows(Sequence[dict[str, Value]]):
         return f"Rows({self._pairs!r})"
 
 
-def first_of(items: Sequence[str]) -> str:
-    """Text that names the first items of many."""
-    return ", ".join(items[:SHOWN]) + ", …" * (len(items) > SHOWN)
-
-
-def _values(value: Any) -> list[Any]:
-    return [*value] if isinstance(value, Iterable) and not isinstance(value, str) else [value]
-
-
-def _numbers_of(dataset: KeyedRows, key: str) -> Sequence[int]:
+def _numbers_of(dataset: Any, key: str) -> Sequence[int]:
     """Numbers of the pairs of a dataset that have a key, or whose keys begin with it, by bisection."""
     if not KEY_TEXT.allows(key):
         return ()
-    wanted = _numbers_in(key)
-
-    def beginning(number: int) -> list[int]:
-        return _numbers_in(dataset.key(number))[: len(wanted)]
-
-    every = range(len(dataset))
-    first, end = (bisect_at(every, wanted, key=beginning) for bisect_at in (bisect.bisect_left, bisect.bisect_right))
-    return every[first:end] if first < end and f"{dataset.key(first)}-".startswith(f"{key}-") else ()
+    wanted, every = _numbers_in(key), range(len(dataset))
+    ends = (
+        bisect_at(every, wanted, key=lambda number: _numbers_in(dataset.key(number))[: len(wanted)])
+        for bisect_at in (bisect.bisect_left, bisect.bisect_right)
+    )
+    pairs = every[slice(*ends)]
+    return pairs if pairs and f"{dataset.key(pairs[0])}-".startswith(f"{key}-") else ()
 
 
 def _numbers_in(key: str) -> list[int]:

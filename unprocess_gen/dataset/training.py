@@ -59,6 +59,11 @@ def to_light(dn: ArrayLike, row: Row) -> NDArray[np.float32]:
     ndarray of float32, same shape
         (DN - black) / (white - black). Not clipped, because clipping at 0 raises the mean of dark areas.
 
+    Raises
+    ------
+    ValueError
+        If the row has no levels.
+
     Examples
     --------
     >>> import unprocess_gen as ug
@@ -89,7 +94,7 @@ def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
     Raises
     ------
     ValueError
-        If the row has no ``dark_variance_dn2``.
+        If the row has no ``dark_variance_dn2``, or no levels.
 
     Notes
     -----
@@ -157,5 +162,7 @@ def random_crop(frames: Sequence[Frame], side: int, integer: Callable[[int], int
 
 def _levels(row: Row) -> tuple[int, int]:
     """Black level and range from black to white, DN."""
-    black, white = int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)
-    return black, white - black
+    black, white = row.get("black_level_dn"), row.get("white_level_dn")
+    if black is None or white is None:
+        raise ValueError("black_level_dn or white_level_dn is missing from the row; expected the row of a pair")
+    return int(black), int(white) - int(black)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Self, SupportsIndex
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
-from unprocess_gen.core.sequences import Recent
+from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.dataset.columns import Value
@@ -33,7 +33,7 @@ from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, check_split, open_datasets, stackable
 from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
-from unprocess_gen.dataset.table import PairTable, first_of
+from unprocess_gen.dataset.table import PairTable
 from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.pairs import PairSettings, levels_of, plan_pixels, targets_of
 from unprocess_gen.pipeline.replay import source_of
@@ -69,7 +69,7 @@ class LiveSample(Sample):
     """
 
 
-class LivePairs(PairTable["LiveSource"]):
+class LivePairs(PairTable):
     """Make the pairs of datasets when they are read, with new noise in each epoch: a map-style dataset.
 
     ``live[epoch, i]`` depends only on the dataset, epoch and i, whatever process, worker or order reads it. ``live[i]``
@@ -188,7 +188,13 @@ class LivePairs(PairTable["LiveSource"]):
         epoch = operator.index(epoch)
         if not 0 <= epoch < EPOCHS:
             raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
-        position, crop = divmod(range(len(self))[self._item(number)], self._patches)
+        if isinstance(number, str):
+            if self._patches > 1:
+                raise UnknownKeyError(
+                    f"{number!r}: names {self._patches} patches; expected a number (patches={self._patches})"
+                )
+            number = self._position(number)
+        position, crop = divmod(range(len(self))[operator.index(number)], self._patches)
         if not isinstance(item, tuple | str) and self._redraw != "none":
             self._warn_of_repetition()
         number = int(self._numbers[position])
@@ -218,15 +224,8 @@ class LivePairs(PairTable["LiveSource"]):
         row: Any = LiveRow(partial(image.row, plan, epoch, patch, pair))
         return LiveSample(first, second, row, source.name, targets)
 
-    def _item(self, number: SupportsIndex | str) -> int:
-        """Number of the item of a number or key."""
-        if not isinstance(number, str):
-            return operator.index(number)
-        first = self._position(number) * self._patches
-        if self._patches > 1:
-            numbers = f"{first} to {first + self._patches - 1}"
-            raise UnknownKeyError(f"{number!r}: names {self._patches} patches; expected a number from {numbers}")
-        return first
+    def _example(self, number: int) -> Any:
+        return self[0, number * self._patches]
 
     def _part(self, numbers: NDArray[np.int64]) -> Self:
         part = super()._part(numbers)

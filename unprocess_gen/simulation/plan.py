@@ -513,6 +513,10 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
     output: OutputPlan = OutputPlan()
     # fmt: on
 
+    def __repr__(self) -> str:
+        key, camera, noise, scene = self.stream_key, self.camera.camera, self.noise.noise, self.scene.scene
+        return f"Plan(stream_key={key:016x}, camera={camera}, noise={noise}, scene={scene}, accuracy={self.accuracy})"
+
     @property
     def numbers(self) -> Physics:
         """Numbers of the physical profile, which the plan must have."""
