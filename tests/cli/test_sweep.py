@@ -118,12 +118,17 @@ def test_repeated_sweep_and_its_plan_change_nothing(run_main: RunMain, source: P
     assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
 
 
-def test_plan_of_a_sweep_prints_every_job_and_totals(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    done = run_main("plan", *TWO_BY_TWO, "n_jobs=1")
-    assert (done.code, done.out.count("sources   3")) == (0, 4)
-    assert re.search(
-        r"^totals    4 jobs: 12 pairs in 4 shards, [\d,]+ bytes, about [\d.]+ (s|min)$", done.out, re.MULTILINE
-    )
+def test_plan_of_a_sweep_prints_what_is_common_a_table_and_totals(
+    run_main: RunMain, source: Path, tmp_path: Path
+) -> None:
+    done = run_main("plan", *TWO_BY_TWO, "scene.iso=200", "n_jobs=1")
+    assert (done.code, [done.out.count(label) for label in ("sources   3", "effects ", "bytes  ")]) == (0, [1, 1, 0])
+    rows = re.findall(r"^ +(\d)  +3  .* a_dn ([\d.]+), b_dn2 [\d.]+ +(\S+)$", done.out, re.MULTILINE)
+    assert rows == [(str(k + 1), ("3.513", "6.956")[k % 2], folder) for k, folder in enumerate(FOLDERS)]
+    assert re.search(r"^warning   scene.iso=200: .*imx385_iso1600(.*\n)+? +in jobs 1, 3$", done.out, re.MULTILINE)
+    totals = r"^totals    4 jobs: 12 pairs in 4 shards, [\d,]+ bytes, about [\d.]+ (s|min); \S+ GB free$"
+    assert re.search(totals, done.out, re.MULTILINE)
+    assert messages(done.err) == [f"gen-dataset: {k + 1}/4 {folder}" for k, folder in enumerate(FOLDERS)]
     assert sorted(os.listdir(tmp_path)) == ["p"]
 
 
@@ -207,10 +212,32 @@ def test_swept_lists_of_sources_have_folders_of_their_own(run_main: RunMain, sou
     assert [(row["folder"], row["rows"]) for row in rows] == [(f"source.list='{name}.txt'", "1") for name in "01"]
 
 
-def test_shortened_name_begins_with_the_swept_keys(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+def test_name_of_a_folder_has_swept_keys_only(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     globs = ",".join(f"*{number:020d}" for number in range(9))
     run = ("-m", "source.limit=1,2", f"source.include=['*.png',{globs}]", "source.root=p", "out=sweep", "n_jobs=1")
     assert run_main(*run).code == 0
     row, other = sweep_rows(tmp_path / "sweep")
-    assert [row["folder"].partition(",")[0] for row in (row, other)] == ["source.limit=1", "source.limit=2"]
-    assert max(len(row["folder"]) for row in (row, other)) <= 200
+    assert [(row["folder"], globs.split(",")[8] in row["overrides"]) for row in (row, other)] == [
+        ("source.limit=1", True),
+        ("source.limit=2", True),
+    ]
+
+
+def test_folder_of_another_job_is_refused_and_its_row_stays(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    sweep = ("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    done = run_main(*sweep, "isp=linear")
+    assert (done.code, messages(done.out)[-1]) == (0, "sweep: 2 of 2; next: gen-dataset verify sweep")
+    before = (tmp_path / "sweep/sweep.csv").read_bytes()
+    done = run_main(*sweep, "isp=srgb")
+    assert (done.code, done.err.count("was begun with other settings: isp.")) == (2, 2)
+    assert messages(done.out)[-1] == "sweep: 0 of 2; sweep/sweep.csv has the exit codes"
+    assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
+
+
+def test_folders_name_recipes_and_one_job_all_its_settings(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    common = ("source.root=p", "source.limit=1", "n_jobs=1", "out=sweep")
+    assert run_main("-m", "+experiment=ipol_demo,many_highlights", "seed=3", *common).code == 0
+    assert run_main("-m", "seed=4", *common).code == 0
+    assert [row["folder"] for row in sweep_rows(tmp_path / "sweep")] == [
+        *("experiment=ipol_demo", "experiment=many_highlights", "seed=4,source.limit=1")
+    ]

@@ -55,9 +55,9 @@ def test_sweep_in_a_file_equals_the_command_line(
         done = run_main(*arguments, *REST)
         assert done.code == 0, done.err
         rows = [row | {"seconds": ""} for row in sweep_rows(tmp_path / "sweep")]
-        found.append((rows, [tree_hash(tmp_path / "sweep" / name) for name in NAMED]))
+        found.append((rows, [tree_hash(tmp_path / "sweep" / name) for name in FOLDERS]))
         shutil.rmtree(tmp_path / "sweep")
-    assert [row["folder"] for row in found[0][0]] == NAMED
+    assert [(row["folder"], row["overrides"]) for row in found[0][0]] == list(zip(FOLDERS, NAMED, strict=True))
     assert found[1] == found[2] == found[0]
 
 

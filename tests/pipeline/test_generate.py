@@ -263,7 +263,7 @@ def test_progress_is_plain_lines_without_a_terminal(make: Make, photos: Path, tm
     assert re.fullmatch(r"gen-dataset: 13/13 images, [\d.]+ images/s, 0 failed, 0 s left\n", err)
 
 
-COMPILING = "gen-dataset: 0/1 images, compiling kernels for this kind of noise and frames, once per machine and version"
+COMPILING = "gen-dataset: 0/1 images, compiling kernels for this kind of noise and frames, once per environment"
 
 
 @pytest.mark.parametrize("compiled", [False, True])

@@ -69,8 +69,8 @@ def option_folders(call: Call) -> OptionFolders:
     return OptionFolders(call.config_dir, name, call.config_path)
 
 
-def checked_jobs(composed: Iterable[Composition], only_swept: bool = False) -> list[Job]:
-    """Validate composed configs; with ``only_swept`` the folders of a sweep are named by their swept values alone."""
+def checked_jobs(composed: Iterable[Composition]) -> list[Job]:
+    """Validate composed configs; folders of a sweep are named by swept values, or by all settings if none is swept."""
     from unprocess_gen.config.schema import replaced
     from unprocess_gen.core.paths import local_path
 
@@ -82,9 +82,8 @@ def checked_jobs(composed: Iterable[Composition], only_swept: bool = False) -> l
         advice = "run its jobs one by one, or copy its datasets afterwards"
         refusal = f"out={config.out}: a sweep cannot write to an object store; expected a local folder; {advice}"
         sweep = local_path(config.out, refusal)
-        texts = [f"{key}={value}" for key, value in job.swept.items()] if only_swept else job.overrides
-        named = named_overrides(texts, job.swept)
-        folder = job_folder(named, job.swept)
+        named = named_overrides(job.overrides, job.swept)
+        folder = job_folder(sorted(f"{key}={value}" for key, value in job.swept.items()) or named)
         row = {"folder": folder, "overrides": ",".join(named), **job.swept}
         jobs.append(Job(replaced(config, {"out": str(sweep / folder)}), row, sweep))
     for number, checked in enumerate(jobs, start=1):

@@ -22,7 +22,7 @@ from unprocess_gen.cli.arguments import (
     verb,
 )
 from unprocess_gen.cli.jobs import Job, composed_jobs, option_folders, run_jobs
-from unprocess_gen.cli.messages import print_results
+from unprocess_gen.cli.messages import LOGGER, print_results
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dataset_folder, given_places, given_root
 from unprocess_gen.cli.sweep import swept_keys
@@ -40,19 +40,22 @@ def plan(call: Call) -> int:
     """Estimate pairs, bytes and time, and explain the effects; write nothing."""
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run
-    from unprocess_gen.reports.plan_text import format_estimate, totals_line
+    from unprocess_gen.reports.plan_text import format_estimate, sweep_lines
 
-    jobs, estimates = composed_jobs(call), []
+    jobs, planned = composed_jobs(call), {}
 
     def explain(job: Job) -> list[str]:
+        if job.sweep is not None:
+            LOGGER.info(job.label)
         estimate = estimate_run(job.config, effective_jobs(job.config.n_jobs, 10**6), call.all)
-        estimates.append(estimate)
-        text = format_estimate(estimate, call.numbers)
-        return [*([] if job is jobs[0] else [""]), f"out       {job.config.out}", text]
+        if job.sweep is None:
+            return [f"out       {job.config.out}", format_estimate(estimate, call.numbers)]
+        planned[job.row["folder"]] = estimate
+        return []
 
     code = run_jobs(jobs, explain)
-    if estimates and jobs[0].sweep is not None:
-        print_results(totals_line(estimates))
+    if planned:
+        print_results(f"out       {jobs[0].sweep}", *sweep_lines(planned, call.numbers))
     return code
 
 

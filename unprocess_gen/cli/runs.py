@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Mapping
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 from types import MappingProxyType
@@ -38,7 +39,18 @@ DIFFERENCES_LISTED = 20
 @verb(composes=True)
 def generate(call: Call) -> int:
     """Generate a dataset; the default verb."""
-    return run_jobs(composed_jobs(call), _generate, has_table=True)
+    return _generate_all(composed_jobs(call), _generate)
+
+
+def _generate_all(jobs: Sequence[Job], work: Callable[[Job], list[str]]) -> int:
+    """Generate the dataset of each job, and end a sweep with what to do next; the worst exit code."""
+    code = run_jobs(jobs, work, has_table=True)
+    if jobs and (sweep := jobs[0].sweep) is not None:
+        done = sum(job.code == DONE for job in jobs)
+        place = shlex.quote(str(sweep))
+        after = f"next: gen-dataset verify {place}" if code == DONE else f"{sweep}/sweep.csv has the exit codes"
+        print_results(f"{sweep}: {done} of {len(jobs)}; {after}")
+    return code
 
 
 def _generate(job: Job, changes: Mapping[str, Any] = MappingProxyType({})) -> list[str]:
@@ -48,22 +60,22 @@ def _generate(job: Job, changes: Mapping[str, Any] = MappingProxyType({})) -> li
 
     summary = generate(replaced(job.config, changes), job.label)
     job.row |= result_cells(summary)
-    job.code, lines = outcome(summary, job.config.source.max_failed)
+    job.code, lines = outcome(summary, job.config.source.max_failed, job.sweep is None)
     return lines
 
 
 @verb(composes=True)
 def manifest(call: Call) -> int:
     """Write the manifest of a dataset without frames, for ug.LivePairs."""
-    return run_jobs(composed_jobs(call), partial(_generate, changes={"output.frames": False}), has_table=True)
+    return _generate_all(composed_jobs(call), partial(_generate, changes={"output.frames": False}))
 
 
-def outcome(summary: Summary, max_failed: int) -> tuple[int, list[str]]:
-    """Exit code of a generated dataset, and the lines to print about it."""
+def outcome(summary: Summary, max_failed: int, has_next: bool = True) -> tuple[int, list[str]]:
+    """Exit code of a generated dataset, and the lines to print about it, with the next step on request."""
     from unprocess_gen.planning.advice import clipped_low_warning
     from unprocess_gen.sources.listing import unmatched_sentence
 
-    lines, sites = [summary.sentence(max_failed), unmatched_sentence(summary.unmatched)], summary.sites
+    lines, sites = [summary.sentence(max_failed, has_next), unmatched_sentence(summary.unmatched)], summary.sites
     if summary.is_raw and (warning := clipped_low_warning(sites["clean_clipped_low"], sites["all"])):
         lines.append(f"{summary.out} {warning}")
     return TOO_MANY_FAILED if sum(summary.failed.values()) > max_failed else DONE, list(filter(None, lines))
@@ -184,4 +196,4 @@ def make_build(build: Build, folder: Path, n_jobs: str = "-1") -> int:
 
     settings = [*build.overrides(folder, build.photographs_folder()), f"n_jobs={n_jobs}"]
     composed = compose_jobs(settings, OptionFolders(), multirun=bool(build.recipe.sweep))
-    return run_jobs(checked_jobs(composed, only_swept=True), lambda job: _generate(job)[:1], has_table=True)
+    return run_jobs(checked_jobs(composed), lambda job: _generate(job)[:1], has_table=True)

@@ -8,7 +8,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from unprocess_gen.core.errors import RESUME
+from unprocess_gen.core.errors import RESUME, ConfigError
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -37,27 +37,18 @@ def named_overrides(overrides: Iterable[str], swept: Container[str] = ()) -> lis
         differs = key in swept and key.startswith("source.")
         return differs or not any(key == name or key.startswith(f"{name}.") for name in NOT_IN_NAMES)
 
-    return sorted(override for override in overrides if is_named(_key(override)))
+    return sorted(override for override in overrides if is_named(override.lstrip("+").partition("=")[0]))
 
 
-def _key(override: str) -> str:
-    return override.lstrip("+").partition("=")[0]
-
-
-def job_folder(overrides: Sequence[str], swept: Container[str] = ()) -> str:
-    """Name of a job's folder; a long one begins with the overrides of swept keys, is cut, and ends with a digest."""
+def job_folder(overrides: Sequence[str]) -> str:
+    """Name of a job's folder; a long one is cut, and ends with a digest."""
     import hashlib
 
-    name = _encoded(overrides) or "default"
+    name = ",".join(overrides).replace("%", "%25").replace("/", "%2F") or "default"
     if len(os.fsencode(name)) <= LONGEST_FOLDER_NAME:
         return name
     digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
-    swept_first = sorted(overrides, key=lambda override: _key(override) not in swept)
-    return os.fsencode(_encoded(swept_first))[: LONGEST_FOLDER_NAME - 20].decode(errors="ignore") + "-" + digest
-
-
-def _encoded(overrides: Sequence[str]) -> str:
-    return ",".join(overrides).replace("%", "%25").replace("/", "%2F")
+    return os.fsencode(name)[: LONGEST_FOLDER_NAME - 20].decode(errors="ignore") + "-" + digest
 
 
 def worst(exit_codes: Iterable[int]) -> int:
@@ -101,6 +92,8 @@ def write_row(out: Path, row: Mapping[str, str]) -> None:
         lock.acquire(wait=True)  # several processes may sweep into one folder
         try:
             rows = {other["folder"]: other for other in (read_sweep_table(path) if path.exists() else ())}
+            if row["folder"] in rows and row.get("exit") == str(ConfigError.exit_code):
+                return  # the folder is that of another job, whose row stays
             rows[row["folder"]] = {"seconds": rows.get(row["folder"], {}).get("seconds", ""), **row}
             table = io.StringIO()
             columns = [*FIRST_COLUMNS, *swept_keys(rows.values()), *LAST_COLUMNS]

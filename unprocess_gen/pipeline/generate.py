@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import platform
+import shlex
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -124,8 +125,8 @@ class Summary:
         """Pairs, failures and filtered images together."""
         return self.pairs + sum(self.failed.values()) + self.filtered
 
-    def sentence(self, max_failed: int) -> str:
-        """Describe the outcome in one line, for the command line."""
+    def sentence(self, max_failed: int, has_next: bool = True) -> str:
+        """Describe the outcome, and the next step, in one line, for the command line."""
         failed = sum(self.failed.values())
         reasons = ", ".join(f"{count} {reason}" for reason, count in self.failed.items())
         stored = f"{self.bytes / 1e6:,.1f} MB" if self.has_frames else "no frames"
@@ -139,10 +140,10 @@ class Summary:
             failures += f", {self.noted} noted (column detail)"
         if not self.made:
             return f"{self.out} is complete: {size}, {failures}; nothing to do"
-        look = f"gen-dataset preview {self.out} --to {self.out.name}_sheets"
-        after = look if self.has_frames else f'ug.LivePairs("{self.out}")'
+        look = shlex.join(["gen-dataset", "preview", str(self.out), "--to", f"{self.out.name}_sheets"])
+        after = "; next: " + (look if self.has_frames else f'ug.LivePairs("{self.out}")') if has_next else ""
         part = f" ({self.made} in this run)" if self.made < self.rows else ""
-        return f"{self.out}: {size}{part}, {self.seconds:.1f} s, {failures}; next: {after}"
+        return f"{self.out}: {size}{part}, {self.seconds:.1f} s, {failures}{after}"
 
 
 def generate(config: Config, label: str = "") -> Summary:

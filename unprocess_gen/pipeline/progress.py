@@ -27,7 +27,7 @@ Item = TypeVar("Item")
 LOGGER = logging.getLogger("unprocess_gen")
 LINE_S = 5.0
 """Seconds between progress lines if stderr is not a terminal."""
-COMPILING = "compiling kernels for this kind of noise and frames, once per machine and version"
+COMPILING = "compiling kernels for this kind of noise and frames, once per environment"
 POLL_S = 0.1
 """Time between two looks at the files by which workers report what they do."""
 BAR_DELAY_S = 2.0

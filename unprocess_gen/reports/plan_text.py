@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.schema import Config
@@ -24,8 +25,11 @@ from unprocess_gen.sources.listing import unmatched_sentence
 Estimates = Sequence[SourceEstimate]
 
 
-def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
-    """Format an estimate for a terminal: lines without a final newline, with the sources of numbers on request."""
+def format_estimate(estimate: RunEstimate, with_numbers: bool = False, with_table: bool = True) -> str:
+    """Format an estimate for a terminal: lines without a final newline, with the sources of numbers on request.
+
+    Without ``with_table``, the effects of physical profiles are a list of those that are simulated.
+    """
     run, read, config = estimate.run, estimate.source_estimates, estimate.run.config
     about = "" if estimate.exact else "about "
     place = config.source.list or config.source.place or "the synthetic pictures"
@@ -45,9 +49,52 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False) -> str:
             f"time      about {total} with {counted(estimate.n_jobs, 'worker')}: start-up {start}, pairs {pairs}",
             *_failure_lines(config, read),
             *_labelled("note", (f"{source.source.name} {source.note}" for source in read if source.note)),
-            *noise_lines(config, levels, run.settings.dark_frames, [s.noise_ratio for s in read], with_numbers),
+            *noise_lines(
+                config, levels, run.settings.dark_frames, [s.noise_ratio for s in read], with_numbers, with_table
+            ),
         ]
     )
+
+
+_JOB_LINE = "{:>5}  {:>9}  {:>10}  {:>9}  {:34}  {}"
+IN_TABLE = ("pairs ", "bytes ", "time ", "scene ", "noise ", "effect ")
+"""Labels whose lines the table of jobs replaces, unless they are common."""
+UNSHARED = ("bytes ", "time ")
+"""Labels whose lines have measurements of each job."""
+
+
+def sweep_lines(jobs: Mapping[str, RunEstimate], with_numbers: bool = False) -> list[str]:
+    """Format the estimates of a sweep by job: what is common, a table of jobs, what only some of them have, totals."""
+    owners: dict[str, list[int]] = {}  # of each line, with those that continue it: the numbers of its jobs
+    for number, estimate in enumerate(jobs.values(), start=1):
+        for block in re.split(r"\n(?=\S)", format_estimate(estimate, with_numbers, with_table=False)):
+            owners.setdefault(block, []).append(number)
+    common = [
+        block for block, numbers in owners.items() if len(numbers) == len(jobs) and not block.startswith(UNSHARED)
+    ]
+    others = [
+        f"{block}\n{'':10}in jobs {', '.join(map(str, numbers))}"
+        for block, numbers in owners.items()
+        if block not in common and not block.startswith(IN_TABLE)
+    ]
+    rows = [
+        _JOB_LINE.format(
+            *(number, f"{job.pairs:,}", byte_size(job.bytes), format_duration(job.seconds), _noise_cell(job), name)
+        )
+        for number, (name, job) in enumerate(jobs.items(), start=1)
+    ]
+    header = _JOB_LINE.format("job", "pairs", "size", "time", "noise", "settings")
+    return [*common, "", header, *rows, "", *others, totals_line(list(jobs.values()))]
+
+
+def _noise_cell(estimate: RunEstimate) -> str:
+    """The numbers of the noise of a job, in DN of its sensor."""
+    plans = [plan for source in estimate.source_estimates for plan, _ in source.levels]
+    if not plans:
+        return ""
+    if plans[0].physics is None:
+        return f"a_dn {_range(plans, 'noise.a_dn', 4)}, b_dn2 {_range(plans, 'noise.b_dn2', 4)}"
+    return f"{_range(plans, 'physics.dn_per_e', 3)} DN/e, read {_range(plans, 'physics.read_std_dn', 3)} DN"
 
 
 def totals_line(estimates: Sequence[RunEstimate]) -> str:
@@ -56,7 +103,8 @@ def totals_line(estimates: Sequence[RunEstimate]) -> str:
     totals = [(job.pairs, job.run.shards, job.bytes, job.seconds) for job in estimates]
     pairs, shards, size, seconds = map(sum, zip(*totals, strict=True))
     made = f"{about}{pairs:,} pairs in {shards:,} shards, {about}{size:,} bytes, about {format_duration(seconds)}"
-    return f"totals    {len(estimates)} jobs: {made}"
+    free = f"{byte_size(estimates[-1].free_bytes)} free" + (": NOT ENOUGH" if estimates[-1].free_bytes < size else "")
+    return f"totals    {len(estimates)} jobs: {made}; {free}"
 
 
 def format_duration(seconds: float) -> str:
@@ -109,6 +157,7 @@ def noise_lines(
     dark_frames: DarkFrames | None,
     noise_ratios: Sequence[float | None] = (),
     with_numbers: bool = False,
+    with_table: bool = True,
 ) -> list[str]:
     """Scene, noise, warnings and effects of the plans of all noise levels of the sources that can be read.
 
@@ -128,10 +177,15 @@ def noise_lines(
         *_labelled("numbers", _number_sources(config, plans) if with_numbers else []),
         *_labelled("source", [_source_noise_sentence(config, noise_ratios)]),
         *_labelled("warning", [*warnings(config), _rounding_warning(plans)]),
-        *_labelled("effects", [] if is_physical else [", ".join(noise.effects)]),
+        *_labelled("effects", [] if is_physical and with_table else [_simulated(plans)]),
         *_labelled("skipped", [] if is_physical else noise.skipped),
-        *(_effect_table(config, [predictions for _, predictions in levels]) if is_physical else []),
+        *(_effect_table(config, [predictions for _, predictions in levels]) if is_physical and with_table else []),
     ]
+
+
+def _simulated(plans: Sequence[Plan]) -> str:
+    """Effects that are simulated in any of the plans."""
+    return ", ".join(dict.fromkeys(effect for plan in plans for effect in plan.noise.effects))
 
 
 def _range(plans: Sequence[Plan], path: str, digits: int = 6) -> str:
