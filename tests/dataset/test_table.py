@@ -67,12 +67,21 @@ def test_rows_are_selected_by_value_list_and_function(ladder: Path, dataset: Pat
         ({"izo": 3}, r"izo: no such column; expected one of the manifest, or dataset; did you mean iso\?"),
         ({"level": "1"}, r"level='1': no pair is selected; expected level=[01], [01]$"),
         ({"key": "1"}, r"expected key=('\d{8}-p\d{4}-l\d\dd\d\d', ){5}…$"),
-        ({"level": 0, "a_dn": [8, 9]}, r"level=0, a_dn=\[8, 9\]: no pair .* expected what occurs together"),
+        ({"level": 0, "a_dn": [8, 9]}, r"level=0, a_dn=\[8, 9\]: no pair .* expected conditions that a pair meets"),
     ],
 )
 def test_what_selects_no_pair_is_refused(columns: dict[str, Any], message: str, ladder: Path) -> None:
     with pytest.raises(ConfigError, match=message):
         ug.RawPairs(ladder).select(**columns)
+
+
+def test_reader_without_pairs_says_so(dataset: Path) -> None:
+    none = ug.RawPairs(dataset)[13:]
+    with pytest.raises(KeyError, match="expected a reader that has pairs"):
+        none["00000000"]
+    with pytest.raises(ConfigError, match="select: a function, iso=1: no pair is selected; expected conditions"):
+        none.select(bool, iso=1)
+    assert (len(none.rows), none._repr_html_().count("<img")) == (0, 0)
 
 
 def test_rows_are_a_table(ladder: Path, dataset: Path) -> None:

@@ -78,7 +78,7 @@ class PairTable:
         RawPairs('ds', length=2)
         """
         known = (*COLUMN_NAMES, "dataset")
-        for name in columns.keys() - {*known}:
+        for name in sorted(columns.keys() - {*known}):
             hint = did_you_mean(name, known)
             raise ConfigError(f"select: {name}: no such column; expected one of the manifest, or dataset{hint}")
         wanted = {
@@ -91,13 +91,15 @@ class PairTable:
             if all(row[name] in values for name, values in wanted.items()) and (test is None or test(row))
         ]
         if not positions:
-            given = ", ".join(f"{name}={value!r:.60}" for name, value in columns.items())
-            known_values = {name: {row[name] for row in self.rows} for name in columns}
-            never = {name: values for name, values in known_values.items() if values.isdisjoint(wanted[name])}
-            expected = "; ".join(
-                f"{name}={first_of(sorted(map(repr, values), key=len))}" for name, values in never.items()
-            )
-            raise ConfigError(f"select: {given}: no pair is selected; expected {expected or 'what occurs together'}")
+            given = [*(["a function"] if test else []), *(f"{name}={value!r:.60}" for name, value in columns.items())]
+            values = {name: {row[name] for row in self.rows} for name in columns}
+            expected = [
+                f"{name}={first_of(sorted(map(repr, seen), key=len))}"
+                for name, seen in values.items()
+                if seen and not any(value in wanted[name] for value in seen)
+            ]
+            problem = f"no pair is selected; expected {'; '.join(expected) or 'conditions that a pair meets'}"
+            raise ConfigError(f"select: {', '.join(given)}: {problem}")
         return self._part(self._numbers[positions])
 
     def _repr_html_(self) -> str:
@@ -133,10 +135,11 @@ class PairTable:
         positions = np.flatnonzero(np.isin(self._numbers, numbers))
         if len(positions) == 1:
             return int(positions[0])
-        shown = positions[:MANY] if len(positions) else [0, -1]
-        keys = [self._datasets[place].key(number) for place, number in map(self._place, self._numbers[shown])]
+        shown = self._numbers[positions[:MANY]] if len(positions) else [*self._numbers[:1], *self._numbers[-1:]]
+        keys = [self._datasets[place].key(number) for place, number in map(self._place, shown)]
         if not len(positions):
-            raise UnknownKeyError(f"{key!r:.40}: no pair has this key; expected one from {keys[0]} to {keys[1]}")
+            expected = f"one from {' to '.join(keys)}" if keys else "a reader that has pairs"
+            raise UnknownKeyError(f"{key!r:.40}: no pair has this key; expected {expected}")
         raise UnknownKeyError(
             f"{key!r}: names {len(positions)} pairs ({first_of(keys)}); expected one; give its complete key, after "
             "select(dataset=…) if several datasets have it"

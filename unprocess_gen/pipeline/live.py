@@ -75,7 +75,7 @@ class LivePairs(PairTable):
     ``live[epoch, i]`` depends only on the dataset, epoch and i, whatever process, worker or order reads it. ``live[i]``
     is epoch 0, which equals ``RawPairs(ds)[i]`` byte for byte. Fixed patterns of a camera body are the same in every
     epoch. Only the patch is simulated. An instance can be pickled and forked. ``live[epoch, "00000003"]`` is the pair
-    with this key, and a slice is a `LivePairs` of those pairs.
+    with this key, and a slice is a `LivePairs` of those pairs, unless items are several patches of a pair.
 
     Parameters
     ----------
@@ -182,19 +182,17 @@ class LivePairs(PairTable):
         return f"LivePairs({names}, length={len(self)}, redraw={self._redraw!r})"
 
     def __getitem__(self, item: Any) -> Any:  # arrays instead of a LiveSample with arrays_only
+        epoch, number = item if isinstance(item, tuple) else (0, item)
+        if self._patches > 1 and isinstance(number, str | slice):
+            items = f"an item is one of {self._patches} patches of a pair"
+            raise UnknownKeyError(f"{number!r:.40}: {items}; expected the number of an item, or select(…)")
         if isinstance(item, slice):
             return self._part(self._numbers[item])
-        epoch, number = item if isinstance(item, tuple) else (0, item)
         epoch = operator.index(epoch)
         if not 0 <= epoch < EPOCHS:
             raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
-        if isinstance(number, str):
-            if self._patches > 1:
-                raise UnknownKeyError(
-                    f"{number!r}: names {self._patches} patches; expected a number (patches={self._patches})"
-                )
-            number = self._position(number)
-        position, crop = divmod(range(len(self))[operator.index(number)], self._patches)
+        number = self._position(number) if isinstance(number, str) else operator.index(number)
+        position, crop = divmod(range(len(self))[number], self._patches)
         if not isinstance(item, tuple | str) and self._redraw != "none":
             self._warn_of_repetition()
         number = int(self._numbers[position])
