@@ -75,7 +75,7 @@ def test_what_selects_no_pair_is_refused(columns: dict[str, Any], message: str, 
         ug.RawPairs(ladder).select(**columns)
 
 
-def test_reader_without_pairs_says_so(dataset: Path) -> None:
+def test_reader_without_pairs_is_reported(dataset: Path) -> None:
     none = ug.RawPairs(dataset)[13:]
     with pytest.raises(KeyError, match="expected a reader that has pairs"):
         none["00000000"]
