@@ -16,7 +16,7 @@ from selenium.webdriver.chrome.service import Service
 
 SETTINGS = ("source.limit=6", "noise=imx385_iso12800", "gains=fig6_top", "camera=sony_a7r")
 SIZE = {"width": 1200, "height": 1100, "deviceScaleFactor": 1, "mobile": False}
-READY = "return Bokeh.documents[0].get_model_by_name('command').value"
+READY = "return Bokeh.documents[0].get_model_by_name('command').text"
 
 
 def screenshot(address: str) -> np.ndarray:

@@ -82,6 +82,10 @@ def test_every_effect_has_size_noise_and_reason(settings: Settings, tmp_path: Pa
     text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=daylight", "effects.row=off")
     for effect in EFFECTS:
         assert re.search(rf"^{effect} +(\S+ (DN|pixels)  .*)?[0-2] of 2 +\S", text, re.MULTILINE)
+    columns = {line.index(" in ") for line in text.splitlines() if line.startswith("effect ")}
+    columns |= {line.index(" pixel ") for line in text.splitlines() if line.startswith("read ")}
+    columns |= {line.index(" outliers ") for line in text.splitlines() if line.startswith("hot_pixels ")}
+    assert len(columns) == 1, text
     assert re.search(r"^read .* DN  pixel .* DN  2 of 2 +visible$", text, re.MULTILINE)
     assert re.search(r"^prnu .* 2 of 2 +visible \(assumed number\)$", text, re.MULTILINE)
     assert re.search(r"^dark_current .* 0 of 2 +too small to see$", text, re.MULTILINE)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -19,12 +20,18 @@ import pytest
 
 import unprocess_gen as ug
 from unprocess_gen.config.option_files import OptionFolders
+from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.reports.explorer.exploration import Exploration, open_place
-from unprocess_gen.reports.explorer.overrides import overrides_of
+from unprocess_gen.reports.explorer.overrides import override_word, overrides_of, split_overrides
 
 pytest.importorskip("bokeh", reason="the explorer needs the extra explore")
+
+from bokeh.document import Document
+
+from unprocess_gen.reports.explorer import views
+from unprocess_gen.reports.explorer.page import Page
 
 ON_PAGE = (
     "key",
@@ -50,8 +57,8 @@ def photos(tmp_path: Path) -> Path:
 
 
 def explorations(place: Path | None, *overrides: str, keys: str | None = None) -> list[Exploration]:
-    choices = open_place(None if place is None else any_path(place), keys, overrides, (), OptionFolders())
-    return [choice() for choice in choices.values()]
+    start, choices = open_place(None if place is None else any_path(place), keys, overrides, (), OptionFolders())
+    return [choice(start) for choice in choices.values()]
 
 
 def row_of_command(command: str, key: str, out: Path) -> dict[str, Any]:
@@ -98,17 +105,173 @@ def test_overrides_of_a_config_compose_it_again() -> None:
     assert overrides_of(ug.load_config(texts)) == overrides_of(composed)
 
 
+def test_raw_frames_are_refused_with_the_steps_that_show_them(tmp_path: Path) -> None:
+    (tmp_path / "a.DNG").touch()
+    for place in (tmp_path, tmp_path / "a.DNG"):
+        with pytest.raises(ConfigError, match=r"raw frames.*photographs.*gen-dataset source.kind=raw"):
+            explorations(place)
+
+
+# ----------------------------------------------------------------------------------------------- the field of a page
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("  seed=7   n_jobs=1 ", ("seed=7", "n_jobs=1")),
+        ("camera.xyz2cam=[1, 0, 0] split={a: 0.5, b: 0.5}", ("camera.xyz2cam=[1, 0, 0]", "split={a: 0.5, b: 0.5}")),
+        ("source.exclude=['a ]b', \"c d\"] seed=1", ("source.exclude=['a ]b', \"c d\"]", "seed=1")),
+        ("'gains.red=[uniform, 1.9, 2.4]' seed=1", ("gains.red=[uniform, 1.9, 2.4]", "seed=1")),
+        ("a=[1, 2 seed=1", ("a=[1, 2 seed=1",)),
+        ("a='b seed=1", ("a='b seed=1",)),
+    ],
+)
+def test_text_is_split_at_blanks_outside_of_quotes_and_brackets(text: str, words: tuple[str, ...]) -> None:
+    assert split_overrides(text) == words
+
+
+@pytest.mark.parametrize("text", ["x", "a b", "it's", "[1, 2]", 'say "x"', "\\", "[a", "]"])
+def test_word_of_a_setting_stays_in_one_piece(text: str) -> None:
+    word = override_word("out", text)
+    assert split_overrides(f"seed=1 {word} seed=2") == ("seed=1", word, "seed=2")
+
+
+class Driven:
+    """A page without a browser: controls are set, and the tasks that wait are run."""
+
+    def __init__(self, place: Path | None, *overrides: str) -> None:
+        self._document = Document()
+        Page(*open_place(place and any_path(place), None, overrides, (), OptionFolders()), self._document).fill()
+
+    def __getitem__(self, name: str) -> Any:
+        return self._document.get_model_by_name(name)
+
+    def set(self, name: str, value: Any) -> None:
+        self[name].value = value
+        while tasks := self._document.session_callbacks:
+            self._document.remove_timeout_callback(tasks[0])
+            tasks[0].callback()
+
+    @property
+    def settings(self) -> list[str]:
+        """What the command sets, without the place of the photograph and the output."""
+        words = shlex.split(self["command"].text)[1:]
+        return [word for word in words if not word.startswith(("source.root=", "source.limit=", "out="))]
+
+    @property
+    def refused(self) -> list[str]:
+        """Controls that are outlined."""
+        return [model.name for model in self._document.roots if "refused" in model.css_classes]
+
+
+def test_text_of_the_field_is_the_list_of_other_settings() -> None:
+    page = Driven(None, "source.downscale=4", "seed=1")
+    assert page["other"].value == "source.downscale=4"
+    page.set("other", "source.downscale=4 output.dtype=float32 seed=7")
+    assert page["seed"].value == "7"
+    page.set("other", "gains.red=[uniform, 1, 2]  source.patch=[grid, 64, 32]")
+    assert page.settings == ["gains.red=[uniform, 1, 2]", "source.patch=[grid, 64, 32]", "seed=1"]
+    page.set("gains.red", 2.5)  # a control takes its key back
+    assert page["other"].value == "source.patch=[grid, 64, 32]"
+    page.set("other", "")
+    assert page.settings == ["seed=1", "gains.red=2.5"]
+
+
+def test_refused_text_blocks_nothing_and_the_next_one_replaces_it() -> None:
+    page = Driven(None)
+    page.set("other", "source.downscale=4 noize=x")
+    assert page.refused == ["other"]
+    assert "noize=x" in page["refusal"].text
+    page.set("scene", "night")
+    assert (page.refused, page.settings, page["other"].value) == (
+        ["other"],
+        ["scene=night"],
+        "source.downscale=4 noize=x",
+    )
+    page.set("other", "source.downscale=4")
+    assert (page.refused, page["message"].text, page["refusal"].text) == ([], "", "")
+    assert page.settings == ["source.downscale=4", "scene=night"]
+
+
+def test_value_of_a_wrong_type_is_outlined_and_has_no_effect() -> None:
+    page = Driven(None, "body=sony_a7s2")
+    for name in ("scene.iso", "scene.exposure_s", "noise.a", "sensor.bits"):
+        page.set(name, "banana")
+        assert f"{name}=banana" in page["message"].text
+    assert page.settings == ["body=sony_a7s2"]
+    assert set(page.refused) == {"scene.iso", "scene.exposure_s", "noise.a", "sensor.bits"}
+    for name in page.refused:
+        page.set(name, "")
+    assert (page.refused, page.settings) == ([], ["body=sony_a7s2"])
+
+
+def test_refused_value_is_retried_with_the_next_change() -> None:
+    page = Driven(None)
+    page.set("sensor.white_level_dn", "16383")
+    assert page.refused == ["sensor.white_level_dn"]
+    page.set("sensor.bits", "14")
+    assert (page.refused, page.settings) == ([], ["sensor.white_level_dn=16383", "sensor.bits=14"])
+
+
+def test_settings_stay_when_another_photograph_is_opened(photos: Path) -> None:
+    page = Driven(photos)
+    page.set("scene", "night")
+    page.set("open", page["open"].options[1])
+    assert page.settings == ["scene=night"]
+    assert "b.png" in page["command"].text
+
+
+def test_weights_are_shown_for_a_mix_of_cameras_only() -> None:
+    page = Driven(None)
+    assert page["camera.weights"].visible
+    page.set("body", "sony_a7s2")
+    assert not page["camera.weights"].visible
+
+
+def test_zoom_keeps_the_place_of_the_site_pointed_at() -> None:
+    (shown,) = [state.shown() for state in explorations(None, "source.limit=1")]
+    site, window = np.array([300.0, 100.0]), np.array([[0.0, length] for length in shown.clean.shape])
+    for _ in range(3):
+        nearer = views.moved("Zoom in", window, shown, (300.0, 100.0))
+        places = [(site - ends[:, 0]) / (ends[:, 1] - ends[:, 0]) for ends in (window, nearer)]
+        np.testing.assert_allclose(*places)
+        np.testing.assert_allclose(np.diff(nearer), np.diff(window) / 2)
+        window = nearer
+    for label in views.MOVES:
+        rows, columns = views.moved(label, window, shown, None)
+        assert 0 <= rows[0] < rows[1] <= shown.clean.shape[0]
+        assert 0 <= columns[0] < columns[1] <= shown.clean.shape[1]
+
+
+def test_finest_detail_is_in_the_textured_part() -> None:
+    picture = np.full((600, 800, 3), 90, np.uint8)
+    picture[:, :300] = 200  # a strong edge is no detail
+    picture[350:500, 600:750] = np.random.default_rng(0).integers(80, 100, (150, 150, 3))
+    row, column = views.finest_detail(picture)
+    assert 350 <= row < 500
+    assert 600 <= column < 750
+
+
 # ------------------------------------------------------------------------------------------------------------ browser
 
 
-@pytest.fixture
-def address(photos: Path) -> Iterator[str]:
-    command = [sys.executable, "-m", "unprocess_gen", "explore", str(photos), "--no-browser", "noise=imx385_iso12800"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+@contextmanager
+def served(place: Path, stderr: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "unprocess_gen", "explore", str(place), "--no-browser", "noise=imx385_iso12800"]
+    with (
+        stderr.open("w") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+    ):
         assert process.stdout is not None
         yield process.stdout.readline().split()[0]
         process.terminate()
         assert process.wait(30) == 143
+
+
+@pytest.fixture
+def address(photos: Path, tmp_path: Path) -> Iterator[str]:
+    with served(photos, tmp_path / "stderr") as place:
+        yield place
 
 
 def answer_to(address: str, origin: str, host: str = "localhost") -> int:
@@ -152,6 +315,13 @@ def wait(browser: Any, name: str, code: str, timeout_s: float = 60) -> Any:
             last = error
         time.sleep(0.1)
     raise AssertionError(f"{name}: {code}: {locals().get('last')}")
+
+
+def open_page(browser: Any, address: str, width: int, height: int) -> None:
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 800}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    browser.get(address)
+    wait(browser, "command", "return it.text")
 
 
 BUTTON = """
@@ -205,19 +375,17 @@ def tooltip(browser: Any, name: str) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1200, 390])
 def test_page_works_in_a_browser_without_network(width: int, address: str, browser: Any, tmp_path: Path) -> None:
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 800}
     from selenium.webdriver.common.keys import Keys
 
     grants = {"origin": address.rstrip("/"), "permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]}
     browser.execute_cdp_cmd("Browser.grantPermissions", grants)
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    browser.get(address)
-    wait(browser, "command", "return it.value.includes('iso12800')")
+    open_page(browser, address, width, 900)
+    assert "iso12800" in model(browser, "command", "return it.text")
     assert browser.execute_script("return document.documentElement.scrollWidth") <= width
 
     model(browser, "camera", "it.value = 'sony_a7r'")
     model(browser, "gains.red", "it.value = 2.05")
-    command = wait(browser, "command", "return it.value.includes('gains.red=2.05') && it.value")
+    command = wait(browser, "command", "return it.text.includes('gains.red=2.05') && it.text")
     assert "camera=sony_a7r" in command
     facts = model(browser, "facts", "return it.text")
     row = row_of_command(command, "00000000", tmp_path / "made")
@@ -229,11 +397,11 @@ def test_page_works_in_a_browser_without_network(width: int, address: str, brows
 
     model(browser, "sensor.bits", "it.value = '12'")
     wait(browser, "message", "return it.text === ''")
-    press(browser, "Zoom In", Keys.ENTER)
+    press(browser, "Zoom in", Keys.ENTER)
     wait(browser, "clean", "return it.x_range.end - it.x_range.start < 127")
     press(browser, "Copy the command")
     assert browser.execute_async_script("navigator.clipboard.readText().then(arguments[0])") == model(
-        browser, "command", "return it.value"
+        browser, "command", "return it.text"
     )
     column, line, clean_dn, noisy_dn = map(int, re.findall(r"\d+", " ".join(tooltip(browser, "clean"))))
     pair = ug.RawPairs(tmp_path / "made")[0]
@@ -241,3 +409,62 @@ def test_page_works_in_a_browser_without_network(width: int, address: str, brows
     requests = [entry["message"] for entry in browser.get_log("performance") if "requestWillBeSent" in entry["message"]]
     urls = {url for text in requests for url in re.findall(r'"url":"(https?://[^"]+)"', text)}
     assert urls and all(url.startswith(address) for url in urls), urls
+
+
+VIEW = "const place = Bokeh.index.find_one(it).el.getBoundingClientRect(); return [place.top, place.bottom];"
+
+
+@pytest.mark.slow
+def test_pictures_and_errors_stay_in_view_while_controls_scroll(address: str, browser: Any) -> None:
+    open_page(browser, address, 1280, 900)
+    browser.execute_script("document.querySelector('.controls').scrollTop = 10000")
+    model(browser, "other", "it.value = 'noize=x'")
+    wait(browser, "refusal", "return it.text")
+    wait(browser, "other", "return getComputedStyle(Bokeh.index.find_one(it).el).outlineStyle === 'solid'")
+    for name in ("message", "refusal", "other", "noisy_developed"):
+        top, bottom = wait(browser, name, VIEW)
+        assert 0 <= top < bottom <= 900, name
+    model(browser, "other", "it.value = 'source.exclude=[" + "long_name," * 40 + "x]'")
+    wait(browser, "command", "return it.text.includes('long_name')")
+    assert model(browser, "command", "const {el} = Bokeh.index.find_one(it); return el.scrollWidth <= el.clientWidth")
+
+
+@pytest.mark.slow
+def test_one_picture_stays_on_top_on_a_phone(address: str, browser: Any) -> None:
+    open_page(browser, address, 390, 844)
+    for name in ("scene.iso", "other", "transfer"):
+        model(browser, name, "Bokeh.index.find_one(it).el.scrollIntoView({block: 'center'})")
+        top, bottom = wait(browser, "noisy_developed", VIEW)
+        assert 0 <= top < bottom <= 844 / 2, name
+        assert wait(browser, name, VIEW)[0] >= bottom
+
+
+@pytest.mark.slow
+def test_button_zooms_where_the_picture_was_clicked(address: str, browser: Any) -> None:
+    open_page(browser, address, 1280, 900)
+    place = "const place = Bokeh.index.find_one(it).el.getBoundingClientRect(); return [place.x, place.y, place.width];"
+    x, y, width = wait(browser, "clean", place)
+    for kind in ("mousePressed", "mouseReleased"):
+        event = {"type": kind, "x": x + width / 4, "y": y + 30, "button": "left", "clickCount": 1}
+        browser.execute_cdp_cmd("Input.dispatchMouseEvent", event)
+    time.sleep(1)  # a click waits for a second one
+    press(browser, "Zoom in")
+    wait(browser, "clean", "return it.x_range.end - it.x_range.start < 127")
+    ends = model(browser, "clean", "return [it.x_range.start, it.x_range.end]")
+    assert (32 - ends[0]) / (ends[1] - ends[0]) == pytest.approx(0.25, abs=0.02)  # 128 columns
+    press(browser, "Everything")
+    wait(browser, "clean", "return it.x_range.end - it.x_range.start === 128")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("body", ["", "nikon_d850"], ids=["loading", "computing"])
+def test_closing_a_page_writes_nothing_to_the_terminal(body: str, photos: Path, tmp_path: Path, browser: Any) -> None:
+    with served(photos, tmp_path / "stderr") as address:
+        for _ in range(3):
+            browser.get(address)
+            if body:
+                wait(browser, "command", "return it.text")
+                model(browser, "body", f"it.value = {body!r}")
+            browser.get("about:blank")
+            time.sleep(3)
+    assert (tmp_path / "stderr").read_text() == "gen-dataset: ended by SIGTERM\n"

@@ -74,6 +74,20 @@ def test_wrong_numbers_in_a_row_are_detected(scenes: Path, column: str, factor: 
     assert fit.deviation > 6
 
 
+@pytest.mark.parametrize(("overrides", "prnu"), [((), 0.005), (("clean.includes_fixed_pattern=true",), 0.0)])
+def test_expected_variance_contains_prnu(overrides: tuple[str, ...], prnu: float, settings: Settings) -> None:
+    """The variance of 3200 sites has a relative standard error of √(2 / 3200) = 2.5 %; PRNU adds 50 to 200 % here."""
+    picture = np.broadcast_to(np.linspace(0, 255, 512)[:, None, None], (512, 512, 3)).astype(np.uint8)
+    pair = make_pair(picture, settings("body=sony_a7s2", "scene=daylight", *overrides))
+    fit = fit_pair(pair.clean, pair.noisy, pair.row)
+    assert fit is not None
+    expected_dn2 = np.interp(fit.signal_dn, *fit.line)
+    drawn = (fit.signal_dn > 2000) & (fit.signal_dn < 6000)
+    assert np.count_nonzero(drawn) >= 200  # of at least 16 sites each
+    assert np.mean(fit.variance_dn2[drawn] / expected_dn2[drawn]) == pytest.approx(1, abs=0.1)
+    assert fit.prnu == prnu
+
+
 def test_pair_without_a_range_of_signals_has_no_fit(settings: Settings) -> None:
     pair = make_pair(np.full((64, 64, 3), 90, dtype=np.uint8), settings("camera=identity", "gains=unity"))
     assert fit_pair(pair.clean, pair.noisy, pair.row) is None

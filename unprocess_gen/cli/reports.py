@@ -199,8 +199,8 @@ def explore(call: Call) -> int:
         raise ConfigError(f"explore: {place}: is the folder of a sweep; expected one of its datasets")
     given = {"--config-dir": call.config_dir, "--config-name": call.config_name, "--config-path": call.config_path}
     flags = [word for name, value in given.items() if value is not None for word in (name, str(value))]
-    choices = open_place(place, call.keys, call.overrides, flags, option_folders(call))
-    server.serve(choices, call.port, not call.no_browser, _print_address)
+    start, choices = open_place(place, call.keys, call.overrides, flags, option_folders(call))
+    server.serve(start, choices, call.port, not call.no_browser, _print_address)
     return 0
 
 

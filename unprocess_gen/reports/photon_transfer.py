@@ -11,23 +11,28 @@ from unprocess_gen.core.arrays import Float
 from unprocess_gen.reports.noise_check.pair_scores import Bins, residual_of
 from unprocess_gen.reports.noise_check.repetition import Noise
 from unprocess_gen.reports.pictures import figure_png, new_figure
+from unprocess_gen.simulation.plan_slots import slots_of
 
 LEAST_SITES_OF_POINT = 16
 """Fewest sites of a clean DN whose variance is drawn."""
+POINTS_OF_LINE = 65
+"""Points of the expected variance that are drawn; PRNU bends it."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFit:
     """The line fitted to the noise of the pair with a key: variance against signal above black.
 
-    ``estimate``, its standard ``error`` and what the row ``expected`` are slope (DN) and intercept (DN²). The points
-    are variances without the offsets of rows and columns.
+    ``estimate``, its standard ``error`` and what the row ``expected`` are slope (DN) and intercept (DN²). ``prnu`` is
+    the standard deviation of the relative gain of pixels. The points are variances without the offsets of rows and
+    columns.
     """
 
     key: str
     estimate: Float
     error: Float
     expected: Float
+    prnu: float
     signal_dn: Float
     variance_dn2: Float
 
@@ -38,9 +43,9 @@ class NoiseFit:
 
     @property
     def line(self) -> tuple[Float, Float]:
-        """Ends of the expected line."""
-        ends = np.array([self.signal_dn.min(initial=0.0), self.signal_dn.max(initial=1.0)])
-        return ends, self.expected[0] * ends + self.expected[1]
+        """Points of the expected variance: the line, and the square of the signal that PRNU adds."""
+        signal_dn = np.linspace(self.signal_dn.min(initial=0.0), self.signal_dn.max(initial=1.0), POINTS_OF_LINE)
+        return signal_dn, self.expected[0] * signal_dn + self.expected[1] + (self.prnu * signal_dn) ** 2
 
     def __str__(self) -> str:
         numbers = zip("ab", ("DN", "DN²"), self.estimate, NORMAL_95 * self.error, self.expected, strict=True)
@@ -65,7 +70,9 @@ def fit_noise(noise: Noise | None) -> NoiseFit | None:
     spread += noise.rounding_dn2 * (noise.rounding_dn2 + expected[0] ** 2)
     by_point = influence(np.stack([bins.signal, np.ones_like(bins.signal)]), 1 / spread)
     estimate, error = expected + by_point @ (variances[0] - variances[1]), np.sqrt(by_point**2 @ spread)
-    return NoiseFit(noise.key, estimate, error, expected, bins.signal[drawn], variances[0][drawn])
+    pattern = None if noise.plan.averaged else slots_of(noise.plan).patterns.electrons
+    prnu = 0.0 if pattern is None else pattern.std
+    return NoiseFit(noise.key, estimate, error, expected, prnu, bins.signal[drawn], variances[0][drawn])
 
 
 def draw_fits(fits: list[NoiseFit]) -> bytes:

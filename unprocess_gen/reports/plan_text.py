@@ -301,13 +301,18 @@ def _effect_table(config: Config, levels: Sequence[Sequence[Prediction]]) -> lis
         if interpretation.missing_number(config.noise, effect.name) is not None:
             size = "", "", ""
         elif effect.has_outliers:
-            size = f"{strongest.outliers:.3g} pixels", "outliers", ""
+            size = f"{_count_text(strongest.outliers)} pixels", "outliers", ""
         images = f"{sum(image.simulated for image in by_image)} of {len(by_image)}"
         reason = _reason(strongest, config.effects.tolerance)
         if strongest.simulated and interpretation.assumed_numbers(config.noise, effect.name):
             reason += " (assumed number)"
         lines.append(_TABLE_LINE.format(effect.name, *size, images, reason).rstrip())
     return lines
+
+
+def _count_text(expected: float) -> str:
+    """An expected count in at most six characters."""
+    return "<0.01" if 0 < expected < 0.01 else f"{expected:.3g}" if expected < 1000 else f"{expected:.0f}"
 
 
 def _reason(prediction: Prediction, tolerance: float) -> str:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
+from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.core.source import NO_CLIP, Source
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import recorded_places
@@ -32,7 +34,7 @@ from unprocess_gen.dataset.row import pair_row
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.reports.estimate import predicted_levels
-from unprocess_gen.reports.explorer.overrides import overrides_of
+from unprocess_gen.reports.explorer.overrides import key_of, override_word, overrides_of
 from unprocess_gen.reports.panels import MosaicArray
 from unprocess_gen.reports.plan_text import noise_lines
 from unprocess_gen.simulation import self_test
@@ -48,6 +50,8 @@ from unprocess_gen.sources.patches import crop_patch
 
 PAIR_FOLDER = "pair"
 """Folder of the dataset that the command of a page makes."""
+PLACE_KEYS = ("source.root", "source.list", "source.limit", "source.include")
+"""Keys that say which photograph is open; a page has a control of its own for them."""
 SOURCES_LISTED = 1000
 """Photographs or rows that a page offers; the others are opened by their name or key."""
 
@@ -73,17 +77,17 @@ class Shown(NamedTuple):
     dark_pixels: DarkPixels | None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Exploration:
     """The settings of a page, by key as texts, and which pair of them is shown.
 
-    ``others`` are overrides that add something (``+experiment=…``), ``flags`` are flags of Hydra. ``index`` is the
-    number of the source in the listing, ``part`` the rest of the key of the pair.
+    ``typed`` are the overrides in the field of other settings, which win over ``settings``; ``flags`` are flags of
+    Hydra. ``index`` is the number of the source in the listing, ``part`` the rest of the key of the pair.
     """
 
     folders: OptionFolders
     settings: dict[str, str] = field(default_factory=dict)
-    others: tuple[str, ...] = ()
+    typed: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
     index: int = 0
     part: str = ""
@@ -91,13 +95,15 @@ class Exploration:
     @property
     def overrides(self) -> list[str]:
         """The settings as a command line has them."""
-        return [*self.others, *(f"{key}={text}" for key, text in self.settings.items())]
+        typed = set(map(key_of, self.typed))
+        return [*self.typed, *(f"{key}={text}" for key, text in self.settings.items() if key not in typed)]
 
     @property
     def command(self) -> str:
         """The command that generates the pair, with the other pairs of its sources."""
-        out = [] if "out" in self.settings else [f"out={PAIR_FOLDER}"]
-        return shlex.join(["gen-dataset", *self.flags, *self.overrides, *out])
+        overrides = self.overrides
+        out = [] if "out" in map(key_of, overrides) else [f"out={PAIR_FOLDER}"]
+        return shlex.join(["gen-dataset", *self.flags, *overrides, *out])
 
     @property
     def source_config(self) -> SourceConfig:
@@ -109,26 +115,37 @@ class Exploration:
         require_photographs(config.source, "explore")
         return config, choices
 
-    def add(self, overrides: Sequence[str]) -> None:
-        """Apply overrides as the command line does."""
-        for override in overrides:
-            key, _, text = override.partition("=")
-            if key.startswith(("+", "~")) or not text:
-                self.others += (override,)
-            else:
-                self.settings.pop(key, None)
-                self.settings[key] = text
+    def with_settings(self, settings: dict[str, str]) -> Exploration:
+        """Set keys, and remove them from the typed ones."""
+        kept = self.without(settings.__contains__)
+        return replace(kept, settings=kept.settings | settings)
 
-    def choose(self, group: str, option: str | None) -> None:
+    def with_option(self, group: str, option: str | None) -> Exploration:
         """Choose an option of a group, None for none, and forget settings that it replaces."""
         replaced = (group, "camera", "sensor", "noise") if group == "body" else (group,)
-        self.settings = {key: text for key, text in self.settings.items() if key.partition(".")[0] not in replaced}
-        self.settings[group] = "null" if option is None else option
+        kept = self.without(lambda key: key.partition(".")[0] in replaced)
+        return kept.with_settings({group: "null" if option is None else option})
+
+    def with_field(self, controls: Container[str]) -> Exploration:
+        """Move settings without a control to the typed ones, except the place of the sources."""
+        moved = [key for key in self.settings if key not in controls and key not in PLACE_KEYS]
+        words = [override_word(key, self.settings[key]) for key in moved]
+        return replace(self.without(moved.__contains__), typed=(*self.typed, *words))
+
+    def without(self, is_replaced: Callable[[str], bool]) -> Exploration:
+        """Forget the settings of some keys, typed ones too."""
+        settings = {key: text for key, text in self.settings.items() if not is_replaced(key)}
+        return replace(self, settings=settings, typed=tuple(w for w in self.typed if not is_replaced(key_of(w))))
 
     def shown(self) -> Shown:
         """Make the pair; ConfigError, SourceError or MachineError with the sentence of the command line."""
         config, choices = self._composed()
-        source, settings = listed_sources(config.source)[self.index], PairSettings.read(config)
+        sources, settings = listed_sources(config.source), PairSettings.read(config)
+        if self.index >= len(sources):
+            raise ConfigError(
+                f"the settings list {len(sources)} sources, too few for number {self.index}; open another"
+            )
+        source = sources[self.index]
         sha256, photograph = _loaded_source(config.source, source, config.output.layout)
         image = plan_pixels(settings, photograph, source, sha256)
         is_cut, several = config.source.patch is not None, len(image.plans) > 1
@@ -176,27 +193,34 @@ def _loaded_source(config: SourceConfig, source: Source, layout: str) -> tuple[s
 
 # ------------------------------------------------------------------------------------------------------------- opening
 
-Choices = dict[str, Callable[[], Exploration]]
-"""What a page offers to open, by its label."""
+Choices = dict[str, Callable[[Exploration], Exploration]]
+"""What a page offers to open, by its label: each changes what the page shows."""
 
 
 def open_place(
     place: AnyPath | None, keys: str | None, overrides: Sequence[str], flags: Sequence[str], folders: OptionFolders
-) -> Choices:
-    """List the explorations of a photograph, a folder, a dataset, or without a place of ``source.root``."""
-    start = Exploration(folders, flags=tuple(flags))
-    start.add(overrides)
+) -> tuple[Exploration, Choices]:
+    """List what a photograph, a folder, a dataset, or without a place ``source.root`` offers to open, and the start."""
+    added = tuple(override for override in overrides if override.startswith(("+", "~")) or "=" not in override)
+    given = dict(override.split("=", 1) for override in overrides if override not in added)
+    start = Exploration(folders, given, added, tuple(flags))
     if place is not None and is_dataset(place):
-        return _open_rows(place, keys, start)
+        return start, _open_rows(place, keys, start)
     if keys is not None:
         raise ConfigError(f"--keys {keys}: {place or 'the source'} is no dataset; expected one; leave --keys out")
     if place is not None:
         if root := start.settings.get("source.root"):
             raise ConfigError(f"explore: {place}: the source is also given by source.root={root}; expected one of them")
-        start.settings["source.root"] = _path_text(str(place))
+        start = start.with_settings({"source.root": _path_text(str(place))})
     config = start.source_config
+    names = [] if place is None else list(any_path(place).entries()) or [place.name]
+    if names and all(PurePosixPath(name).suffix.lower() in RAW_FILES for name in names):
+        steps = f"gen-dataset source.kind=raw source.root={shlex.quote(str(place))} out=ds, then gen-dataset report ds"
+        raise ConfigError(f"explore: {place}: raw frames cannot be explored; expected photographs; run {steps}")
     sources = listed_sources(config)[:SOURCES_LISTED]
-    return {f"{source.index} {source.name}": partial(_open_source, start, config, source) for source in sources}
+    return start, {
+        f"{source.index} {source.name}": partial(_open_source, config=config, source=source) for source in sources
+    }
 
 
 def _path_text(path: str) -> str:
@@ -211,10 +235,11 @@ def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Ex
     if root is not None and is_alone and any_path(root).is_dir():
         path = _path_text(f"{root.rstrip('/')}/{source.path}")
         kept = {key: text for key, text in state.settings.items() if key not in ("source.limit", "source.include")}
-        return replace(state, settings=kept | {"source.root": path})
+        return replace(state, settings=kept | {"source.root": path}, index=0, part="")
     is_last = source.index + 1 == len(listed_sources(config))
-    limit = {} if is_last else {"source.limit": str(source.index + 1)}
-    return replace(state, settings=state.settings | limit, index=source.index)
+    limit = config.limit if is_last else source.index + 1
+    state = replace(state.without("source.limit".__eq__), index=source.index, part="")
+    return state if limit is None else state.with_settings({"source.limit": str(limit)})
 
 
 def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices:
@@ -223,11 +248,12 @@ def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices
     rows = list(islice(select_pairs(manifest, keys).rows.values() if keys else pairs, SOURCES_LISTED))
     if not rows:
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
-    return {f"{row['key']} {row['source']}": partial(_open_row, folder, row, start) for row in rows}
+    opened = partial(_open_row, folder=folder, start=start)
+    return {f"{row['key']} {row['source']}": partial(opened, row=row) for row in rows}
 
 
-def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
-    """Write the settings of a dataset as overrides that give the pair of the row."""
+def _open_row(_: Exploration, folder: AnyPath, row: Row, start: Exploration) -> Exploration:
+    """Write the settings of a dataset as overrides that give the pair of the row, whatever was shown before."""
     given = dict(start.settings)
     recorded, kind = read_dataset_yaml(folder / "config.yaml")
     settings = overrides_of(recorded)
@@ -238,9 +264,9 @@ def _open_row(folder: AnyPath, row: Row, start: Exploration) -> Exploration:
     for key, place in places.settings.items():
         if place:
             settings[key] = _path_text(place)
-    state = replace(start, settings=settings | given, part=str(row["key"]).removeprefix(image_key(row)))
+    state = replace(start, settings=settings | given)
     config = state.source_config
     source = next((source for source in listed_sources(config) if source.name == row["source"]), None)
     if source is None:
         raise ConfigError(f"explore: {row['source']}: is not among the sources of {folder}; restore the photograph")
-    return _open_source(state, config, source)
+    return replace(_open_source(state, config, source), part=str(row["key"]).removeprefix(image_key(row)))

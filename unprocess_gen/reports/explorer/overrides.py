@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
+import os
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -19,6 +21,8 @@ from unprocess_gen.core.fields import is_number
 
 WORDS_OF_HYDRA = ("null", "true", "false", "nan", "inf")
 """Words that are no texts in overrides."""
+QUOTED = re.compile(r"""'(?:\\.|[^'\\])*(?:'|$)|"(?:\\.|[^"\\])*(?:"|$)""")
+"""A text in quotes, or from a quote to the end."""
 NAMED_GROUPS = ("camera", "noise", "scene")
 """Groups whose config contains the name of its option."""
 
@@ -59,3 +63,25 @@ def override_text(value: Any) -> str:
     text = str(value)
     is_word = re.fullmatch(r"[A-Za-z_]\w*", text, re.ASCII) and text.lower() not in WORDS_OF_HYDRA
     return text if is_word else quoted(text)
+
+
+def key_of(override: str) -> str:
+    """The key or group that an override sets."""
+    return override.lstrip("+").partition("=")[0]
+
+
+def override_word(key: str, text: str) -> str:
+    """An override that `split_overrides` keeps in one piece, whatever follows."""
+    word = f"{key}={text}"
+    return word if split_overrides(f"{word} +") == (word, "+") else f"{key}={quoted(os.path.expanduser(text))}"
+
+
+def split_overrides(text: str) -> tuple[str, ...]:
+    """Split a line at blanks outside of quotes and brackets; a word that is in quotes, as in a shell, loses them."""
+    masked = QUOTED.sub(lambda match: "_" * len(match[0]), text)
+    depths = itertools.accumulate((mark in "[{(") - (mark in "]})") for mark in masked)
+    marks = zip(text, masked, depths, strict=True)
+    ends = "".join("\n" if mark.isspace() and depth <= 0 else character for character, mark, depth in marks)
+    return tuple(
+        word[1:-1] if QUOTED.fullmatch(word) and word[0] == word[-1] else word for word in ends.split("\n") if word
+    )

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import PACKED, Float
+from unprocess_gen.core.arrays import PACKED, Float, Srgb
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.explorer.exploration import Shown
 from unprocess_gen.reports.noise_check.repetition import measure_noise
@@ -28,6 +28,46 @@ PICTURES = {
 
 VIEW_PX = (360, 480)
 """Most rows and columns of a picture; of a larger window, means of sites are drawn."""
+SMALLEST_PX = 8
+"""Fewest sites of a side of the window."""
+DETAIL_PX = 160
+"""Columns of the window that shows the finest detail: a site is about two pixels of the screen."""
+MOVES = {
+    "Zoom in": (0.5, 0, 0),
+    "Zoom out": (2, 0, 0),
+    "Left": (1, 0, -0.25),
+    "Right": (1, 0, 0.25),
+    "Up": (1, -0.25, 0),
+    "Down": (1, 0.25, 0),
+    "Detail": (0, 0, 0),
+    "Everything": (np.inf, 0, 0),
+}
+"""Buttons: the factor of the size of the window, and its steps down and to the right in parts of its size."""
+
+
+def moved(label: str, window: Float, shown: Shown, pointed: tuple[float, float] | None) -> Float:
+    """First and last row and column, [2, 2], of the window after a move.
+
+    It is zoomed about the site that was pointed at, or else the finest detail, or its centre if that is not in view.
+    """
+    shape, (factor, *steps) = np.array(shown.clean.shape, float), MOVES[label]
+    site = np.array(pointed or finest_detail(shown.srgb))
+    if label == "Detail":
+        site = np.array(finest_detail(shown.srgb))
+        window, factor = np.stack([site - shape / 2, site + shape / 2], axis=1), min(1, DETAIL_PX / shape[1])
+    low, high = window.T
+    site = site if ((low <= site) & (site <= high)).all() else (low + high) / 2
+    size = np.minimum((high - low) * max(factor, SMALLEST_PX / (high - low).min()), shape)
+    start = np.clip(site - (site - low) * size / (high - low) + np.array(steps) * size, 0, shape - size)
+    return np.stack([start, start + size], axis=1)
+
+
+def finest_detail(srgb: Srgb) -> tuple[float, float]:
+    """Row and column about which the mean square of the Laplacian of a photograph is largest."""
+    squares: Any = cv2.Laplacian(srgb.mean(axis=2, dtype=np.float32), cv2.CV_32F) ** 2
+    sums: Any = cv2.boxFilter(squares, -1, (DETAIL_PX, DETAIL_PX), borderType=cv2.BORDER_CONSTANT)
+    row, column = np.unravel_index(int(sums.argmax()), sums.shape)
+    return float(row), float(column)
 
 
 def view(shown: Shown, window: panels.Window, common: bool) -> dict[str, Any]:
@@ -96,7 +136,7 @@ class Curve(NamedTuple):
 
 
 def curves(shown: Shown, fit: NoiseFit | None) -> dict[str, list[Curve]]:
-    """The curves of `PLOTS`; the photon transfer has the expected line."""
+    """The curves of `PLOTS`; the photon transfer has the expected variance."""
     camera, isp, light = shown.plan.camera, shown.plan.isp, np.linspace(0, 1, 201)
     grey = np.repeat(light[:, None], 3, axis=1)
     inverted = unprocess.invert_gains(grey, camera.inverse_gains, isp.highlight, isp.highlight_threshold)
