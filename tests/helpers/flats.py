@@ -21,13 +21,12 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.effects.dead_pixels import DeadPixels
 from unprocess_gen.simulation.effects.hot_pixels import HotPixels
 from unprocess_gen.simulation.effects.prnu import Prnu
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, Plan, SensorPlan
 from unprocess_gen.simulation.reference.colour import IDENTITY
-from unprocess_gen.simulation.reference.electrons import bright_means_e, normal_pattern, with_dead_pixels
+from unprocess_gen.simulation.reference.electrons import bright_means_e, normal_pattern
 from unprocess_gen.sources import synthetic
 
 SHA256 = "7" * 64
@@ -144,8 +143,3 @@ def hot_pixel_means(physics: Physics, shape: tuple[int, int], origin: tuple[int,
 
 def response(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
     return normal_pattern(Prnu().slots(plan_with("prnu").replace(physics=physics))["electrons"], shape, origin)
-
-
-def dead(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
-    plan = plan_with("dead_pixels").replace(physics=physics)
-    return with_dead_pixels(np.full(shape, -1.0), DeadPixels().slots(plan)["dead"], origin) >= 0

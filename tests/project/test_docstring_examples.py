@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 import unprocess_gen as ug
+import unprocess_gen.testing
 
 FIRST = ("generate", "verify", "replay")
 """Functions whose examples write or read the dataset ``ds``, in the order of its use."""
 
 NAMES = [*FIRST, *(name for name in ug.__all__ if inspect.isfunction(getattr(ug, name)) and name not in FIRST)]
-NAMES += ["RawPairs", "CameraNoise", "CameraNoise.fit"]
+NAMES += ["RawPairs", "CameraNoise", "CameraNoise.fit", "testing.EffectTests", "testing.BodyTests"]
 
 
 def test_examples_of_the_api_give_their_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

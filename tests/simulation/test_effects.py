@@ -163,21 +163,6 @@ def assert_normal_offsets(offsets: np.ndarray, std: float) -> None:
     assert bounds_off(offsets**2, variance, 2 * variance**2, reach**2) <= 1
 
 
-@pytest.mark.parametrize(
-    ("effect", "shape", "is_fixed"),
-    [("row", (OFFSETS, 5), False), ("column", (5, OFFSETS), True), ("column_temporal", (5, OFFSETS), False)],
-)
-def test_lines_have_one_offset_of_given_standard_deviation(effect: str, shape: tuple[int, int], is_fixed: bool) -> None:
-    plan = plan_with(effect, **{f"{effect}_std_dn": 300.0})
-    one, later = (noisy_dn(plan.replace(frame=frame), 0, *shape) for frame in (1, 2))
-    assert (one == (one[:, :1] if shape[0] == OFFSETS else one[:1])).all()
-    offsets, others = (frame.ravel("F" if shape[0] == OFFSETS else "C")[:OFFSETS] for frame in (one, later))
-    assert_normal_offsets(offsets, 300.0)
-    assert (one == later).all() == is_fixed
-    if not is_fixed:
-        assert_normal_offsets((offsets - others) / math.sqrt(2), 300.0)
-
-
 @pytest.mark.parametrize("correlation", [0.9, 0.5, -0.7])
 def test_correlated_rows_are_an_autoregressive_process(correlation: float) -> None:
     """What a row adds to its share of the row before is independent, with variance 1 - r² of that of an offset."""
@@ -189,14 +174,6 @@ def test_correlated_rows_are_an_autoregressive_process(correlation: float) -> No
     repeated = (1 + correlation**2) / (1 - correlation**2)  # squares of neighbours have the correlation r²
     bound = bernstein(2 * 300.0**4, (REACH * 300) ** 2, int(rows.size / repeated))
     assert abs(float((rows**2).mean()) - 300.0**2) <= bound
-
-
-def test_dsnu_is_a_fixed_offset_of_each_pixel_of_a_body() -> None:
-    plan = plan_with("dsnu", dsnu_std_e=40.0)  # 8 DN per electron
-    one, later, other = (noisy_dn(one) for one in (plan, plan.replace(stream_key=2), with_physics(plan, body_key=9)))
-    assert (one == later).all()
-    assert_normal_offsets(one.ravel()[:OFFSETS], 320.0)
-    assert_normal_offsets((one - other).ravel()[:OFFSETS] / math.sqrt(2), 320.0)
 
 
 # Gain by colour and lens shading -------------------------------------------------------------------------------------
@@ -275,10 +252,6 @@ def hot() -> np.ndarray:
     return hot_pixel_means(SILENT.replace(hot_pixel_share=SHARE, hot_pixel_e=200.0), (1024, 1024))
 
 
-def test_hot_pixels_have_given_fraction(hot: np.ndarray) -> None:
-    assert bounds_off(hot > 0, SHARE, SHARE * (1 - SHARE), 1) <= 1
-
-
 def test_hot_pixel_means_are_exponential(hot: np.ndarray) -> None:
     """Bound the Kolmogorov distance (Dvoretzky, Kiefer, Wolfowitz, Massart); levels have steps of 1/1024."""
     means = np.sort(hot[hot > 0])
@@ -307,31 +280,7 @@ def test_hot_pixels_add_poisson_count_of_their_mean(hot: np.ndarray) -> None:
     assert abs(float(score.mean())) <= bound
 
 
-def test_hot_and_dead_pixels_are_fixed_per_sensor_unit() -> None:
-    plan = plan_with("hot_pixels", "dead_pixels", hot_pixel_share=SHARE, hot_pixel_e=1e4, dead_pixel_share=SHARE)
-    one, later = (noisy_dn(plan.replace(stream_key=frame), 0) for frame in (1, 2))
-    shining = [np.abs(frame) > 8 * 500 for frame in (one, later)]  # hot enough, or dead
-    assert ((one == -BLACK) == (later == -BLACK)).all()
-    assert (shining[0] != shining[1]).mean() < SHARE / 50  # those whose mean is 500
-    assert (one != later).any()
-
-
-@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
-def test_dead_pixels_read_a_fraction_of_black_and_have_given_fraction(level: float) -> None:
-    plan = plan_with("read", "dead_pixels", dead_pixel_share=SHARE, dead_pixel_level=level, read_std_dn=30.0)
-    frame = make_pair(flat(40000), plan).noisy
-    dead_dn = level * BLACK
-    assert bounds_off(frame == dead_dn, SHARE, SHARE * (1 - SHARE), 1) <= 1
-    assert frame[frame != dead_dn].min() > 30000
-
-
 # Fixed patterns -------------------------------------------------------------------------------------------------------
-
-
-def test_prnu_has_mean_1_and_given_standard_deviation() -> None:
-    pattern = response(SILENT.replace(prnu_std=0.01), (1024, 1024))
-    assert bounds_off(pattern, 1, 1e-4, REACH * 0.01) <= 1
-    assert bounds_off((pattern - 1) ** 2, 1e-4, 2e-8, (REACH * 0.01) ** 2) <= 1
 
 
 @pytest.mark.parametrize("code", [0, 800, 20000, 50000])
