@@ -230,7 +230,7 @@ def test_folder_of_another_job_is_refused_and_its_row_stays(run_main: RunMain, s
     before = (tmp_path / "sweep/sweep.csv").read_bytes()
     done = run_main(*sweep, "isp=srgb")
     assert (done.code, done.err.count("was begun with other settings: isp.")) == (2, 2)
-    assert messages(done.out)[-1] == "sweep: 0 of 2; sweep/sweep.csv has the exit codes"
+    assert messages(done.out)[-1] == "sweep: 0 of 2"
     assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 import functools
 import os
+import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -177,8 +179,13 @@ class _Parser(argparse.ArgumentParser):
 
 def parse(verb: Verb, arguments: Sequence[str]) -> Call:
     """Parse what follows a verb; everything after ``--`` is a word, even with a leading hyphen."""
+    from unprocess_gen.config.option_files import group_options
     from unprocess_gen.core.paths import any_path  # --help needs no paths
 
+    name = arguments[0] if arguments else ""
+    if name in group_options(verb.name) and not os.path.lexists(name):
+        remedy = f"for the option of this name, write gen-dataset {verb.name}={name}"
+        raise ConfigError(f"{verb.name}: {name}: no such file; {remedy}")
     cut = arguments.index("--") if "--" in arguments else len(arguments)
     call, rest = verb.parser.parse_known_args(arguments[:cut], Call(verb=verb, words=list(arguments)))
     for word in rest:
@@ -197,9 +204,11 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
         elif verb.composes and (equals or word.startswith("~")):
             call.overrides.append(word)
         elif verb.composes:
-            raise ConfigError(f"{verb.name}: {word}: expected a setting key=value{path_hint(word)}")
+            hint = _quotes_hint(call.words, word) or path_hint(word)
+            raise ConfigError(f"{verb.name}: {word}: expected a setting key=value{hint}")
         else:
             raise ConfigError(f"{verb.name}: {word}: unknown argument; {_expected(verb, key)}")
+    _refuse_expanded_braces(call.overrides)
     return call
 
 
@@ -229,6 +238,37 @@ def path_hint(word: str) -> str:
     if any((path / name).is_file() for name in ("dataset.json", "manifest.csv", "sweep.csv")):
         return f"; {word} is a dataset: write gen-dataset verify {word}, or another verb"
     return f"; {word} is a file or folder: write source.root={word}"
+
+
+def _quotes_hint(words: Sequence[str], word: str) -> str:
+    """Remedy for a part of a list that the shell split at blanks; empty for other words."""
+    at = words.index(word)
+    start = next((index for index in range(at, -1, -1) if "=" in words[index]), None)
+    if start is None or not (_is_open(words[start]) or words[start].endswith(",")):
+        return ""
+    end = start + 1
+    while end < len(words) and "=" not in words[end] and (_is_open(" ".join(words[start:end])) or end <= at):
+        end += 1
+    return f"; write {shlex.quote(' '.join(words[start:end]))} in quotes"
+
+
+def _is_open(text: str) -> bool:
+    """True if a bracket of a text is not closed."""
+    return sum(map(text.count, "[{(")) > sum(map(text.count, "]})"))
+
+
+def _refuse_expanded_braces(overrides: Sequence[str]) -> None:
+    """Refuse a mapping that the shell expanded to several overrides: ``split={a:1,b:2}`` without quotes."""
+    parts = [re.fullmatch(r"(\S+?=\[*)([\w-]+:[^{}\[\]:]+)(\]*)", text) for text in overrides]
+    items: dict[tuple[str, str], list[str]] = {}
+    for part in filter(None, parts):
+        items.setdefault((part[1], part[3]), []).append(part[2])
+    for (before, after), pairs in items.items():
+        if len(pairs) > 1:
+            written = shlex.quote(f"{before}{{{','.join(pairs)}}}{after}")
+            raise ConfigError(
+                f"{before}{pairs[0]}{after}: {before.partition('=')[0]} is given twice; write {written} in quotes"
+            )
 
 
 def _setting_hint(verb: Verb, word: str) -> str:

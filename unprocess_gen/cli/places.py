@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from unprocess_gen.core.paths import AnyPath
@@ -30,9 +30,7 @@ def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> 
         raise ConfigError(f"{verb}: {path}: is a file; expected {place.expected}")
     is_sweep = (path / "sweep.csv").is_file()
     if not is_sweep and not any((path / name).exists() for name in DATASET_ENTRIES):
-        # a dataset without any of its files is damaged; only again, which reads settings, calls it wrong usage
-        error = ConfigError if verb == "again" else DamageError
-        raise error(f"{verb}: {path}: not a dataset; expected {place.expected}")
+        raise ConfigError(f"{verb}: {path}: not a dataset; expected {place.expected}")
     if is_sweep and not sweeps and not (path / "dataset.json").exists():
         datasets = sorted(str(path / name) for name in path.entries() if (path / name / "dataset.json").is_file())
         example = f", such as {datasets[0]}" if datasets else ""

@@ -47,9 +47,8 @@ def _generate_all(jobs: Sequence[Job], work: Callable[[Job], list[str]]) -> int:
     code = run_jobs(jobs, work, has_table=True)
     if jobs and (sweep := jobs[0].sweep) is not None:
         done = sum(job.code == DONE for job in jobs)
-        place = shlex.quote(str(sweep))
-        after = f"next: gen-dataset verify {place}" if code == DONE else f"{sweep}/sweep.csv has the exit codes"
-        print_results(f"{sweep}: {done} of {len(jobs)}; {after}")
+        after = f"; next: gen-dataset verify {shlex.quote(str(sweep))}" if code == DONE else ""
+        print_results(f"{sweep}: {done} of {len(jobs)}{after}")
     return code
 
 

@@ -163,11 +163,19 @@ def _are_shares(value: Any) -> bool:
     return has_names and has_shares and abs(sum(value.values()) - 1) <= 1e-9
 
 
+def _shares_text(value: Any) -> str:
+    """Write shares, with their sum if it is not 1."""
+    text = value_text(value)[:80]
+    if not isinstance(value, dict) or not all(map(is_number, value.values())) or abs(sum(value.values()) - 1) <= 1e-9:
+        return text
+    return f"{text} (sum {sum(value.values()):.6g})"
+
+
 SPLIT = Limit(
     "null, or shares above 0 that sum to 1 by name, such as {train: 0.8, val: 0.2}; "
     f"up to {MAX_SPLITS} names of up to 32 letters, digits, _ and -",
     _are_shares,
-    lambda value: value_text(value)[:80],
+    _shares_text,
 )
 
 TARGET_NAMES = Limit(f"[] or [{LINEAR_RGB}]", lambda value: tuple(value) in ((), (LINEAR_RGB,)))

@@ -137,7 +137,7 @@ def resolve(config: Config) -> Run:
 
     ConfigError if sources or dark frames cannot be used, SourceChangedError if recorded dark frames changed.
     """
-    listing, settings = list_photographs(config.source), PairSettings.read(config)
+    listing, settings = list_photographs(config.source, config.out), PairSettings.read(config)
     if settings.dark_folder is not None and settings.dark_folder.warning:
         listing = replace(listing, warnings=(*listing.warnings, settings.dark_folder.warning))
     return Run(settings, listing)

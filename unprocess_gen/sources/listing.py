@@ -75,8 +75,10 @@ class Listing:
         return sum(self.unmatched.values())
 
 
-def list_photographs(config: SourceConfig) -> Listing:
+def list_photographs(config: SourceConfig, out: str | None = None) -> Listing:
     """List every source of a run in order, with identical files and frames of clips numbered; decode no pixel.
+
+    The files of the dataset ``out`` do not count as unmatched.
 
     Raises ConfigError for a folder or a list that cannot be used, MachineError if a file changes while it is hashed.
     """
@@ -86,7 +88,8 @@ def list_photographs(config: SourceConfig) -> Listing:
         pictures = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(names))
         return Listing(number_clips(None, pictures) if config.clips else pictures)
     if config.list is None:
-        listed = list_folder(place, config.include, config.recursive, config.limit, config.exclude)
+        own = "" if out is None else os.path.relpath(os.path.realpath(out), os.path.realpath(place))
+        listed = list_folder(place, config.include, config.recursive, config.limit, config.exclude, own)
     else:
         listed = list_file(place, config.list, config.limit)
     listed = replace(listed, sources=number_twins(place, listed.sources))
@@ -102,10 +105,11 @@ def list_photographs(config: SourceConfig) -> Listing:
 
 
 def list_folder(
-    root: str, include: Sequence[str], recursive: bool, limit: int | None, exclude: Sequence[str] = ()
+    root: str, include: Sequence[str], recursive: bool, limit: int | None, exclude: Sequence[str] = (), own: str = ""
 ) -> Listing:
     """List the files below ``root`` that the globs match, ordered by the bytes of their relative paths.
 
+    Files below ``own``, the relative path of a dataset, do not count as unmatched.
     Hidden files and folders are left out, with a warning. A single file is listed whatever the globs are. ConfigError
     if the root does not exist, a sub-folder cannot be read, or no file matches.
     """
@@ -124,7 +128,7 @@ def list_folder(
                 continue
             elif entry.kind not in (EntryKind.FOLDER, EntryKind.LOOP) and is_included(entry.path):
                 matched.append(entry)
-            elif entry.kind is EntryKind.FILE:
+            elif entry.kind is EntryKind.FILE and not (own and entry.path.startswith(f"{own}/")):
                 suffixes[PurePosixPath(encode_name(entry.path)).suffix.lower()] += 1
             elif entry.kind is EntryKind.UNREADABLE and recursive:  # may be a folder of photographs
                 raise OSError(0, entry.problem, os.path.join(root, entry.path))
