@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -39,8 +39,8 @@ class CameraNoise:
 
     Parameters
     ----------
-    config : Config, or sequence of str
-        From `load_config`, or Hydra overrides. Everything random is drawn for each index: camera, gains, noise.
+    config : Config, sequence of str, or mapping
+        From `load_config`, or what it takes. Everything random is drawn for each index: camera, gains, noise.
     demosaic : str
         ``"malvar"``, the filters of Malvar, He and Cutler, or ``"bilinear"``.
     jpeg : int or list, optional
@@ -99,7 +99,7 @@ class CameraNoise:
 
     def __init__(
         self,
-        config: Config | Sequence[str] = (),
+        config: Config | Sequence[str] | Mapping[str, Any] = (),
         demosaic: str = "malvar",
         jpeg: int | Sequence[Any] | None = None,
         seed: int = 0,
@@ -126,7 +126,10 @@ class CameraNoise:
 
     @classmethod
     def fit(
-        cls, pairs: Iterable[tuple[ArrayLike, ArrayLike]], config: Sequence[str] = ("gains=fixed",), **options: Any
+        cls,
+        pairs: Iterable[tuple[ArrayLike, ArrayLike]],
+        config: Sequence[str] | Mapping[str, Any] = ("gains=fixed",),
+        **options: Any,
     ) -> CameraFit:
         """Fit the noise to real pairs of a noisy and a clean picture.
 
@@ -135,8 +138,8 @@ class CameraNoise:
         pairs : iterable of (array_like, array_like)
             Noisy and clean picture of one scene, in this order, uint8 or uint16 [H, W, 3], of one camera and ISO. All
             pairs together are cut to 2**19 pixels, each to its middle.
-        config : sequence of str
-            Hydra overrides of everything but noise. ``isp=`` and ``camera=`` fix what is fitted otherwise.
+        config : sequence of str, or mapping
+            What `load_config` takes, for everything but noise. ``isp=`` and ``camera=`` fix what is fitted otherwise.
         **options : Any
             Keyword arguments of `CameraNoise` that are known, such as ``jpeg=75``.
 

@@ -60,7 +60,7 @@ GRAPH = {name: modules & NAMES for name, modules in IMPORTS.items()}
 
 ONLY_IN = {
     "hydra": {"config.composition", "config.composition_errors"},
-    "omegaconf": {"config.composition", "config.composition_errors", "config.serialization"},
+    "omegaconf": {"config.composition", "config.composition_errors", "config.overrides", "config.serialization"},
     "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},
     "numba": {"simulation.kernels.jit", "simulation.kernels.simd"},

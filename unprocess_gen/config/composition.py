@@ -12,7 +12,6 @@ import functools
 import itertools
 import math
 import os
-import re
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -42,6 +41,7 @@ from unprocess_gen.config.option_files import (
     check_override,
     group_options,
 )
+from unprocess_gen.config.overrides import PATH_KEYS, overrides_of_mapping, quoted
 from unprocess_gen.config.raw_validation import check_raw_overrides
 from unprocess_gen.config.schema import CHOSEN, TWO_NUMBERS, Config, NoiseConfig
 from unprocess_gen.config.serialization import writable_node
@@ -61,9 +61,6 @@ VERSION_BASE = "1.3"
 
 PLAIN_ERRORS = (ValueError, TypeError, AttributeError, AssertionError, OSError, RecursionError)
 """Other exceptions that Hydra and OmegaConf raise for wrong overrides and files."""
-
-PATH_KEYS = ("source.root", "source.list", "noise.dark_frames", "out")
-"""Keys whose values are paths, which are quoted for Hydra's grammar."""
 
 SHORTHANDS = {"source.kind=raw": "source=raw", "source.kind=srgb": "source=default"}
 """Overrides that choose an option, because patterns and sensor follow from the kind of the source."""
@@ -85,16 +82,20 @@ NO_EFFECT: dict[str, Any] = {
 """Settings of Hydra that have no effect here, with Hydra's own values; files with others are refused."""
 
 
-def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str] | None = None) -> Config:
+def load_config(
+    overrides: Sequence[str] | Mapping[str, Any] = (), config_dir: str | os.PathLike[str] | None = None
+) -> Config:
     r"""Compose and validate the config of one dataset.
 
     Works inside a running Hydra application and without one; the application's own config is left unchanged.
 
     Parameters
     ----------
-    overrides : sequence of str
+    overrides : sequence of str, or mapping
         Hydra overrides, as on the command line: ``["camera=sony_a7r", "noise.draws=2"]``. Values of ``source.root``
-        and ``out`` may contain any character; a literal ``${`` is written ``\${``.
+        and ``out`` may contain any character; a literal ``${`` is written ``\${``. Or a mapping such as a DictConfig,
+        nested or with dotted keys: ``{"camera": "sony_a7r", "noise": {"draws": 2}}``. Text for a group is the name of
+        an option; so is ``name`` in a mapping for a group.
     config_dir : path-like, optional
         Folder of additional option files, as with ``--config-dir``.
 
@@ -117,8 +118,9 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
     """
     if isinstance(overrides, str):
         raise ConfigError(f"overrides={overrides!r}: one string; expected a list of strings; write [{overrides!r}]")
-    config, _ = composed_config(overrides, OptionFolders(own=None if config_dir is None else Path(config_dir)))
-    return config
+    folders = OptionFolders(own=None if config_dir is None else Path(config_dir))
+    given = overrides_of_mapping(overrides, folders.own) if isinstance(overrides, Mapping) else overrides
+    return composed_config(given, folders)[0]
 
 
 def composed_config(overrides: Sequence[str], folders: OptionFolders) -> tuple[Config, dict[str, str | None]]:
@@ -340,16 +342,6 @@ def _spelled(override: str, overrides: Sequence[str]) -> str:
         return f"~{override.removesuffix('=null')}"
     has_option = any(other.startswith("source=") for other in overrides)
     return override if has_option else SHORTHANDS.get(override, override)
-
-
-def quoted(path: str) -> str:
-    r"""Quote a path for Hydra's grammar, in which an umlaut, an apostrophe or a bracket is not part of a word.
-
-    Interpolations stay active; ``\${`` is a literal ``${``.
-    """
-    path = re.sub(r"(\\*)'", r"\1\1\\'", path)
-    path = re.sub(r"(\\+)$", r"\1\1", path)
-    return f"'{path}'"
 
 
 def _check_own_files(overrides: Sequence[str], folders: OptionFolders) -> None:

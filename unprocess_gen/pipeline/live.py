@@ -79,9 +79,9 @@ class LivePairs(PairTable):
 
     Parameters
     ----------
-    dataset : str, Path, Config, or a list of str or Path
+    dataset : str, Path, Config, mapping, or a list of str or Path
         Folder of a dataset or sweep, or a list of them, as for `RawPairs`: manifest and sources are read, not the
-        shards. Or a config or Hydra overrides, of which no dataset is generated:
+        shards. Or a config, or what `load_config` takes, of which no dataset is generated:
         pairs are planned when they are read, and a source that cannot be used raises its error.
     root : str or Path, optional
         Folder of the sources; by default the one that the dataset records, or ``source.root`` of the config.
@@ -142,7 +142,7 @@ class LivePairs(PairTable):
 
     def __init__(
         self,
-        dataset: str | Path | ObjectPath | Config | Sequence[str],
+        dataset: str | Path | ObjectPath | Config | Sequence[str] | Mapping[str, Any],
         root: str | os.PathLike[str] | None = None,
         redraw: str = "noise",
         cache: str | os.PathLike[str] | None = None,
@@ -311,8 +311,8 @@ class LiveRow(Mapping[str, Value]):
 
 def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[LiveSource]:
     """Open datasets, or list the sources of a config or of overrides."""
-    places = [dataset] if isinstance(dataset, DatasetPath) else [] if isinstance(dataset, Config) else list(dataset)
-    if isinstance(dataset, DatasetPath) or any(_is_dataset(place) for place in places):
+    is_place = isinstance(dataset, DatasetPath)
+    if is_place or (not isinstance(dataset, Config | Mapping) and any(map(_is_dataset, dataset))):
         return [*open_datasets("LivePairs", dataset, split, partial(RecordedPairs, root))]
     if not isinstance(dataset, Config):
         from unprocess_gen.config.composition import load_config

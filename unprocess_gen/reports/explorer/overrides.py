@@ -6,21 +6,18 @@ import itertools
 import operator
 import os
 import re
-from collections.abc import Mapping
 from typing import Any
 
-from unprocess_gen.config.composition import compose_node, load_config, quoted, typed_config
+from unprocess_gen.config.composition import compose_node, load_config, typed_config
 from unprocess_gen.config.defaults import default_options
 from unprocess_gen.config.limits import OVERRIDDEN
 from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.overrides import override_text, quoted
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import recorded
 from unprocess_gen.config.settings import all_settings
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.fields import is_number
 
-WORDS_OF_HYDRA = ("null", "true", "false", "nan", "inf")
-"""Words that are no texts in overrides."""
 QUOTED = re.compile(r"""'(?:\\.|[^'\\])*(?:'|$)|"(?:\\.|[^"\\])*(?:"|$)""")
 """A text in quotes, or from a quote to the end."""
 NAMED_GROUPS = ("camera", "noise", "scene")
@@ -48,21 +45,6 @@ def _deciding_values(config: Config) -> dict[str, Any]:
     """Values of the keys that decide data, as ``config.yaml`` has them."""
     deciding = (key for key, setting in all_settings(Config).items() if setting.decides_data)
     return {key: recorded(operator.attrgetter(key)(config)) for key in deciding}
-
-
-def override_text(value: Any) -> str:
-    """A value in Hydra's grammar of overrides."""
-    if isinstance(value, bool) or value is None:
-        return {None: "null", True: "true", False: "false"}[value]
-    if is_number(value):
-        return repr(value)
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{override_text(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ",".join(map(override_text, value)) + "]"
-    text = str(value)
-    is_word = re.fullmatch(r"[A-Za-z_]\w*", text, re.ASCII) and text.lower() not in WORDS_OF_HYDRA
-    return text if is_word else quoted(text)
 
 
 def key_of(override: str) -> str:

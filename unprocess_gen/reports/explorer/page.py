@@ -28,13 +28,14 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from unprocess_gen.config.option_files import conf_dir, group_options, option_summary
+from unprocess_gen.config.overrides import override_text
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.settings import all_settings
 from unprocess_gen.core.errors import UnprocessGenError
 from unprocess_gen.core.fields import Choice
 from unprocess_gen.reports.explorer import views
 from unprocess_gen.reports.explorer.exploration import Choices, Exploration, Shown
-from unprocess_gen.reports.explorer.overrides import key_of, override_text, split_overrides
+from unprocess_gen.reports.explorer.overrides import key_of, split_overrides
 from unprocess_gen.reports.manifest_statistics import MEANINGS, SITE_COLUMNS
 from unprocess_gen.reports.pages import page_template, render_macro, render_page
 from unprocess_gen.reports.photon_transfer import NoiseFit
