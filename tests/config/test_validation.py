@@ -14,21 +14,23 @@ from typing import Any
 
 import pytest
 import yaml
+from helpers.commands import RunMain
 from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+import unprocess_gen as ug
 from unprocess_gen.config.distributions import parse_distribution
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
-from unprocess_gen.config.schema import GROUPS, Config, replaced
+from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, replaced
 from unprocess_gen.config.serialization import (
     dataset_yaml,
     differences,
     parse_dataset_yaml,
     read_dataset_yaml,
 )
-from unprocess_gen.config.settings import all_settings
+from unprocess_gen.config.settings import all_settings, settings_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import parse_yaml_mapping
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16
@@ -212,6 +214,40 @@ ACCEPTED = [
     "gains.threshold=0.999", "isp.gamma=10", "sensor.black_level_dn=4094", "sensor.white_level_dn=241",
     "noise.a=[uniform,0,1]", "output.pairs_per_shard=1000000", "noise.bits=14",
 ]  # fmt: skip
+
+
+PATHS = {"out": "x://y", "source.list": "none", "source.root": "none", "noise.dark_frames": "none"}
+"""Keys whose values may be any text, with paths that cannot be used."""
+
+TEXTS = dict.fromkeys(("camera.name", "noise.name", "scene.name", "body.name", "executor.address"), "'a b'") | PATHS
+"""Keys that take texts, with a text that is none of theirs."""
+
+BRANCH = {"iso": "[100, 200]", **dict.fromkeys(("dn_per_e", "read_std_dn", "row_std_dn", "column_std_dn"), "1")}
+
+
+@pytest.mark.parametrize("key", all_settings(Config))
+def test_every_key_refuses_a_wrong_type_and_a_wrong_word_whether_it_is_used_or_not(key: str) -> None:
+    for value in (TEXTS.get(key, "banana"), PATHS.get(key, "[[[]]]"), PATHS.get(key, "{x: [1]}")):
+        with pytest.raises(ConfigError, match=rf"^{re.escape(key)}(\[0\])?(=|: expected)") as refused:
+            ug.load_config([f"{key}={value}"])
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("key", settings_of(BranchConfig))
+def test_every_key_of_a_branch_refuses_a_wrong_type_and_a_wrong_word(key: str) -> None:
+    for value in ("banana", "{x: [1]}"):
+        branch = ", ".join(f"{name}: {number}" for name, number in (BRANCH | {key: value}).items())
+        with pytest.raises(ConfigError, match=rf"noise\.branches.*\b{key}(=|: )"):
+            ug.load_config([f"noise.branches=[{{{branch}}}]"])
+
+
+@pytest.mark.parametrize("group", [*GROUPS, ""])
+def test_wrong_word_ends_a_run_and_a_plan_with_exit_code_2(group: str, run_main: RunMain, tmp_path: Path) -> None:
+    key = next(key for key in all_settings(Config) if key.rpartition(".")[0] == group and key not in TEXTS)
+    for verb in ((), ("plan",)):
+        done = run_main(*verb, f"{key}=banana")
+        assert (done.code, done.out, done.err.count("\n"), list(tmp_path.iterdir())) == (2, "", 1, [])
+        assert done.err.startswith(f"gen-dataset: {key}=banana: ")
 
 
 def test_limits_of_ranges_are_accepted(settings: Settings) -> None:

@@ -20,6 +20,11 @@ def text(what: str) -> Limit:
     return Limit(what, bool, repr)
 
 
+def are_texts(values: Any) -> bool:
+    """True if all items of a list are texts that are not empty; OmegaConf accepts lists and mappings as items too."""
+    return all(isinstance(value, str) and value for value in values)
+
+
 class LevelRange(GroupLimit):
     """An integer whose range follows from other keys of its group; ``ends`` computes it."""
 

@@ -134,8 +134,8 @@ class SourceConfig(Group):
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False)
     include: tuple[str, ...] = key(
         ("*.jpg", "*.jpeg", "*.jpe", "*.jfif", "*.mpo", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
-        Limit("a list of at least one pattern such as '*.jpg'"))
-    exclude: tuple[str, ...] = key((), Limit("a list of patterns such as '*_thumb.jpg'"))
+        Limit("a list of at least one pattern such as '*.jpg'", limits.are_texts))
+    exclude: tuple[str, ...] = key((), Limit("a list of patterns such as '*_thumb.jpg'", limits.are_texts))
     recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
