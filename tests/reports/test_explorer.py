@@ -219,6 +219,9 @@ def test_settings_stay_when_another_photograph_is_opened(photos: Path) -> None:
     page.set("open", page["open"].options[1])
     assert page.settings == ["scene=night"]
     assert "b.png" in page["command"].text
+    page.set("open", page["open"].options[2])
+    assert page["part"].value == "00000002"
+    assert page.settings == ["scene=night"]
 
 
 def test_weights_are_shown_for_a_mix_of_cameras_only() -> None:

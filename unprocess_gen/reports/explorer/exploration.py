@@ -218,9 +218,8 @@ def open_place(
         steps = f"gen-dataset source.kind=raw source.root={shlex.quote(str(place))} out=ds, then gen-dataset report ds"
         raise ConfigError(f"explore: {place}: raw frames cannot be explored; expected photographs; run {steps}")
     sources = listed_sources(config)[:SOURCES_LISTED]
-    return start, {
-        f"{source.index} {source.name}": partial(_open_source, config=config, source=source) for source in sources
-    }
+    opened = partial(_open_source, start=start, config=config)
+    return start, {f"{source.index} {source.name}": partial(opened, source=source) for source in sources}
 
 
 def _path_text(path: str) -> str:
@@ -228,18 +227,17 @@ def _path_text(path: str) -> str:
     return path.replace("${", "\\${")
 
 
-def _open_source(state: Exploration, config: SourceConfig, source: Source) -> Exploration:
+def _open_source(state: Exploration, start: Exploration, config: SourceConfig, source: Source) -> Exploration:
     """Choose a source: a photograph of a folder by itself, others with the sources that are listed before them."""
-    root = config.root
+    place = {key: text for key, text in start.settings.items() if key in PLACE_KEYS}
+    root, index = config.root, source.index
     is_alone = config.list is None and source.clip == NO_CLIP and not source.occurrence
     if root is not None and is_alone and any_path(root).is_dir():
-        path = _path_text(f"{root.rstrip('/')}/{source.path}")
-        kept = {key: text for key, text in state.settings.items() if key not in ("source.limit", "source.include")}
-        return replace(state, settings=kept | {"source.root": path}, index=0, part="")
-    is_last = source.index + 1 == len(listed_sources(config))
-    limit = config.limit if is_last else source.index + 1
-    state = replace(state.without("source.limit".__eq__), index=source.index, part="")
-    return state if limit is None else state.with_settings({"source.limit": str(limit)})
+        place, index = {"source.root": _path_text(f"{root.rstrip('/')}/{source.path}")}, 0
+    elif index + 1 < len(listed_sources(config)):
+        place["source.limit"] = str(index + 1)
+    kept = state.without(PLACE_KEYS.__contains__)
+    return replace(kept, settings=kept.settings | place, index=index, part="")
 
 
 def _open_rows(folder: AnyPath, keys: str | None, start: Exploration) -> Choices:
@@ -269,4 +267,4 @@ def _open_row(_: Exploration, folder: AnyPath, row: Row, start: Exploration) -> 
     source = next((source for source in listed_sources(config) if source.name == row["source"]), None)
     if source is None:
         raise ConfigError(f"explore: {row['source']}: is not among the sources of {folder}; restore the photograph")
-    return replace(_open_source(state, config, source), part=str(row["key"]).removeprefix(image_key(row)))
+    return replace(_open_source(state, state, config, source), part=str(row["key"]).removeprefix(image_key(row)))
