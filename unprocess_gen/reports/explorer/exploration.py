@@ -143,7 +143,7 @@ class Exploration:
         sources, settings = listed_sources(config.source), PairSettings.read(config)
         if self.index >= len(sources):
             raise ConfigError(
-                f"the settings list {len(sources)} sources, too few for number {self.index}; open another"
+                f"source number {self.index} is open, but the settings list only {len(sources)}; open another"
             )
         source = sources[self.index]
         sha256, photograph = _loaded_source(config.source, source, config.output.layout)
