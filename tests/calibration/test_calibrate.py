@@ -128,12 +128,15 @@ def two_isos(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_page_shows_estimates_with_intervals_and_figures(calibrated: Any, tmp_path: Path) -> None:
+def test_page_shows_curves_then_estimates_with_intervals(calibrated: Any, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     profile = calibrated(two_isos(tmp_path), "--report", str(page))
     text, gain = page.read_text(encoding="utf-8"), estimates(profile)["dn_per_e", 800, None]
     assert all(short_number(value, 4) in text for value in (gain["value"], *gain["interval"]))
-    assert "Against ISO" in text and "photon transfer, residuals, histogram" in text
+    assert text.count("<img ") == 9 and "photon transfer, ISO 800" in text
+    headings = ("Against ISO", "<h2>ISO 800", "<h2>ISO 1600", "Notes", "Estimates")
+    places = [text.index(heading) for heading in headings]
+    assert places == sorted(places)
 
 
 def test_folder_without_list_is_read_by_metadata(calibrated: Any, tmp_path: Path) -> None:

@@ -144,17 +144,28 @@ def test_planes_average_sites_of_one_colour(pattern: str, reduction: int, panel_
 
 
 def test_overview_has_one_strip_per_pair_in_manifest_order(few: Path) -> None:
-    strips = [sheets.contact_sheet(few, key) for key in ("00000000", "1", "00000003")]
-    np.testing.assert_array_equal(sheets.contact_sheet(few), np.vstack(strips))
-    np.testing.assert_array_equal(sheets.contact_sheet(few, "3,0"), np.vstack(strips[::2]))
+    headings = ["00000000 a.png", "00000001 large.png", "00000003 sixteen.png"]
+    strips = [*sheets.overview(few)]
+    assert [heading for heading, _ in strips] == headings
+    assert [heading for heading, _ in sheets.overview(few, "3,0")] == headings[::2]
+    assert all(len(drawn) == 6 and all(panel.overview is not None for panel in drawn) for _, drawn in strips)
 
 
 def test_overview_without_photographs_shows_the_reason_and_the_frames(few: Path, tmp_path: Path) -> None:
-    with_source, without = (sheets.contact_sheet(few, "0", source) for source in (None, tmp_path))
+    [(_, with_source)], [(_, without)] = (sheets.overview(few, "0", source) for source in (None, tmp_path))
+    assert without[0].overview is None and without[0].note.startswith("not available: ")
+    for one, other in zip(without[1:], with_source[1:], strict=True):
+        np.testing.assert_array_equal(one.overview, other.overview)
 
-    left, height = panels.STRIP_PX[1] + panels.MARGIN_PX, panels.STRIP_PX[0]
-    assert (without[:, :left] < panels.EMPTY_GREY - 100).any()  # text of the reason
-    np.testing.assert_array_equal(without[-height:, left:], with_source[-height:, left:])
+
+def test_finest_detail_is_the_box_with_most_edges() -> None:
+    frame = np.linspace(0, 1, 400 * 600).reshape(400, 600, 1).repeat(3, axis=2)
+    frame[300:340:2, 100:140] = 0
+    row, column = panels.finest_detail(frame, (60, 60))
+    window = panels.detail_window(frame.shape[:2], (60, 60), (row, column))
+    assert all(part.start % 2 == 0 and part.stop - part.start == 60 for part in window)
+    assert window[0].start <= 300 and window[0].stop >= 340 and window[1].start <= 100 and window[1].stop >= 140
+    assert panels.detail_window((400, 600), (60, 60), (0, 599)) == (slice(0, 60), slice(540, 600))
 
 
 def test_frames_of_any_size_are_shown(dataset: Path, tmp_path: Path) -> None:

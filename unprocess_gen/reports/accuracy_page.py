@@ -8,7 +8,6 @@ import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -131,9 +130,8 @@ def accuracy_figure(rows: Sequence[Measurement]) -> bytes:
     runs = [row for row in rows if row.stage == STAGES[-1]]
     scales = np.array([(run.ratio_to_exact or 0) / (run.ns_per_pixel or 1) for run in runs])
     places, ends = range(len(runs)), np.zeros(len(runs))
-    style: dict[Any, Any] = {"font.size": 9, "axes.spines.right": False, "axes.spines.top": False}
-    with rc_context(style):
-        figure, (axes,) = new_figure(8.4, 2.6)
+    with rc_context({"font.size": 9}):
+        figure, axes = new_figure(8.4, 2.6)
         for stage, colour in STAGE_COLOURS.items():
             lengths = np.minimum([ns[run.tier, stage] for run in runs] * scales, LONGEST_BAR - ends)
             axes.barh(places, lengths, left=ends, color=colour, height=0.7, label=stage)

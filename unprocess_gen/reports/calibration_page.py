@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +22,11 @@ from unprocess_gen.reports.pictures import figure_png, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLOURS = {"R": "#c0392b", "Gr": "#27ae60", "Gb": "#145a32", "B": "#2c6fbb", "": "#444444"}
-DPI = 90
+DPI, SIZE = 120, (4.6, 3.6)
+"""Resolution, and width and height of a figure in inches."""
 
 
 def check_page(page: Path) -> None:
@@ -47,8 +50,7 @@ def write_page(calibration: Calibration, name: str, command: str, page: Path) ->
         command=command,
         frames=len(calibration.captures.captures),
         notes=calibration.captures.notes,
-        figures=[(f"ISO {result.iso:g}", data_uri(_drawn(result, sites))) for result in calibration.isos],
-        against_iso=data_uri(_against_iso(calibration)) if len(calibration.isos) > 1 else "",
+        figures=[*_against_iso(calibration), *(_drawn(result, sites) for result in calibration.isos)],
         table=PageTable(("number", "ISO", "value", "from", "to", "unit"), lines, numeric=(1, 2, 3, 4)),
     )
     write_file(page, text)
@@ -57,12 +59,22 @@ def write_page(calibration: Calibration, name: str, command: str, page: Path) ->
 # ------------------------------------------------------------------------------------------------------------- figures
 
 
-def _drawn(result: IsoResult, sites: list[str]) -> bytes:
+Section = tuple[str, dict[str, str]]
+"""Heading, and addresses of pictures by their titles."""
+
+
+def _section(heading: str, drawn: Mapping[str, Figure]) -> Section:
+    return heading, {name: data_uri(figure_png(figure, DPI)) for name, figure in drawn.items()}
+
+
+def _drawn(result: IsoResult, sites: list[str]) -> Section:
     """The photon transfer curve with residuals, and the histogram of the darks, of one ISO."""
-    figure, (transfer, residuals, histogram) = new_figure(14, 4, columns=3)
-    _draw_transfer(transfer, residuals, result, sites)
-    _draw_histogram(histogram, result)
-    return figure_png(figure, DPI)
+    figures, axes = zip(*(new_figure(*SIZE) for _ in range(3)), strict=True)
+    _draw_transfer(axes[0], axes[1], result, sites)
+    _draw_histogram(axes[2], result)
+    return _section(
+        f"ISO {result.iso:g}", dict(zip(("photon transfer", "residuals", "read noise"), figures, strict=True))
+    )
 
 
 def _draw_transfer(curve_axes: Axes, residual_axes: Axes, result: IsoResult, sites: list[str]) -> None:
@@ -102,12 +114,20 @@ def _draw_histogram(axes: Axes, result: IsoResult) -> None:
     axes.legend()
 
 
-def _against_iso(calibration: Calibration) -> bytes:
-    """Draw gain, read noise and row noise against ISO, with intervals."""
-    figure, axes = new_figure(9, 4, columns=len(AGAINST_ISO))
-    for place, (name, label) in zip(axes, AGAINST_ISO.items(), strict=True):
+def _against_iso(calibration: Calibration) -> Iterator[Section]:
+    """Draw gain, read noise and row noise against ISO, with intervals, if there are several ISOs."""
+    isos = calibration.captures.isos
+    drawn: dict[str, Figure] = {}
+    for name, label in AGAINST_ISO.items():
+        drawn[label], axes = new_figure(*SIZE)
         values, lows, highs = (np.array([getattr(result[name], end) for result in calibration.isos]) for end in ENDS)
         errors = np.maximum([values - lows, highs - values], 0)
-        place.errorbar(calibration.captures.isos, values, errors, fmt="o-", markersize=3)
-        place.set(xscale="log", yscale="log", xlabel="ISO", title=label)
-    return figure_png(figure, DPI)
+        axes.errorbar(isos, values, errors, fmt="o-", markersize=3)
+        axes.set(xscale="log", xlabel="ISO", title=label)
+        axes.set_xticks(isos, [f"{iso:g}" for iso in isos], rotation=90 if len(isos) > 8 else 0)
+        axes.xaxis.set_minor_formatter("")
+        axes.set_yscale("log", subs=(2, 5))
+        axes.yaxis.set_major_formatter("{x:.3g}")
+        axes.yaxis.set_minor_formatter("{x:.3g}")
+    if len(isos) > 1:
+        yield _section("Against ISO", drawn)

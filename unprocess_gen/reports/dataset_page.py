@@ -1,7 +1,7 @@
 """Write the HTML page of a dataset: settings, contents, failures, parameters, noise check, how to load it.
 
 The page describes ``dataset.json``, ``config.yaml`` and ``manifest.csv``, whose SHA-256 are checked first. Of the
-arrays, only a few evenly spaced pairs are read: `PAIRS_CHECKED` for the noise, and the pairs of the contact sheet.
+arrays, only a few evenly spaced pairs are read: `PAIRS_CHECKED` for the noise, and the pairs that are shown.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from unprocess_gen.reports.manifest_statistics import MEANINGS, SITE_COLUMNS, re
 from unprocess_gen.reports.noise_check.alarms import Checker
 from unprocess_gen.reports.noise_check.repetition import measure_noise
 from unprocess_gen.reports.pages import data_uri, page_file, render_page
+from unprocess_gen.reports.panels import SheetPanel, byte_codes
 from unprocess_gen.reports.photon_transfer import NoiseFit, draw_fits, fit_noise
 from unprocess_gen.reports.pictures import picture_jpeg
-from unprocess_gen.reports.sheets import contact_sheet
+from unprocess_gen.reports.sheets import overview
 from unprocess_gen.sources.dark_frames import dark_folder
 from unprocess_gen.sources.names import encode_name
 
 PAIRS_CHECKED = 8
 SHARDS_LISTED = 20
-JPEG_QUALITY = 88
+JPEG_QUALITY = 80
 
 
 def write_dataset_report(
@@ -44,7 +45,7 @@ def write_dataset_report(
 ) -> Path:
     """Write the page of a finished dataset to ``to``, ``report.html`` in a local dataset by default.
 
-    ``source`` is the folder of the photographs for the contact sheet, by default the recorded one. Raises ConfigError,
+    ``source`` is the folder of the photographs for the pictures, by default the recorded one. Raises ConfigError,
     DamageError if the dataset is not finished or was changed, or MachineError.
     """
     file = page_file(folder, to)
@@ -105,7 +106,7 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
     except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
         missing, fits = str(error), []
     return {
-        "contact_sheet": data_uri(picture_jpeg(contact_sheet(folder, source=source), JPEG_QUALITY), "jpeg"),
+        "strips": [(heading, [*map(_figure, panels)]) for heading, panels in overview(folder, source=source)],
         "checks": checks,
         "fits": fits,
         "missing": missing,
@@ -114,3 +115,13 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
         "first_shard": f"{folder_name(folder)}/shards/{shard_name(int(first['shard'] or 0))}",
         "first_key": sample_key(first),
     }
+
+
+def _figure(panel: SheetPanel) -> tuple[str, str, str]:
+    """Title, note and picture of a panel; no picture if it has none."""
+    shown = panel.overview
+    return (
+        panel.title,
+        panel.note,
+        "" if shown is None else data_uri(picture_jpeg(byte_codes(shown), JPEG_QUALITY), "jpeg"),
+    )

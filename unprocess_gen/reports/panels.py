@@ -21,8 +21,8 @@ Picture = NDArray[np.uint8]
 MosaicArray = Frame | Float
 """A mosaic ``[H, W]`` in DN, integer or not."""
 
-PANEL_PX, STRIP_PX = (224, 336), (120, 180)
-"""Height and width of the box that a picture is scaled into, on a sheet and on a strip of an overview."""
+PANEL_PX, CELL_PX = (224, 336), (120, 180)
+"""Height and width of the box that a picture of a sheet is scaled into, and of a detail in a cell of a sweep."""
 
 MARGIN_PX, LINE_PX = 10, 17
 PAPER_GREY, INK_GREY, EMPTY_GREY = 250, 20, 225
@@ -50,9 +50,13 @@ class SheetPanel(NamedTuple):
 # ------------------------------------------------------------------------------------------------------------- scaling
 
 
-def detail_window(shape: tuple[int, ...], panel_px: tuple[int, int] = PANEL_PX) -> Window:
-    """The centre of a frame that fits into a panel, from an even row and column like the Bayer tile."""
-    starts = [max(0, length - most) // 4 * 2 for length, most in zip(shape, panel_px, strict=True)]
+def detail_window(
+    shape: tuple[int, ...], panel_px: tuple[int, int] = PANEL_PX, centre: Sequence[float] | None = None
+) -> Window:
+    """Part of a frame that fits into a panel, about a place or the centre, from an even row and column."""
+    middle = centre or [length / 2 for length in shape]
+    firsts = (min(place - most / 2, length - most) for place, most, length in zip(middle, panel_px, shape, strict=True))
+    starts = [int(max(0.0, first) / 2) * 2 for first in firsts]
     ends = (min(start + most, length) for start, most, length in zip(starts, panel_px, shape, strict=True))
     rows, columns = map(slice, starts, ends)
     return rows, columns
@@ -72,6 +76,14 @@ def average_planes(raw: MosaicArray, panel_px: tuple[int, int]) -> Float:
     """Scale the four planes of a mosaic into a panel, ``[H, W]`` to ``[h, w, 4]``; a lone row or column is doubled."""
     even = np.pad(raw, [(0, length % 2) for length in raw.shape], mode="reflect")
     return np.stack([fit_image(plane.astype(np.float32), panel_px) for plane in planes_of(even)], axis=-1)
+
+
+def finest_detail(values: NDArray[Any], box_px: tuple[int, int]) -> tuple[float, float]:
+    """Centre of the box in which the mean square of the Laplacian of an image ``[H, W, C]`` is largest."""
+    squares: Any = cv2.Laplacian(values.mean(axis=2, dtype=np.float32), cv2.CV_32F) ** 2
+    sums: Any = cv2.boxFilter(squares, -1, box_px[::-1], borderType=cv2.BORDER_CONSTANT)
+    row, column = np.unravel_index(int(sums.argmax()), sums.shape)
+    return float(row), float(column)
 
 
 # --------------------------------------------------------------------------------------------------------------- light
@@ -133,12 +145,10 @@ def byte_codes(values: Float) -> Picture:
 # ------------------------------------------------------------------------------------------------------------- layout
 
 
-def lay_out(
-    heading: Sequence[str], panels: Sequence[SheetPanel], columns: int, panel_px: tuple[int, int] = PANEL_PX
-) -> Picture:
+def lay_out(heading: Sequence[str], panels: Sequence[SheetPanel], columns: int) -> Picture:
     """Lay out a sheet: a heading, then rows of panels with title and note, overview, and detail if any has one."""
-    height, width = (length + MARGIN_PX for length in panel_px)
-    texts = [_wrapped([panel.title, panel.note], panel_px[1]) for panel in panels]
+    height, width = (length + MARGIN_PX for length in PANEL_PX)
+    texts = [_wrapped([panel.title, panel.note], PANEL_PX[1]) for panel in panels]
     pictures = [panel[2:] if any(other.detail is not None for other in panels) else panel[2:3] for panel in panels]
     lines = _wrapped(heading, columns * width - MARGIN_PX)
     head_px, text_px = (LINE_PX * count + MARGIN_PX // 2 for count in (len(lines), max(map(len, texts))))
@@ -150,10 +160,10 @@ def lay_out(
         panel = sheet[head_px + row * panel_height :, column * width :]
         _write(panel, text)
         for place, values in enumerate(drawn):
-            box = panel[text_px + place * height :][: panel_px[0], : panel_px[1]]
+            box = panel[text_px + place * height :][: PANEL_PX[0], : PANEL_PX[1]]
             box[:] = EMPTY_GREY
             if values is not None:
-                top, left = ((most - length) // 2 for most, length in zip(panel_px, values.shape, strict=False))
+                top, left = ((most - length) // 2 for most, length in zip(PANEL_PX, values.shape, strict=False))
                 box[top : top + values.shape[0], left : left + values.shape[1]] = byte_codes(values)
     return sheet
 

@@ -18,6 +18,8 @@ LEAST_SITES_OF_POINT = 16
 POINTS_OF_LINE = 65
 """Points of the expected variance that are drawn; PRNU bends it."""
 
+BINS_DRAWN = 24
+
 
 @dataclass(frozen=True, slots=True)
 class NoiseFit:
@@ -76,12 +78,14 @@ def fit_noise(noise: Noise | None) -> NoiseFit | None:
 
 
 def draw_fits(fits: list[NoiseFit]) -> bytes:
-    """Draw variance against signal with the expected lines; return a PNG."""
-    figure, (axes,) = new_figure(8, 5)
+    """Draw medians of the variance in up to `BINS_DRAWN` bins of the signal, and expected lines; return a PNG."""
+    figure, axes = new_figure(8, 5)
     for number, fit in enumerate(fits):
-        colour = f"C{number % 10}"
-        axes.plot(fit.signal_dn, fit.variance_dn2, ".", color=colour, markersize=2, alpha=0.5)
-        axes.plot(*fit.line, color=colour, label=fit.key)
+        colour, order = f"C{number % 10}", np.argsort(fit.signal_dn)
+        bins = np.array_split(order, min(BINS_DRAWN, max(order.size, 1)))
+        medians = [[np.median(values[one]) for one in bins if one.size] for values in (fit.signal_dn, fit.variance_dn2)]
+        axes.plot(*medians, "o", color=colour, markersize=4)
+        axes.plot(*fit.line, color=colour, label=fit.key, linewidth=1)
     axes.set(xlabel="signal above black (DN)", ylabel="variance of the noise (DN²)", title="Photon transfer")
-    axes.legend(title="line: expected from the manifest")
+    axes.legend(title="line: expected from the manifest\npoints: medians of the pair")
     return figure_png(figure, dpi=120)

@@ -13,12 +13,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, list[Axes]]:
-    """A figure, inches, and its axes side by side."""
+def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
+    """A figure, inches, and its axes."""
     from matplotlib.figure import Figure  # optional library, extra "figures"
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, list(figure.subplots(1, columns, squeeze=False)[0])
+    axes = figure.subplots()
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
 
 
 def figure_png(figure: Figure, dpi: int) -> bytes:

@@ -31,7 +31,7 @@ from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.reports import panels
-from unprocess_gen.reports.panels import MosaicArray, Picture, SheetPanel, Window
+from unprocess_gen.reports.panels import MosaicArray, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference import unprocess
@@ -111,14 +111,12 @@ def write_sheets(
         yield SheetFiles(key, str(pair.row["source"]), tuple(to / name for name in drawn), pair.missing_source)
 
 
-def contact_sheet(folder: AnyPath, keys: str = "", source: AnyPath | None = None) -> Picture:
-    """Draw an overview, RGB, with one strip per pair in the order of the manifest; arguments of `selected_pairs`."""
-    strips = []
+def overview(folder: AnyPath, keys: str = "", source: AnyPath | None = None) -> Iterator[tuple[str, list[SheetPanel]]]:
+    """Yield heading and panels without details of each pair, for a page; arguments of `selected_pairs`."""
     for pair in with_bar(selected_pairs(folder, keys, source), "pair drawn"):
-        drawn = _pair_panels(pair, panels.detail_window(pair.clean.shape), panels.STRIP_PX)
-        overviews = [panel._replace(detail=None, note=panel.note.partition(", detail")[0]) for panel in drawn]
-        strips.append(panels.lay_out([f"{pair.row['key']}   {pair.row['source']}"], overviews, 6, panels.STRIP_PX))
-    return np.vstack(strips)
+        drawn = _pair_panels(pair, panels.detail_window(pair.clean.shape), panels.PANEL_PX)
+        complete = [panel._replace(detail=None, note=panel.note.partition(", detail")[0]) for panel in drawn]
+        yield f"{pair.row['key']} {pair.row['source']}", complete
 
 
 def _heading(pair: SheetPair, window: Window) -> list[str]:

@@ -20,7 +20,15 @@ from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.dataset_page import write_dataset_report
 from unprocess_gen.reports.pages import data_uri, page_file, render_page
-from unprocess_gen.reports.panels import STRIP_PX, byte_codes, common_stretch, detail_window
+from unprocess_gen.reports.panels import (
+    CELL_PX,
+    Window,
+    average_planes,
+    byte_codes,
+    common_stretch,
+    detail_window,
+    finest_detail,
+)
 from unprocess_gen.reports.pictures import picture_jpeg
 
 JPEG_QUALITY = 70
@@ -42,9 +50,10 @@ def write_sweep_page(
     file = page_file(folder, to)
     *down, across = swept or [""]
     rows: dict[tuple[str, ...], dict[str, SweepCell]] = {}
+    windows: dict[tuple[int, ...], Window] = {}
     for job in with_bar(jobs, "dataset", len(jobs)):
         row = rows.setdefault(tuple(job.get(key, "") for key in down), {})
-        row[job.get(across, "")] = _sweep_cell(folder / job["folder"], job, file.parent)
+        row[job.get(across, "")] = _sweep_cell(folder / job["folder"], job, file.parent, windows)
     values = list(dict.fromkeys(job.get(across, "") for job in jobs))
     title = f"Sweep {folder.absolute().name}"
     page = render_page("sweep.html", title=title, down=down, across=across, values=values, rows=rows, jobs=jobs)
@@ -52,8 +61,11 @@ def write_sweep_page(
     return file
 
 
-def _sweep_cell(folder: Path, job: Mapping[str, str], start: Path) -> SweepCell:
-    """The centre of the first pair, clean and noisy, one pixel per site; the reason without a readable dataset."""
+def _sweep_cell(folder: Path, job: Mapping[str, str], start: Path, windows: dict[tuple[int, ...], Window]) -> SweepCell:
+    """The finest detail of the first pair, clean and noisy, one pixel per site; the reason without a readable dataset.
+
+    All frames of a size have one window, so that cells can be compared.
+    """
     try:
         pairs, page = RawPairs(folder), page_file(folder)
         frames = [common_stretch(mosaic_dn(dn, row), plan_from_row(row)) for *pair, row in pairs[:1] for dn in pair]
@@ -61,6 +73,10 @@ def _sweep_cell(folder: Path, job: Mapping[str, str], start: Path) -> SweepCell:
             write_dataset_report(folder)
     except (UnprocessGenError, OSError) as error:
         return SweepCell(job, problem=str(error))
-    details = [frame[detail_window(frame.shape, STRIP_PX)] for frame in frames]
+    for clean in frames[:1]:
+        planes = average_planes(clean, (clean.shape[0] // 2, clean.shape[1] // 2))
+        place = [2 * at for at in finest_detail(planes, (CELL_PX[0] // 2, CELL_PX[1] // 2))]
+        windows.setdefault(clean.shape, detail_window(clean.shape, CELL_PX, place))
+    details = [frame[windows[frame.shape]] for frame in frames]
     picture = data_uri(picture_jpeg(byte_codes(np.hstack(details)), JPEG_QUALITY), "jpeg") if details else ""
     return SweepCell(job, quote(os.path.relpath(page, start)), picture)

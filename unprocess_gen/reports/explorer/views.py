@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import PACKED, Float, Srgb
+from unprocess_gen.core.arrays import PACKED, Float
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.explorer.exploration import Shown
 from unprocess_gen.reports.noise_check.repetition import measure_noise
@@ -51,23 +51,15 @@ def moved(label: str, window: Float, shown: Shown, pointed: tuple[float, float] 
     It is zoomed about the site that was pointed at, or else the finest detail, or its centre if that is not in view.
     """
     shape, (factor, *steps) = np.array(shown.clean.shape, float), MOVES[label]
-    site = np.array(pointed or finest_detail(shown.srgb))
+    site = np.array(pointed or panels.finest_detail(shown.srgb, (DETAIL_PX, DETAIL_PX)))
     if label == "Detail":
-        site = np.array(finest_detail(shown.srgb))
+        site = np.array(panels.finest_detail(shown.srgb, (DETAIL_PX, DETAIL_PX)))
         window, factor = np.stack([site - shape / 2, site + shape / 2], axis=1), min(1, DETAIL_PX / shape[1])
     low, high = window.T
     site = site if ((low <= site) & (site <= high)).all() else (low + high) / 2
     size = np.minimum((high - low) * max(factor, SMALLEST_PX / (high - low).min()), shape)
     start = np.clip(site - (site - low) * size / (high - low) + np.array(steps) * size, 0, shape - size)
     return np.stack([start, start + size], axis=1)
-
-
-def finest_detail(srgb: Srgb) -> tuple[float, float]:
-    """Row and column about which the mean square of the Laplacian of a photograph is largest."""
-    squares: Any = cv2.Laplacian(srgb.mean(axis=2, dtype=np.float32), cv2.CV_32F) ** 2
-    sums: Any = cv2.boxFilter(squares, -1, (DETAIL_PX, DETAIL_PX), borderType=cv2.BORDER_CONSTANT)
-    row, column = np.unravel_index(int(sums.argmax()), sums.shape)
-    return float(row), float(column)
 
 
 def view(shown: Shown, window: panels.Window, common: bool) -> dict[str, Any]:
