@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         UnprocessGenError,
     )
     from unprocess_gen.dataset.clips import Clip, RawClips
+    from unprocess_gen.dataset.inputs import flip
     from unprocess_gen.dataset.reader import RawPairs, Sample
     from unprocess_gen.dataset.sampler import EpochSampler
     from unprocess_gen.dataset.training import noise_std, pack, random_crop, to_light
@@ -58,6 +59,7 @@ __all__ = [
     "UnprocessGenError",
     "__version__",
     "develop",
+    "flip",
     "generate",
     "load_config",
     "make_pair",
@@ -80,6 +82,7 @@ _MODULES = {
         *("ConfigError", "DamageError", "LockedError", "MachineError", "SourceError", "UnprocessGenError"),
     ),
     "dataset.clips": ("Clip", "RawClips"),
+    "dataset.inputs": ("flip",),
     "dataset.reader": ("RawPairs", "Sample"),
     "dataset.sampler": ("EpochSampler",),
     "dataset.training": ("noise_std", "pack", "random_crop", "to_light"),

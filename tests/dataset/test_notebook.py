@@ -55,7 +55,7 @@ def test_reader_shows_its_first_pairs_and_what_differs(dataset: Path, make: Make
     assert all(re.search(f"<th [^>]*>{name}</th>", text) for name in ("dataset", "camera", "split"))
     for live in (ug.LivePairs(other, patch=8, patches=2), ug.LivePairs(["source.limit=2"])):
         assert len(pictures(live._repr_html_())) == 6
-    assert pairs_html("", [], []) and not pictures(ug.RawPairs(dataset, arrays_only=True)._repr_html_())
+    assert pairs_html("", [], []) and not pictures(ug.RawPairs(dataset, inputs="mosaic")._repr_html_())
     row = {**ug.RawPairs(dataset)[0].row, "source": "<script>"}
     assert "&lt;script" in pair_html(*ug.RawPairs(dataset)[0][:2], row)
 

@@ -134,13 +134,3 @@ def test_several_datasets_are_read_as_one(made: Path, dataset: Path) -> None:
     assert repr(ug.RawPairs([made])) == f"RawPairs([{str(made)!r}], length=24)"
     with pytest.raises(ConfigError, match=r"RawPairs\(\[\]\): no dataset"):
         ug.RawPairs([])
-
-
-@pytest.mark.parametrize("override", ["output.dtype=float32", "output.clean_dtype=float32", "output.layout=packed"])
-def test_frames_that_cannot_be_stacked_are_refused(override: str, made: Path, make: Make, tmp_path: Path) -> None:
-    make(made.parent / "photos", tmp_path / "other", override, "source.limit=1")
-    with pytest.raises(
-        ConfigError, match=r"the frames differ in dtype or layout, or in targets \(other: .*; ds: .*\)|ds: .*; other"
-    ):
-        ug.RawPairs([made, tmp_path / "other"], arrays_only=True)
-    assert len(ug.RawPairs([made, tmp_path / "other"])) == 25

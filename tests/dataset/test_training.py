@@ -61,14 +61,6 @@ def test_impossible_crop_is_refused(side: int) -> None:
         ug.random_crop([np.zeros((10, 14))], side, np.random.default_rng(0).integers)
 
 
-def test_arrays_only_gives_the_frames_without_the_row(dataset: Path) -> None:
-    clean, noisy = ug.RawPairs(dataset, arrays_only=True)[1:][0]
-
-    expected = ug.RawPairs(dataset)[1]
-    assert np.array_equal(clean, expected.clean)
-    assert np.array_equal(noisy, expected.noisy)
-
-
 def test_batches_have_one_type_in_each_column(dataset: Path) -> None:
     """As PyTorch's ``default_collate`` needs it."""
     pairs = ug.RawPairs(dataset)
@@ -79,7 +71,6 @@ def test_batches_have_one_type_in_each_column(dataset: Path) -> None:
         kinds = {type(item.row[name]) for item in batch}
         assert len(kinds) == 1 and kinds <= {int, float, str, bool}, name
     np.testing.assert_array_equal(ug.develop(batch[0].noisy, batch[0].row), ug.develop(*pairs[1][1:]))
-    assert [*map(len, ug.RawPairs(dataset, arrays_only=True).__getitems__([0]))] == [2]
 
 
 @pytest.mark.parametrize(

@@ -82,8 +82,8 @@ def test_stored_target_is_that_of_live_pairs_and_read_by_webdataset(stored: Path
         made, read = live[number].targets[LINEAR_RGB], pairs[number].targets[LINEAR_RGB]
         assert read.dtype == np.float32
         np.testing.assert_array_equal(made, read)
-    items = ug.RawPairs(stored, arrays_only=True)[3]
-    assert [item.shape for item in items] == [(64, 64), (64, 64), (64, 64, 3)]
+    item = ug.RawPairs(stored, inputs="packed")[3]
+    assert [item[name].shape for name in ("clean", LINEAR_RGB)] == [(4, 32, 32), (64, 64, 3)]
     wds = pytest.importorskip("webdataset")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # those of another library
@@ -113,4 +113,4 @@ def test_wrong_targets_are_refused_in_one_line(value: str, run_main: RunMain, tm
 
 def test_lists_of_datasets_with_other_targets_are_refused(stored: Path, dataset: Path) -> None:
     with pytest.raises(ConfigError, match="targets"):
-        ug.RawPairs([stored, dataset], arrays_only=True)
+        ug.RawPairs([stored, dataset], inputs="packed")

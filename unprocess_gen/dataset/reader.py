@@ -6,6 +6,7 @@ import csv
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, Self, SupportsIndex, TypeVar, overload
@@ -18,8 +19,11 @@ from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
+from unprocess_gen.core.random_streams import check_epoch, crop_words, even_corner, flip_bits, frame_word
 from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.dataset.columns import Row, Value
+from unprocess_gen.dataset.development import development_parameters
+from unprocess_gen.dataset.inputs import Options, cut
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
 from unprocess_gen.dataset.row import COLUMNS, has_frames
@@ -105,16 +109,21 @@ class _FramesAndTargets(NamedTuple):
 _TEXTS = {column.name for column in COLUMNS if column.type is number_or_text}
 
 
-def stackable(sample: Sample, **cells: Value) -> tuple[Any, ...]:
-    """Frames, row and targets, if there are any, so that PyTorch's default ``collate_fn`` stacks them.
+def stackable(sample: Sample | dict[str, Any], **cells: Value) -> Any:
+    """Item of a pair, so that PyTorch's default ``collate_fn`` stacks it: a named tuple of a sample, or a dict.
 
     Columns have one type in every pair: NaN instead of None, text where some pairs have text. ``cells`` are those of
     columns that some rows lack.
     """
-    row = cells | {name: math.nan if value is None else value for name, value in sample.row.items()}
-    row = {name: str(value) if name in _TEXTS else value for name, value in row.items()}
-    frames = sample.clean, sample.noisy, row
+    if isinstance(sample, dict):
+        return {**sample, "row": _stackable_row(sample["row"], cells)} if "row" in sample else sample
+    frames = sample.clean, sample.noisy, _stackable_row(sample.row, cells)
     return _FramesAndTargets(*frames, sample.targets) if sample.targets else _Frames(*frames)
+
+
+def _stackable_row(row: Row, cells: Row) -> dict[str, Any]:
+    cells = {**cells, **{name: math.nan if value is None else value for name, value in row.items()}}
+    return {name: str(value) if name in _TEXTS else value for name, value in cells.items()}
 
 
 def row_of_batch(row: Row) -> Row:
@@ -152,10 +161,23 @@ class RawPairs(PairTable):
         Folder of a finished dataset, or of a sweep; or its URL in an object store, such as ``s3://bucket/ds``. A
         sweep's datasets follow each other as in its ``sweep.csv``; jobs that left no dataset are omitted. The pairs of
         a list follow each other in its order.
-    arrays_only : bool
-        Items are tuples ``(clean, noisy)`` and stored targets, without the row.
     split : str, optional
         Only pairs of this split (key ``split`` of the settings), by default all.
+    patch : int, optional
+        Side of a square that is cut from each pair at an even row and column, so that pairs of different sizes stack:
+        that of `LivePairs` with the same ``patch``. The row stays that of the pair.
+    flip : bool
+        Each square is mirrored or transposed at random, as `flip` does, in eight ways. Needs ``patch``.
+    inputs : str, optional
+        Items are dicts of float32 arrays with 0 at black and 1 at white, which PyTorch's default ``collate_fn``
+        stacks: ``noisy``, ``clean`` and targets. ``"mosaic"``: [H, W]. ``"packed"``: [4, H / 2, W / 2], without an odd
+        last row or column; pictures stay [H, W, 3]. ``development`` is what `unprocess_gen.torch.develop` needs.
+    noise_map : bool
+        Dicts have ``noise_std``: `noise_std` of the noisy frame, in the unit and shape of the frames.
+    rows : bool
+        Dicts have ``row``.
+    clip_black : bool
+        Dicts have no values below 0 in ``noisy`` and ``clean``.
 
     Attributes
     ----------
@@ -165,8 +187,8 @@ class RawPairs(PairTable):
     Raises
     ------
     ConfigError
-        If the list is empty, no pair is in the split, or the datasets of a list differ in dtype, layout or targets
-        with ``arrays_only``.
+        If the list is empty, no pair is in the split, an argument is not allowed, or the datasets of a list differ in
+        targets with ``inputs``.
     DamageError
         If a manifest, a shard or ``sweep.csv`` is missing or damaged; for shards when a pair is read.
     IndexError
@@ -188,13 +210,22 @@ class RawPairs(PairTable):
     """
 
     def __init__(
-        self, path: DatasetPath | Sequence[DatasetPath], *, arrays_only: bool = False, split: str | None = None
+        self,
+        path: DatasetPath | Sequence[DatasetPath],
+        *,
+        split: str | None = None,
+        patch: int | None = None,
+        flip: bool = False,
+        inputs: str | None = None,
+        noise_map: bool = False,
+        rows: bool = False,
+        clip_black: bool = False,
     ) -> None:
+        self._options = Options("RawPairs", patch, flip, inputs, noise_map, rows, clip_black)
         super().__init__(open_datasets("RawPairs", path, split, _Dataset))
         self.path = any_path(path) if isinstance(path, DatasetPath) else tuple(map(any_path, path))
-        self.arrays_only = arrays_only
-        if arrays_only and isinstance(self.path, tuple):
-            _check_formats(self._datasets)
+        if inputs is not None:
+            _check_targets(self._datasets)
 
     def __len__(self) -> int:
         return len(self._numbers)
@@ -208,26 +239,39 @@ class RawPairs(PairTable):
         return (self[number] for number in range(len(self)))
 
     @overload
-    def __getitem__(self, number: SupportsIndex | str) -> Sample: ...
+    def __getitem__(self, number: SupportsIndex | str | tuple[int, int | str]) -> Sample: ...
 
     @overload
     def __getitem__(self, number: slice) -> RawPairs: ...
 
-    def __getitem__(self, number: SupportsIndex | str | slice) -> Any:  # arrays instead of a Sample with arrays_only
+    def __getitem__(self, number: Any) -> Any:  # a dict instead of a Sample with inputs
         if isinstance(number, slice):
             return self._part(self._numbers[number])
+        epoch, number = number if isinstance(number, tuple) else (0, number)
         position = self._position(number) if isinstance(number, str) else operator.index(number)
         dataset, place = self._place(self._numbers[position])
-        sample = self._datasets[dataset].read(place)
-        return (*sample[:2], *sample.targets.values()) if self.arrays_only else sample
+        sample, options, flips = self._datasets[dataset].read(place), self._options, (False,) * 3
+        if options.side is not None:
+            sides = [int(sample.row[name] or 0) for name in ("height", "width")]
+            options.check_side(*sides)
+            drawn = _crop_names(sample.row, check_epoch(operator.index(epoch)))
+            sample = cut(sample, sample.row, even_corner(crop_words(*drawn), options.side, *sides), options.side)
+            flips = flip_bits(*drawn)
+        return options.item(sample, sample.row, flips, partial(development_parameters, sample.row))
 
-    def __getitems__(self, numbers: Sequence[int]) -> list[Any]:
+    def __getitems__(self, numbers: Sequence[Any]) -> list[Any]:
         """Read a batch as PyTorch's DataLoader asks for it, in items that its default ``collate_fn`` stacks.
 
         Items are named tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets
-        if there are any; with ``arrays_only`` tuples of arrays.
+        if there are any; with ``inputs`` dicts.
         """
-        return [self[number] if self.arrays_only else stackable(self[number]) for number in numbers]
+        return [stackable(self[number]) for number in numbers]
+
+
+def _crop_names(row: Row, epoch: int) -> tuple[int, int, int, int, int]:
+    """Numbers that name the random crop of a pair in an epoch, as `random_streams.crop_words` takes them."""
+    patch, level, draw, frame = (int(row[name] or 0) for name in ("patch", "level", "draw", "frame"))
+    return int(str(row["stream_key"]), 16), patch, level, draw, frame_word(frame, epoch)
 
 
 class DatasetRows:
@@ -271,7 +315,7 @@ class _Dataset(DatasetRows):
     """Pairs of one dataset: their rows, and their arrays in the shards."""
 
     def __init__(self, path: AnyPath, split: str | None) -> None:
-        self.formats: set[tuple[Value, ...]] = set()
+        self.targets: set[str] = set()
         self._indexes: Recent[int, dict[str, Member]] = Recent(MAX_MEMBERS)
         super().__init__(path, split)
 
@@ -281,8 +325,7 @@ class _Dataset(DatasetRows):
                 f"{self.path}: has a manifest without frames (output.frames=false); expected stored frames; read it "
                 f"with ug.LivePairs, or store them: gen-dataset again {self.path} out=FOLDER output.frames=true"
             )
-        clean, targets = row["clean_dtype"] or row["dtype"], str(row["targets"]).partition(":")[0] or "no"
-        self.formats.add((row["dtype"], clean, row["layout"], targets))
+        self.targets.add(str(row["targets"]).partition(":")[0] or "no")
         super()._note(row)
 
     def read(self, number: int) -> Sample:
@@ -333,16 +376,12 @@ def check_split(reader: str, split: str | None, splits: set[str]) -> None:
         raise ConfigError(f"{reader}: split={split[:40]!r}: no pair is in it; {expected}")
 
 
-def _check_formats(datasets: Sequence[_Dataset]) -> None:
-    """Raise ConfigError if frames of several datasets cannot be stacked, whatever their sizes."""
-    first = {form: dataset.name for dataset in reversed(datasets) for form in dataset.formats}
+def _check_targets(datasets: Sequence[_Dataset]) -> None:
+    """Raise ConfigError if the dicts of several datasets would differ in their keys."""
+    first = {targets: dataset.name for dataset in reversed(datasets) for targets in dataset.targets}
     if len(first) > 1:
-        kinds = "; ".join(
-            f"{name}: {noisy}, clean {clean}, {layout}, {targets} targets"
-            for (noisy, clean, layout, targets), name in first.items()
-        )
-        problem = "the frames differ in dtype or layout, or in targets"
-        raise ConfigError(f"RawPairs: arrays_only=True: {problem} ({kinds}); expected one; use arrays_only=False")
+        kinds = "; ".join(f"{name}: {targets} targets" for targets, name in first.items())
+        raise ConfigError(f"RawPairs: the datasets differ in targets ({kinds}); expected one; use inputs=None")
 
 
 def dataset_folders(path: AnyPath) -> list[AnyPath]:

@@ -1,4 +1,4 @@
-"""Prepare frames for training: packed planes, light, noise maps and crops. Needs NumPy only."""
+"""Prepare frames for training: packed planes, light, noise maps and crops."""
 
 from __future__ import annotations
 
@@ -121,6 +121,13 @@ def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
         slope = np.float32(prnu_std**2) * signal + slope
     variance = slope * signal + np.float32(intercept)
     return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
+
+
+def frame_noise_std(noisy: Frame, row: Row, *, of_white: bool) -> NDArray[np.float32]:
+    """Estimate the noise of a uint16 or float32 frame as `noise_std`, in DN or in units of white."""
+    black, span = _levels(row)
+    noisy_dn = noisy if noisy.dtype == np.uint16 else noisy * np.float32(span) + np.float32(black)
+    return noise_std(noisy_dn, row) / np.float32(span if of_white else 1)
 
 
 def random_crop(frames: Sequence[Frame], side: int, integer: Callable[[int], int]) -> tuple[Frame, ...]:

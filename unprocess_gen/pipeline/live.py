@@ -24,18 +24,19 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.core.random_streams import EPOCHS, crop_words, frame_word
+from unprocess_gen.core.random_streams import check_epoch, crop_words, even_corner, flip_bits, frame_word
 from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import TARGETS
 from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import recorded_places
+from unprocess_gen.dataset.development import development_parameters
+from unprocess_gen.dataset.inputs import Options
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, check_split, open_datasets, stackable
 from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
 from unprocess_gen.dataset.table import PairTable
-from unprocess_gen.dataset.training import to_light
-from unprocess_gen.pipeline.pairs import PairSettings, levels_of, plan_pixels, targets_of
+from unprocess_gen.pipeline.pairs import PairSettings, noise_columns, plan_pixels, targets_of
 from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
@@ -48,7 +49,7 @@ from unprocess_gen.simulation.pair import CropMaker, crop_maker
 from unprocess_gen.simulation.plan import Place, Plan, noisy_frames
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import identity_sha256, load_source
-from unprocess_gen.sources.patches import crop_patch, even_corner, list_patches
+from unprocess_gen.sources.patches import crop_patch, list_patches
 from unprocess_gen.sources.pixel_cache import PixelCache
 from unprocess_gen.sources.recorded_photographs import RecordedPhotographs
 
@@ -101,16 +102,13 @@ class LivePairs(PairTable):
     patches : int
         Number of such squares of each pair, at random places: consecutive items, which share the decoded image. The
         length grows by this factor. `EpochSampler` with this ``block`` keeps them together.
-    as_float : bool
-        Frames are float32 with 0 at black and 1 at white.
     targets : sequence of str
         More arrays: ``"variance"`` of the noise at each site, by the row on the clean frame; ``"noise_std"``, the
         standard deviation that `noise_std` estimates from the noisy frame; ``"srgb"``, the pixels of the photograph;
         ``"linear_rgb"``, the scene before the mosaic, 0 at black and 1 at white, [H, W, 3]. The first two are float32,
-        in DN² and DN, or in units of white with ``as_float``; the last is float32.
-    arrays_only : bool
-        Items are tuples of the clean frame, the noisy frame and the targets, which PyTorch's default ``collate_fn``
-        stacks.
+        in DN² and DN, or in units of white with ``inputs``; the last is float32.
+    flip, inputs, noise_map, rows, clip_black
+        As for `RawPairs`: random flips in each epoch, and dicts of arrays for a network.
 
     Raises
     ------
@@ -151,24 +149,25 @@ class LivePairs(PairTable):
         cache_bytes: int = 2**36,
         patch: int | None = None,
         patches: int = 1,
-        as_float: bool = False,
         targets: Sequence[str] = (),
-        arrays_only: bool = False,
+        flip: bool = False,
+        inputs: str | None = None,
+        noise_map: bool = False,
+        rows: bool = False,
+        clip_black: bool = False,
     ) -> None:
         if redraw not in REDRAWS:
             raise ConfigError(f"LivePairs: redraw={redraw!r}: unknown; expected one of {', '.join(REDRAWS)}")
         unknown = [name for name in targets if name not in TARGETS]
         if isinstance(targets, str) or unknown:
             raise ConfigError(f"LivePairs: targets={targets!r}: unknown; expected a list of {', '.join(TARGETS)}")
-        if patch is not None and (patch < 2 or patch % 2):
-            raise ConfigError(f"LivePairs: patch={patch}: out of range; expected an even number from 2")
+        self._options = Options("LivePairs", patch, flip, inputs, noise_map, rows, clip_black)
         if patches < 1 or (patches > 1 and patch is None):
             expected = "1 or more, and patch with more than 1"
             raise ConfigError(f"LivePairs: patches={patches}: out of range; expected {expected}")
         self._cache = None if cache is None else PixelCache(cache, cache_bytes)
         super().__init__(_live_sources(dataset, None if root is None else os.fspath(root), split))
-        self._redraw, self._patch, self._patches, self._as_float = redraw, patch, patches, as_float
-        self._targets, self._arrays_only = tuple(targets), arrays_only
+        self._redraw, self._patches, self._targets = redraw, patches, tuple(targets)
         most = (NEW_CROPS if redraw == "all" else KEPT_CROPS), NEW_CROPS
         self._kept: list[Recent[tuple[Any, ...], tuple[Plan, CropMaker]]] = [*map(Recent, most)]
         self._facts: Recent[int, Facts | None] = Recent(KEPT)  # they read all pixels of a photograph
@@ -181,16 +180,14 @@ class LivePairs(PairTable):
         names = first_of([repr(source.name) for source in self._datasets])
         return f"LivePairs({names}, length={len(self)}, redraw={self._redraw!r})"
 
-    def __getitem__(self, item: Any) -> Any:  # arrays instead of a LiveSample with arrays_only
+    def __getitem__(self, item: Any) -> Any:  # a dict instead of a LiveSample with inputs
         epoch, number = item if isinstance(item, tuple) else (0, item)
         if self._patches > 1 and isinstance(number, str | slice):
             items = f"an item is one of {self._patches} patches of a pair"
             raise UnknownKeyError(f"{number!r:.40}: {items}; expected the number of an item, or select(…)")
         if isinstance(item, slice):
             return self._part(self._numbers[item])
-        epoch = operator.index(epoch)
-        if not 0 <= epoch < EPOCHS:
-            raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
+        epoch, options = check_epoch(operator.index(epoch)), self._options
         number = self._position(number) if isinstance(number, str) else operator.index(number)
         position, crop = divmod(range(len(self))[number], self._patches)
         if not isinstance(item, tuple | str) and self._redraw != "none":
@@ -203,24 +200,25 @@ class LivePairs(PairTable):
         decode = partial(source.decode, image)
         srgb = decode() if self._cache is None else self._cache.get(image.cache_name, decode)
         plan, patch, make = self._prepared(place, image, srgb, epoch, number)
-        if self._patch is not None:
-            patch = _crop(plan, epoch, patch, self._patch, crop)
+        flips = (False,) * 3
+        if options.side is not None:
+            options.check_side(patch.height, patch.width)
+            words = patch.patch, plan.place.level, plan.place.draw, frame_word(plan.place.frame, epoch), crop
+            y, x = even_corner(crop_words(plan.stream_key, *words), options.side, patch.height, patch.width)
+            patch = Patch(options.side, options.side, patch.patch, patch.patch_y + y, patch.patch_x + x)
+            flips = flip_bits(plan.stream_key, *words)
         clean, noisy, counts = make(crop_patch(srgb, patch), patch.origin, epoch)
 
         def pair() -> Pair:
             return Pair(clean, noisy, counts())
 
-        targets = {}
+        targets, of_white = {}, options.inputs is not None
         if self._targets:
-            targets = targets_of(self._targets, srgb, plan, patch, pair(), as_float=self._as_float)
-        first, second = (
-            to_light(frame, levels_of(plan)) if self._as_float and frame.dtype == np.uint16 else frame
-            for frame in (clean, noisy)
-        )
-        if self._arrays_only:
-            return first, second, *targets.values()
+            targets = targets_of(self._targets, srgb, plan, patch, pair(), of_white=of_white)
         row: Any = LiveRow(partial(image.row, plan, epoch, patch, pair))
-        return LiveSample(first, second, row, source.name, targets)
+        sample = LiveSample(clean, noisy, row, source.name, targets)
+        columns = noise_columns(plan) if options.flip or of_white else {}
+        return options.item(sample, columns, flips, partial(development_parameters, plan))
 
     def _example(self, number: int) -> Any:
         return self[0, number * self._patches]
@@ -234,9 +232,9 @@ class LivePairs(PairTable):
         """Make a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
 
         Items are named tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets
-        if there are any; with ``arrays_only`` tuples of arrays.
+        if there are any; with ``inputs`` dicts.
         """
-        return [self[item] if self._arrays_only else stackable(self[item], epoch=0) for item in items]
+        return [stackable(self[item], epoch=0) for item in items]
 
     def _warn_of_repetition(self) -> None:
         """Warn when a second epoch begins without a number; a copy in a worker process does not see other epochs."""
@@ -256,7 +254,8 @@ class LivePairs(PairTable):
         plan_epoch = epoch if redraws or image.plan.dark else 0
         settings, patch, frame = self._datasets[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
         kept = self._kept[srgb.itemsize > 1 or image.plan.source.dequantize != "off"]
-        shape = (self._patch, self._patch) if self._patch else (patch.height, patch.width)
+        side = self._options.side
+        shape = (patch.height, patch.width) if side is None else (side, side)
         key = place, image.plan.stream_key, image.plan.place, plan_epoch, shape
         prepared = kept.get(key)
         if prepared is None:
@@ -324,19 +323,6 @@ def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[Liv
 def _is_dataset(place: Any) -> bool:
     """Check whether an item of a list is a folder, not an override."""
     return not isinstance(place, str) or "://" in place.partition("=")[0] or any_path(place).is_dir()
-
-
-def _crop(plan: Plan, epoch: int, patch: Patch, side: int, number: int) -> Patch:
-    """Cut a random square from a patch, at an even row and column."""
-    if side > min(patch.height, patch.width):
-        raise ConfigError(
-            f"LivePairs: patch={side}: exceeds a pair of {patch.width} x {patch.height} pixels; expected at most its "
-            "shorter side"
-        )
-    place = plan.place
-    words = crop_words(plan.stream_key, patch.patch, place.level, place.draw, frame_word(place.frame, epoch), number)
-    y, x = even_corner(words, side, patch.height, patch.width)
-    return Patch(side, side, patch.patch, patch.patch_y + y, patch.patch_x + x)
 
 
 # ------------------------------------------------------------------------------------------- pairs of epoch 0

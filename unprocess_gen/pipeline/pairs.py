@@ -8,16 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.arrays import Array, Frame, Srgb
+from unprocess_gen.core.arrays import Array, Srgb
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Value
-from unprocess_gen.dataset.training import noise_std
+from unprocess_gen.dataset.training import frame_noise_std
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.raw_source import with_raw_sensor
@@ -86,9 +83,9 @@ Targets = dict[str, Array]
 
 
 def targets_of(
-    names: Sequence[str], srgb: Srgb, plan: Plan, patch: Patch, pair: Pair, *, as_float: bool = False
+    names: Sequence[str], srgb: Srgb, plan: Plan, patch: Patch, pair: Pair, *, of_white: bool = False
 ) -> Targets:
-    """Compute targets by name from the complete image; with ``as_float``, noise is in units of white."""
+    """Compute targets by name from the complete image, noise in DN or in units of white."""
     targets: Targets = {}
     for name in names:
         pixels = crop_patch(srgb, patch)
@@ -97,26 +94,22 @@ def targets_of(
         elif name == LINEAR_RGB:
             targets[name] = linear_rgb(pixels, plan, patch.origin)
         else:
-            targets[name] = _noise(name, pair.clean if name == "variance" else pair.noisy, plan, as_float)
+            frame = pair.clean if name == "variance" else pair.noisy
+            std = frame_noise_std(frame, noise_columns(plan), of_white=of_white)
+            targets[name] = std * std if name == "variance" else std
     return targets
 
 
-def levels_of(plan: Plan) -> dict[str, Value]:
-    """Levels of a plan as columns of a row."""
-    return {"black_level_dn": plan.sensor.black_level_dn, "white_level_dn": plan.sensor.white_level_dn}
-
-
-def _noise(name: str, frame: Frame, plan: Plan, as_float: bool) -> NDArray[np.float32]:
-    """Compute the variance (DN²) or the standard deviation (DN) of the noise at each site of a frame."""
-    black, span = plan.sensor.black_level_dn, plan.sensor.span_dn
-    numbers = {
-        **levels_of(plan),
+def noise_columns(plan: Plan) -> dict[str, Value]:
+    """Columns of a plan that scale its frames and give their noise."""
+    return {
+        "black_level_dn": plan.sensor.black_level_dn,
+        "white_level_dn": plan.sensor.white_level_dn,
+        "pattern": plan.sensor.pattern,
+        "layout": plan.output.layout,
         "a_dn": plan.noise.a_dn,
         "dark_variance_dn2": dark_variance_dn2(plan),
         "prnu_std": 0.0 if plan.physics is None else plan.physics.prnu_std,
         "skipped": ";".join(plan.noise.skipped),
         "fixed_pattern_in_clean": plan.averaged,
     }
-    frame_dn = frame if frame.dtype == np.uint16 else frame * np.float32(span) + np.float32(black)
-    std = noise_std(frame_dn, numbers) / np.float32(span if as_float else 1)
-    return std * std if name == "variance" else std

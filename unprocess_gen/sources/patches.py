@@ -11,11 +11,11 @@ positions none is more likely than another by more than n / 2**32.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from unprocess_gen.config.interpretation import PatchRule
 from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb
-from unprocess_gen.core.random_streams import PATCH, frame_word, purpose
+from unprocess_gen.core.random_streams import PATCH, even_corner, frame_word, purpose
 from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.kernels.draws import draws
 
@@ -35,12 +35,6 @@ def list_patches(
         words, _ = draws(stream_key, rule.count, purpose(PATCH), frame_word(0, epoch))
         corners = (even_corner(place, rule.side, height, width) for place in words.tolist())
     return tuple(Patch(rule.side, rule.side, number, y, x) for number, (y, x) in enumerate(corners))
-
-
-def even_corner(place: Sequence[int], side: int, height: int, width: int) -> tuple[int, int]:
-    """Even row and column of a square in a rectangle that two random words choose."""
-    rows, columns = (height - side) // 2 + 1, (width - side) // 2 + 1
-    return 2 * (place[0] * rows >> 32), 2 * (place[1] * columns >> 32)
 
 
 def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:

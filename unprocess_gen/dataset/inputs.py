@@ -1,0 +1,212 @@
+"""Cut, flip and convert pairs to the arrays that a network takes: the options that `RawPairs` and `LivePairs` share."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.arrays import PACKED
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.targets import LINEAR_RGB
+from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.development import FILTERS, DevelopmentParameters
+from unprocess_gen.dataset.training import frame_noise_std, to_light
+from unprocess_gen.simulation.reference import cfa
+
+INPUTS = ("mosaic", PACKED)
+FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    "horizontal": lambda sites: sites[..., ::-1],
+    "vertical": lambda sites: sites[..., ::-1, :],
+    "transpose": lambda sites: np.swapaxes(sites, -1, -2),
+}
+"""Ways to flip, in the order of `random_streams.flip_bits`."""
+
+PICTURES = ("srgb", LINEAR_RGB)
+"""Targets whose last axis is the channel; others have the sites of the frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Arguments of `RawPairs` and `LivePairs`, which document them, that change an item; ``reader`` is the class."""
+
+    reader: str
+    patch: int | None = None
+    flip: bool = False
+    inputs: str | None = None
+    noise_map: bool = False
+    rows: bool = False
+    clip_black: bool = False
+
+    def __post_init__(self) -> None:
+        if self.inputs not in (None, *INPUTS):
+            known = ", ".join(INPUTS)
+            raise ConfigError(f"{self.reader}: inputs={self.inputs!r}: unknown; expected {known}, or None for samples")
+        for name in ("noise_map", "rows", "clip_black"):
+            if getattr(self, name) and self.inputs is None:
+                raise ConfigError(f"{self.reader}: {name}=True: has no effect on samples; expected inputs='packed'")
+        if self.patch is not None and (self.patch < 2 or self.patch % 2):
+            raise ConfigError(f"{self.reader}: patch={self.patch}: out of range; expected an even number from 2")
+        if self.flip and self.patch is None:
+            raise ConfigError(
+                f"{self.reader}: flip=True: a flip leaves out sites; expected patch, which all items have"
+            )
+
+    @property
+    def side(self) -> int | None:
+        """Side of the square to cut: a flip may leave out a site on each side."""
+        return self.patch if self.patch is None else self.patch + 2 * self.flip
+
+    def check_side(self, height: int, width: int) -> None:
+        """Raise ConfigError if a pair is smaller than the square."""
+        if self.side is not None and self.side > min(height, width):
+            sites = f" (patch={self.patch}, and 2 more for flip=True)" if self.flip else ""
+            raise ConfigError(
+                f"{self.reader}: patch={self.side}: exceeds a pair of {width} x {height} pixels{sites}; expected at "
+                "most its shorter side"
+            )
+
+    def item(
+        self, sample: Any, columns: Row, flips: tuple[bool, ...], development: Callable[[], DevelopmentParameters]
+    ) -> Any:
+        """Sample or dict of a pair that has been cut, where ``columns`` are levels, pattern, layout and noise."""
+        if self.flip:
+            hows = tuple(how for how, is_drawn in zip(FLIPS, flips, strict=True) if is_drawn)
+            sample = _flipped_sample(sample, columns, hows)
+            sample = cut(sample, columns, (0, 0), self.patch or 0)
+        if self.inputs is None:
+            return sample
+        arrays = {
+            name: self._light(frame, columns) for name, frame in (("noisy", sample.noisy), ("clean", sample.clean))
+        }
+        if self.clip_black:
+            arrays = {name: np.maximum(light, 0) for name, light in arrays.items()}
+        if self.noise_map:
+            arrays["noise_std"] = self._layout(frame_noise_std(sample.noisy, columns, of_white=True), columns)
+        for name, target in sample.targets.items():
+            arrays[name] = _even(target) if name in PICTURES else self._layout(target, columns)
+        row = {"row": sample.row} if self.rows else {}
+        return {**arrays, "development": development(), **row}
+
+    def _light(self, frame: NDArray[Any], columns: Row) -> NDArray[np.float32]:
+        light = to_light(frame, columns) if frame.dtype == np.uint16 else frame
+        return self._layout(light, columns)
+
+    def _layout(self, sites: NDArray[Any], columns: Row) -> NDArray[Any]:
+        """Mosaic or planes, as ``inputs`` says, in an array of its own."""
+        pattern, is_packed = str(columns["pattern"]), columns["layout"] == PACKED
+        if is_packed and self.inputs == PACKED:
+            return np.array(sites)
+        mosaic = cfa.unpack(sites, pattern) if is_packed else np.array(sites)
+        return cfa.pack(_even(mosaic), pattern) if self.inputs == PACKED else mosaic
+
+
+def cut(sample: Any, columns: Row, corner: tuple[int, int], side: int) -> Any:
+    """Sample of a square at an even row and column: views of its arrays."""
+
+    def part(name: str, array: NDArray[Any]) -> NDArray[Any]:
+        scale = 2 if columns["layout"] == PACKED and name not in PICTURES else 1
+        y, x = (slice(start // scale, (start + side) // scale) for start in corner)
+        return array[:, y, x] if scale == 2 else array[y, x]
+
+    return _changed(sample, part)
+
+
+def flip(x: Any, how: str, pattern: str = "RGGB") -> Any:
+    """Flip a mosaic or an item so that it keeps its CFA pattern.
+
+    Sites are moved, none is computed. A mosaic of even width is mirrored without its first and last column, since the
+    phase of the colours would change otherwise; likewise an even height. A transposition that would exchange red and
+    blue leaves out the first and last row and column. Banding along rows becomes banding along columns by it.
+
+    Parameters
+    ----------
+    x : ndarray, [..., H, W]; or an item of `RawPairs` or `LivePairs`
+        Mosaics, or a `Sample` or dict, all arrays of which are flipped. Its row stays that of the pair.
+    how : str
+        ``"horizontal"`` (columns in reverse order), ``"vertical"`` (rows), or ``"transpose"`` (rows become columns).
+    pattern : str
+        CFA pattern of mosaics: RGGB, BGGR, GRBG, GBRG, or MONO, which leaves out nothing. An item has its own.
+
+    Returns
+    -------
+    ndarray, Sample or dict
+        Of the kind of ``x``. Arrays of mosaics are views.
+
+    Raises
+    ------
+    ValueError
+        If ``how`` or ``pattern`` is unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import unprocess_gen as ug
+    >>> ug.flip(np.array([[1, 2, 3, 4], [5, 6, 7, 8]]), "horizontal")
+    array([[3, 2],
+           [7, 6]])
+    """
+    if how not in FLIPS:
+        raise ValueError(f"how={how!r}: unknown; expected one of {', '.join(FLIPS)}")
+    if isinstance(x, Mapping):
+        pattern = FILTERS[int(x["development"].pattern)]
+        is_packed = x["noisy"].ndim == 3
+        return {
+            name: _flipped_sites(name, value, (how,), pattern, is_packed) if isinstance(value, np.ndarray) else value
+            for name, value in x.items()
+        }
+    if hasattr(x, "row"):
+        return _flipped_sample(x, x.row, (how,))
+    return _flipped(np.asarray(x), (how,), pattern)
+
+
+def _flipped_sample(sample: Any, columns: Row, hows: tuple[str, ...]) -> Any:
+    pattern, is_packed = str(columns["pattern"]), columns["layout"] == PACKED
+    return _changed(sample, lambda name, array: _flipped_sites(name, array, hows, pattern, is_packed))
+
+
+def _flipped_sites(
+    name: str, array: NDArray[Any], hows: tuple[str, ...], pattern: str, is_packed: bool
+) -> NDArray[Any]:
+    """Flip an array of an item: a picture, planes, or a mosaic."""
+    if name in PICTURES:
+        return np.moveaxis(_flipped(np.moveaxis(array, -1, 0), hows, pattern), 0, -1)
+    if is_packed:
+        return cfa.pack(_flipped(cfa.unpack(array, pattern), hows, pattern), pattern)
+    return _flipped(array, hows, pattern)
+
+
+def _flipped(sites: NDArray[Any], hows: tuple[str, ...], pattern: str) -> NDArray[Any]:
+    """Flip the last two axes, and leave out what the phase of the pattern requires."""
+    top, left = _corner(hows, pattern, sites.shape[-2] % 2, sites.shape[-1] % 2)
+    for how in hows:
+        sites = FLIPS[how](sites)
+    height, width = sites.shape[-2:]
+    return sites[..., top : height - top, left : width - left]
+
+
+@functools.cache
+def _corner(hows: tuple[str, ...], pattern: str, *odd: int) -> tuple[int, int]:
+    """First row and column at which flipped sites have the pattern."""
+    tile = np.array([*cfa.filters(pattern)]).reshape(2, 2)
+    sites = np.tile(tile, (3, 3))[: 4 + odd[0], : 4 + odd[1]]
+    for how in hows:
+        sites = FLIPS[how](sites)
+    corners = ((y, x) for y in (0, 1) for x in (0, 1))
+    return next((y, x) for y, x in corners if (sites[y : y + 2, x : x + 2] == tile).all())
+
+
+def _changed(sample: Any, change: Callable[[str, NDArray[Any]], NDArray[Any]]) -> Any:
+    """Sample of the same pair with changed arrays."""
+    targets = {name: change(name, target) for name, target in sample.targets.items()}
+    frames = change("clean", sample.clean), change("noisy", sample.noisy)
+    return type(sample)(*frames, sample.row, sample.dataset, targets)
+
+
+def _even(sites: NDArray[Any]) -> NDArray[Any]:
+    """Rows and columns of complete 2x2 tiles."""
+    return sites[: len(sites) // 2 * 2, : sites.shape[1] // 2 * 2]
