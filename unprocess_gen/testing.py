@@ -19,7 +19,7 @@ import numpy as np
 from unprocess_gen import api
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.option_files import group_options
-from unprocess_gen.config.schema import PHYSICAL_NUMBERS, Config, replaced
+from unprocess_gen.config.schema import PHYSICAL_NUMBERS, Config, NoiseConfig, replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import FLOAT32, UINT16, Float, Srgb
 from unprocess_gen.dataset.manifest import csv_lines, read_rows, write_manifest
@@ -299,12 +299,11 @@ class BodyTests:
 
     def test_every_number_has_a_source(self) -> None:
         """Each number of a physical profile has a statement of provenance, or is named in ``assumed``."""
-        noise = self.config().noise
-        branches = [{name: value for name, value in vars(one).items() if name[-3:] != "law"} for one in noise.branches]
-        given = {name for one in (*branches, vars(noise)) for name, value in one.items() if value not in (None, 0.0)}
-        given &= {*PHYSICAL_NUMBERS, *(branches[0] if branches else ())} - {"iso"}
-        sourced = {*noise.assumed, *(name for one in noise.provenance for name in one.numbers)}
-        assert given <= sourced or not branches, f"numbers without a source: {sorted(given - sourced)}"
+        noise, default = self.config().noise, vars(NoiseConfig())
+        numbers = [vars(one).items() for one in noise.branches] + [[(n, vars(noise)[n]) for n in PHYSICAL_NUMBERS]]
+        given = {name for one in numbers for name, value in one if value not in (None, 0.0, default.get(name, 0.0))}
+        sourced = {*noise.assumed, *(name for one in noise.provenance for name in one.numbers), "iso", "read_law"}
+        assert given <= sourced or not noise.branches, f"numbers without a source: {sorted(given - sourced)}"
 
     def test_variance_is_linear_in_the_signal(self) -> None:
         """The variance of single pixels is a·u + b at every ISO and level, with positive a and b of the row."""

@@ -247,15 +247,6 @@ def test_zoom_keeps_the_place_of_the_site_pointed_at() -> None:
         assert 0 <= columns[0] < columns[1] <= shown.clean.shape[1]
 
 
-def test_finest_detail_is_in_the_textured_part() -> None:
-    picture = np.full((600, 800, 3), 90, np.uint8)
-    picture[:, :300] = 200  # a strong edge is no detail
-    picture[350:500, 600:750] = np.random.default_rng(0).integers(80, 100, (150, 150, 3))
-    row, column = views.finest_detail(picture)
-    assert 350 <= row < 500
-    assert 600 <= column < 750
-
-
 # ------------------------------------------------------------------------------------------------------------ browser
 
 
