@@ -6,11 +6,14 @@
 
 from __future__ import annotations
 
+import importlib.util
+import inspect
 import re
 import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import grimp
 
@@ -104,8 +107,31 @@ def purpose(package: str) -> str:
     return text.split('"""')[1].split("\n\n")[0].replace("\n", " ").replace("``", "`").strip()
 
 
+def names_table() -> str:
+    """Return a table of the names of the API page: arguments and first sentence, readable without Sphinx."""
+    page = (ROOT / "docs/reference/api.md").read_text(encoding="utf-8")
+    module, rows = PACKAGE, ["| name | purpose |", "|---|---|"]
+    is_missing = importlib.util.find_spec("torch") is None
+    if is_missing:
+        sys.modules["torch"] = MagicMock()
+    for kind, name, record in re.findall(r"^\.\. (\w+):: ([\w.]+)(\(\))?$", page, re.MULTILINE):
+        if kind == "currentmodule":
+            module = name
+        elif kind in ("autofunction", "autoclass", "autoexception") and not name.startswith(f"{PACKAGE}.simulation"):
+            place, _, last = (name if "." in name else f"{module}.{name}").rpartition(".")
+            entry = getattr(importlib.import_module(place), last)
+            given = "" if record or kind == "autoexception" else f"({', '.join(inspect.signature(entry).parameters)})"
+            shown = f"torch.{last}" if module.endswith(".torch") else last
+            first = inspect.getdoc(entry).partition("\n\n")[0].replace("\n", " ").replace("``", "`")
+            rows.append(f"| `{shown}{given}` | {first.replace('|', chr(92) + '|')} |")
+    if is_missing:  # no test may import a module without PyTorch
+        del sys.modules["torch"], sys.modules[f"{PACKAGE}.torch"]
+    return "\n".join(rows)
+
+
 GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
     "packages": ("docs/design/architecture.md", package_table),
+    "names": ("docs/reference/api.md", names_table),
     "lights": ("docs/guides/own_camera.md", light_tables),
 }
 """Generated parts: name of the markers, page, function that returns the text."""
