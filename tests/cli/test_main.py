@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shlex
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -409,3 +411,12 @@ def test_files_of_the_own_dataset_do_not_count_as_unmatched(run_main: RunMain, t
     for _ in range(2):
         done = run_main("source.root=p", "out=p/ds", "n_jobs=1", "-q")
         assert (done.code, "1 file is not matched by source.include (1 .txt)" in done.out) == (0, True), done
+
+
+def test_suggested_next_step_needs_no_extra(run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for library in ("matplotlib", "jinja2", "bokeh", "rawpy", "tifffile"):
+        monkeypatch.setitem(sys.modules, library, None)
+    fill(tmp_path / "p", 1)
+    done = run_main("source.root=p", "out=my ds", "n_jobs=1")
+    step = done.out.strip().partition("; next: gen-dataset ")[2]
+    assert (step, run_main(*shlex.split(step)).code) == ("preview 'my ds' --to 'my ds_sheets'", 0)

@@ -334,7 +334,7 @@ class NoisePlan(PlanRecord, frozen=True):
     """Noise profile, its variance, and the effects that are simulated."""
 
     # fmt: off
-    noise: Annotated[str, Field("name of the noise profile", ANY_TEXT)]
+    noise: Annotated[str, Field("name of the noise profile, with * if a number of it is overridden", ANY_TEXT)]
     noise_law: Annotated[str, Field(
         "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a "
         "plus a normal distribution of variance b", Choice("gaussian", "poisson"))]
