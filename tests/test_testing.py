@@ -144,6 +144,6 @@ class TestBodies(BodyTests):
 
 
 class TestProfiles(BodyTests):
-    @pytest.fixture(autouse=True, params=slow_except(("brooks2019", "imx385_iso3200_rvdd"), PROFILES))
+    @pytest.fixture(autouse=True, params=slow_except(("imx385_iso3200_rvdd",), PROFILES))
     def _noise(self, request: pytest.FixtureRequest) -> None:
         self.noise, self.overrides = request.param, NEEDS.get(request.param, ())
