@@ -151,3 +151,20 @@ def test_data_loader_stacks_pairs_with_rows(make: Make, tmp_path: Path) -> None:
     assert batch.noisy.dtype == torch.uint16 and tuple(batch.noisy.shape) == (len(pairs), 64, 64)
     assert batch.row["key"] == [pair.row["key"] for pair in pairs]
     assert tuple(batch.targets["linear_rgb"].shape) == (len(pairs), 64, 64, 3)
+    flipped = ug.RawPairs(tmp_path / "ds", patch=16, flip=True)
+    (batch,) = DataLoader(flipped, batch_size=len(pairs))
+    np.testing.assert_array_equal(batch.noisy, np.stack([pair.noisy for pair in flipped]))
+    assert tuple(batch.targets["linear_rgb"].shape) == (len(pairs), 16, 16, 3)
+
+
+def test_inputs_and_their_parameters_develop_as_the_stored_pairs(make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "ds", "source.patch=[random,64,2]", "source.limit=3", "camera=choice")
+    pairs = ug.RawPairs(tmp_path / "ds")
+    expected = np.stack([reference(pair.noisy, plan_from_row(pair.row)) for pair in pairs])
+    for inputs in ("mosaic", "packed"):
+        items = [*ug.RawPairs(tmp_path / "ds", inputs=inputs)]
+        batch = default_collate(items)
+        developed = develop(batch["noisy"], batch["development"])
+        np.testing.assert_allclose(developed.numpy(), expected, rtol=0, atol=LIMIT[torch.float32])
+        alone = develop(torch.from_numpy(np.stack([items[1]["noisy"]] * 2)), items[1]["development"])
+        assert torch.equal(alone, developed[[1, 1]])

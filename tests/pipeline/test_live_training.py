@@ -88,6 +88,33 @@ def test_default_batches_have_frames_rows_and_targets(made_kind: Kind) -> None:
     assert single.row["key"] == live[1, 0].row["key"]
 
 
+@pytest.mark.parametrize("inputs", ["mosaic", "packed"])
+@pytest.mark.parametrize("reader", [ug.RawPairs, ug.LivePairs])
+def test_batches_of_inputs_equal_the_items(reader: Any, inputs: str, made_kind: Kind) -> None:
+    """Persistent workers read two epochs; cameras, laws, dtypes, layouts and sizes of the frames differ."""
+    data = pytest.importorskip("torch.utils.data", reason="PyTorch is not installed")
+    folders = [made_kind(name) for name in ("two numbers", "random patches, packed", "float32", "float clean", "clips")]
+    targets = {"targets": ["variance", "srgb"]} if reader is ug.LivePairs else {}
+    pairs = reader(folders, inputs=inputs, noise_map=True, rows=True, patch=4, flip=True, **targets)
+    order, sampler = (ug.EpochSampler(len(pairs), seed=1) for _ in range(2))
+    loader = data.DataLoader(pairs, batch_size=3, sampler=sampler, num_workers=2, persistent_workers=True)
+    epochs = []
+    for _ in range(2):
+        items = pairs.__getitems__([*order])
+        batches = [*loader]
+        for name in items[0].keys() - {"development", "row"}:
+            values = np.concatenate([batch[name] for batch in batches])
+            np.testing.assert_array_equal(values, np.stack([item[name] for item in items]))
+        for number, field in enumerate(items[0]["development"]._fields):
+            values = np.concatenate([getattr(batch["development"], field) for batch in batches])
+            np.testing.assert_array_equal(values, np.stack([item["development"][number] for item in items]))
+        for name in ("key", "pattern", "a_dn", "row_std_dn"):
+            values = np.concatenate([batch["row"][name] for batch in batches])
+            np.testing.assert_array_equal(values, np.array([item["row"][name] for item in items]))
+        epochs.append({item["row"]["key"]: item["noisy"].tobytes() for item in items})
+    assert epochs[0].keys() == epochs[1].keys() and epochs[0] != epochs[1]
+
+
 @pytest.mark.parametrize("kind", ["two numbers", "night"])
 def test_10_000_items_differ(kind: str, made_kind: Kind) -> None:
     live = ug.LivePairs(made_kind(kind), cache="memory")

@@ -88,7 +88,8 @@ class Options:
         if self.noise_map:
             arrays["noise_std"] = self._layout(frame_noise_std(sample.noisy, columns, of_white=True), columns)
         for name, target in sample.targets.items():
-            arrays[name] = _even(target) if name in PICTURES else self._layout(target, columns)
+            picture = _even(target) if self.inputs == PACKED else target
+            arrays[name] = picture if name in PICTURES else self._layout(target, columns)
         row = {"row": sample.row} if self.rows else {}
         return {**arrays, "development": development(), **row}
 
@@ -135,7 +136,7 @@ def flip(x: Any, how: str, pattern: str = "RGGB") -> Any:
     Returns
     -------
     ndarray, Sample or dict
-        Of the kind of ``x``. Arrays of mosaics are views.
+        Of the kind of ``x``; copies.
 
     Raises
     ------
@@ -186,7 +187,7 @@ def _flipped(sites: NDArray[Any], hows: tuple[str, ...], pattern: str) -> NDArra
     for how in hows:
         sites = FLIPS[how](sites)
     height, width = sites.shape[-2:]
-    return sites[..., top : height - top, left : width - left]
+    return sites[..., top : height - top, left : width - left].copy()  # PyTorch takes no negative strides
 
 
 @functools.cache
