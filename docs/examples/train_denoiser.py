@@ -10,62 +10,27 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 import unprocess_gen as ug
+from unprocess_gen.torch import develop
 
 NOISE = "imx385_iso12800"
+PLANES = {"inputs": "packed", "noise_map": True}
+"""Items: noisy planes, clean planes and noise map, float32 [4, H, W], 0 at black and 1 at white."""
 CROP = 64
 """Side of a training crop, in sites of the mosaic; even."""
 BATCH = 16
 """Crops of a batch, and crops of each image in an epoch."""
 WIDTH = 32
 """Channels of the hidden layers."""
-
-
-def unpack(planes: np.ndarray, pattern: str) -> np.ndarray:
-    """Return the mosaic [2 H, 2 W] of four planes [4, H, W]; the inverse of `ug.pack`."""
-    mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), planes.dtype)
-    places = ug.pack(np.arange(mosaic.size).reshape(mosaic.shape), pattern)
-    mosaic.flat[places] = planes
-    return mosaic
-
-
-def light_and_std(noisy: np.ndarray, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return planes and noise map of a frame or crop, 0 at black and 1 at white, float32 [4, H // 2, W // 2]."""
-    even = noisy[: noisy.shape[0] // 2 * 2, : noisy.shape[1] // 2 * 2]
-    signal = np.maximum(even, row["black_level_dn"])  # the law would give deviations near 0 far below black
-    std = ug.noise_std(signal, row) / np.float32(row["white_level_dn"] - row["black_level_dn"])
-    return ug.pack(ug.to_light(even, row), row["pattern"]), ug.pack(std, row["pattern"])
-
-
-class LiveCrops(Dataset):
-    """Serve crops with new noise in each epoch: noisy planes, clean planes and noise map, float32 [4, 32, 32].
-
-    An item is (epoch, number), as `unprocess_gen.EpochSampler` yields them. Levels and noise of all pairs are those of
-    ``row``.
-    """
-
-    def __init__(self, data: Path, row: Mapping[str, Any]) -> None:
-        self.live = ug.LivePairs(data, split="train", cache="memory", patch=CROP, patches=BATCH, arrays_only=True)
-        self.row = row
-
-    def __len__(self) -> int:
-        return len(self.live)
-
-    def __getitem__(self, item: tuple[int, int]) -> tuple[torch.Tensor, ...]:
-        clean, noisy = self.live[item]
-        light, std = light_and_std(noisy, self.row)
-        truth = ug.pack(ug.to_light(clean, self.row), self.row["pattern"])
-        return torch.from_numpy(light), torch.from_numpy(truth), torch.from_numpy(std)
 
 
 class Denoiser(nn.Module):
@@ -83,7 +48,7 @@ class Denoiser(nn.Module):
         return noisy - std * self.layers(torch.cat([noisy, std], dim=1))
 
 
-def train(model: Denoiser, crops: LiveCrops, steps: int, workers: int) -> None:
+def train(model: Denoiser, crops: ug.LivePairs, steps: int, workers: int) -> None:
     """Minimise the mean error in units of the noise."""
     optimiser = torch.optim.Adam(model.parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
@@ -91,8 +56,9 @@ def train(model: Denoiser, crops: LiveCrops, steps: int, workers: int) -> None:
     loader = DataLoader(crops, batch_size=BATCH, sampler=sampler, num_workers=workers, persistent_workers=workers > 0)
     epochs = itertools.chain.from_iterable(itertools.repeat(loader))
     start, losses = time.process_time(), []
-    for step, (noisy, clean, std) in enumerate(itertools.islice(epochs, steps), start=1):
-        loss = ((model(noisy, std) - clean).abs() / std).mean()
+    for step, batch in enumerate(itertools.islice(epochs, steps), start=1):
+        std = batch["noise_std"]
+        loss = ((model(batch["noisy"], std) - batch["clean"]).abs() / std).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -103,51 +69,38 @@ def train(model: Denoiser, crops: LiveCrops, steps: int, workers: int) -> None:
             print(f"step {step:5}: mean error {np.mean(losses[-200:]):.3f} of the noise; {seconds:4.0f} s", flush=True)
 
 
-Filter = Callable[[np.ndarray, Mapping[str, Any]], np.ndarray]
-"""A denoiser of one frame: noisy mosaic and row to a mosaic in DN, float32."""
-
-
-def by_planes(filtered: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Filter:
-    """Return a filter of mosaics from one of planes (light and noise map to light)."""
-
-    def denoised(noisy: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
-        mosaic = unpack(filtered(*light_and_std(noisy, row)), row["pattern"])
-        return mosaic * np.float32(row["white_level_dn"] - row["black_level_dn"]) + np.float32(row["black_level_dn"])
-
-    return denoised
+Filter = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""A denoiser: noisy planes and noise map to planes, float32 [4, H, W]."""
 
 
 def gaussian(std_sites: float) -> Filter:
     """Return a Gaussian filter of each plane."""
-    return by_planes(lambda light, _: np.stack([cv2.GaussianBlur(plane, (0, 0), std_sites) for plane in light]))
+    return lambda noisy, _: np.stack([cv2.GaussianBlur(plane, (0, 0), std_sites) for plane in noisy])
 
 
 def bilateral(std_sites: float, std_range: float) -> Filter:
     """Return a bilateral filter of each plane; ``std_range`` is in units of the mean noise."""
-    return by_planes(
-        lambda light, std: np.stack(
-            [cv2.bilateralFilter(plane, -1, std_range * float(std.mean()), std_sites) for plane in light]
-        )
+    return lambda noisy, std: np.stack(
+        [cv2.bilateralFilter(plane, -1, std_range * float(std.mean()), std_sites) for plane in noisy]
     )
 
 
 def network(model: Denoiser) -> Filter:
     """Return the trained model as a filter."""
 
-    def filtered(light: np.ndarray, std: np.ndarray) -> np.ndarray:
+    def filtered(noisy: np.ndarray, std: np.ndarray) -> np.ndarray:
         with torch.inference_mode():
-            return model(torch.from_numpy(light)[None], torch.from_numpy(std)[None])[0].numpy()
+            return model(torch.from_numpy(noisy)[None], torch.from_numpy(std)[None])[0].numpy()
 
-    return by_planes(filtered)
+    return filtered
 
 
 def psnr(denoised: Filter, pairs: ug.RawPairs) -> float:
-    """Return the mean PSNR of denoised frames in raw DN, dB; the peak is the white level above black."""
+    """Return the mean PSNR of denoised frames in raw, dB; the peak is the white level above black."""
     values = []
-    for clean, noisy, row in pairs:
-        frame = np.clip(denoised(noisy, row), row["black_level_dn"], row["white_level_dn"])
-        error = frame - clean[: frame.shape[0], : frame.shape[1]].astype(np.float32)
-        values.append(20 * np.log10((row["white_level_dn"] - row["black_level_dn"]) / np.sqrt(np.mean(error**2))))
+    for pair in pairs:
+        error = np.clip(denoised(pair["noisy"], pair["noise_std"]), 0, 1) - pair["clean"]
+        values.append(-10 * np.log10(np.mean(error**2)))
     return float(np.mean(values))
 
 
@@ -160,13 +113,13 @@ def best(candidates: dict[str, Filter], pairs: ug.RawPairs) -> tuple[str, Filter
 def draw(path: Path, denoised: Filter, pairs: ug.RawPairs) -> None:
     """Save crops of the noisy, the denoised and the clean frame of two pairs, developed to sRGB."""
     rows = []
-    for clean, noisy, row in pairs:
-        frame = np.rint(np.clip(denoised(noisy, row), row["black_level_dn"], row["white_level_dn"])).astype(np.uint16)
-        height, width = frame.shape
-        top, left = (height // 2 - 80) // 2 * 2, (width // 2 - 100) // 2 * 2
-        crop = np.s_[top : top + 160, left : left + 200]
-        rows.append(np.hstack([ug.develop(one[crop], row) for one in (noisy, frame, clean)]))
-    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
+    for pair in pairs:
+        frames = np.stack([pair["noisy"], denoised(pair["noisy"], pair["noise_std"]), pair["clean"]])
+        top, left = (frames.shape[2] - 80) // 2, (frames.shape[3] - 100) // 2
+        crops = torch.from_numpy(frames[:, :, top : top + 80, left : left + 100].copy())
+        rows.append(np.hstack(np.moveaxis(develop(crops, pair["development"]).numpy(), 1, -1)))
+    image = np.rint(255 * np.vstack(rows)).astype(np.uint8)
+    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
 
 
 def main() -> None:
@@ -187,14 +140,15 @@ def main() -> None:
     data = options.out / f"denoiser_{name}"
     try:
         ug.generate(ug.load_config([source, f"noise={NOISE}", "split={train: 0.8, test: 0.2}", f"out={data}"]))
-        known, new = ug.RawPairs(data, split="train"), ug.RawPairs(data, split="test")
+        crops = ug.LivePairs(data, split="train", cache="memory", patch=CROP, patches=BATCH, **PLANES)
+        known, new = (ug.RawPairs(data, split=part, **PLANES) for part in ("train", "test"))
     except ug.UnprocessGenError as error:
         raise SystemExit(f"{parser.prog}: {error}") from error
     model = Denoiser()
     size = sum(parameter.numel() for parameter in model.parameters())
     print(f"{len(known)} pairs to train on, {len(new)} held out; {size:,} parameters")
 
-    train(model, LiveCrops(data, known[0].row), options.steps, options.workers)
+    train(model, crops, options.steps, options.workers)
 
     few = known[:: max(len(known) // 8, 1)]
     gaussians = {f"Gaussian, {std} sites": gaussian(std) for std in (0.4, 0.6, 0.8, 1.0, 1.3, 1.7)}
@@ -204,7 +158,7 @@ def main() -> None:
         for width in (2, 3, 5)
     }
     print("PSNR of held-out frames, raw DN:")
-    results = {"noisy frame": lambda noisy, _: noisy.astype(np.float32)}
+    results = {"noisy frame": lambda noisy, _: noisy}
     results |= dict([best(gaussians, few), best(bilaterals, few)]) | {"network": network(model)}
     for name, one in results.items():
         print(f"  {name:32} {psnr(one, new):5.2f} dB")
