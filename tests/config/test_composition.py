@@ -133,6 +133,35 @@ def test_bugs_are_neither_hidden_nor_tried_twice(place: str, monkeypatch: pytest
     assert len(calls) == 1
 
 
+WRONG_FILES = [
+    ("noise/bad", ["noise=bad"], "", r"mine/noise/bad.yaml: noise.units=dnn: expected one of dn, normalized$"),
+    ("noise/bad", ["noise=bad", "noise.units=dnm"], "", "^noise.units=dnm: expected one of"),
+    (
+        "noise/bad",
+        ["noise=bad"],
+        "noise",
+        "noise=bad: no such option; .* for .*/mine/noise/bad.yaml, write --config-dir .*/mine$",
+    ),
+    (
+        "experiment/bad",
+        ["+experiment=bad"],
+        "",
+        r"\+experiment=bad: .*/bad.yaml: expected '# @package _global_' as its first",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "overrides", "folder", "sentence"), WRONG_FILES)
+def test_refused_files_are_named_with_the_remedy(
+    name: str, overrides: list[str], folder: str, sentence: str, own: Path
+) -> None:
+    (own / name).parent.mkdir(exist_ok=True)
+    defaults = "defaults: [override /noise: none]\n" if "experiment" in name else ""
+    (own / f"{name}.yaml").write_text(defaults + OWN_PROFILE.replace("normalized", "dnn"))
+    with pytest.raises(ConfigError, match=sentence):
+        load_config(overrides, own / folder)
+
+
 def test_text_for_a_list_and_a_missing_folder_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"overrides='seed=1': one string; expected a list .*\['seed=1'\]"):
         load_config("seed=1")

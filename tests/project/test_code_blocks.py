@@ -2,7 +2,8 @@
 
 Every ``python`` and ``bash`` block of a page runs, in order, in a new folder that contains `photos` and `clips`. Python
 blocks of a page share their names. A ``yaml`` block that begins with a comment with a path, such as
-``# mine/camera/phone.yaml: …``, is written to that path. Indented blocks that begin with a command count as ``bash``.
+``# mine/camera/phone.yaml: …``, is written to that path, as is a ``python`` block that begins with ``# train.py: …``.
+Indented blocks that begin with a command count as ``bash``.
 HTML comments directly before a block change this:
 
 * ``<!-- not run: reason -->``: the block does not run.
@@ -42,7 +43,7 @@ BLOCK = re.compile(
 """Comments, and a fenced block (language and text) or an indented one."""
 
 COMMANDS = ("gen-dataset", "python", ".venv/bin", "pip ", "pytest")
-YAML_PATH = re.compile(r"(?:# @package _global_\n)?# ([\w./-]+\.yaml)\b")
+FILE_PATH = re.compile(r"(?:# @package _global_\n)?# ([\w./-]+(?:\.yaml\b|\.py:))")
 SYNOPSIS = re.compile(r"\.\.\.|…|\[flags\]")
 OPERATORS = ("|", "&", ";", ">", "<", "$(", "=$")
 
@@ -95,16 +96,16 @@ class Page:
     def run(self, block: Block) -> str:
         """Run one block and return what it prints on stdout."""
         place = f"{self.path.relative_to(ROOT)}:{block.line}"
-        if block.language == "python":
+        if block.language in ("yaml", "python") and (named := FILE_PATH.match(block.text)):
+            file = Path(named[1].rstrip(":"))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(block.text + "\n", encoding="utf-8")
+        elif block.language == "python":
             printed = io.StringIO()
             code = compile("\n" * (block.line - 1) + block.text, str(self.path), "exec")
             with contextlib.redirect_stdout(printed):
                 exec(code, self.names)
             return printed.getvalue()
-        if block.language == "yaml" and (named := YAML_PATH.match(block.text)):
-            file = Path(named[1])
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(block.text + "\n", encoding="utf-8")
         if block.language != "bash":
             return ""
         printed_by, expected = "", [0] * len(commands_of(block))
@@ -178,3 +179,10 @@ def test_blocks_that_do_not_run_have_a_reason() -> None:
     assert len([block for block in blocks.values() if block.runs and block.language]) > 80
     assert [place for place, block in blocks.items() if block.comments.get("not run") == ""] == []
     assert [place for place, block in blocks.items() if block.language in ("sh", "shell", "console", "py")] == []
+
+
+def test_a_training_has_at_most_30_lines() -> None:
+    page = ROOT / "docs/guides/hydra_apps.md"
+    (training,) = [block.text for block in blocks_of(page) if block.text.startswith("# train.py: ")]
+    assert all(word in training for word in ("hydra.main", "packed", "noise_map", "develop", "num_workers=2"))
+    assert len([line for line in training.splitlines() if line.strip()]) <= 30

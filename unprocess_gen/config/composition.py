@@ -12,8 +12,9 @@ import functools
 import itertools
 import math
 import os
+import re
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,7 @@ from unprocess_gen.config.schema import CHOSEN, TWO_NUMBERS, Config, NoiseConfig
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.config.yaml_files import read_yaml_mapping
+from unprocess_gen.config.yaml_files import flat, read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import value_text
 
@@ -136,20 +137,31 @@ def composed_config(overrides: Sequence[str], folders: OptionFolders) -> tuple[C
 class Composition:
     """A composed config, whose values are not checked, and the overrides that it is composed from.
 
-    ``swept`` is the value of each swept key; None without a sweep.
+    ``files`` are the chosen option files of the user, by group. ``swept`` is the value of each swept key; None without
+    a sweep.
     """
 
     node: DictConfig
     overrides: tuple[str, ...]
+    files: Mapping[str, Path]
     swept: Mapping[str, str] | None = None
 
     def config(self) -> Config:
         """Resolve and validate the config; ConfigError if an interpolation or a value is refused."""
-        with _naming(self.swept):
+        with _naming(self.swept, self._file):
             config = typed_config(self.node, self.overrides)
             check_raw_overrides(config, self.overrides)
             validate_config(config)
         return config
+
+    def _file(self, message: str) -> str:
+        """Name the user's option file that states the refused key, unless an override does."""
+        key = message.partition("=")[0].partition(":")[0]
+        if not any(text.lstrip("+").startswith(f"{key}=") for text in self.overrides):
+            for group, file in self.files.items():
+                if flat(read_yaml_mapping(file)).keys() & {key, key.removeprefix(f"{group}.")}:
+                    return f"{file}: "
+        return ""
 
     def text(self, shown: str, resolve: bool) -> str:
         """YAML of the settings (``job``), of Hydra's own (``hydra``), or of both (``all``)."""
@@ -171,7 +183,7 @@ def compose_jobs(overrides: Sequence[str], folders: OptionFolders, multirun: boo
     is_sweep, params = _sweep_settings(node)
     if not (multirun or is_sweep):
         _refuse_values(choices, params)
-        yield Composition(_marked(node, overrides, folders), tuple(overrides))
+        yield Composition(_marked(node, overrides, folders), tuple(overrides), _own_files(node, folders))
         return
     given = {choice.name for choice in choices}
     choices += [choice for choice in _parse(list(params.values()), folders) if choice.name not in given]
@@ -186,18 +198,26 @@ def compose_jobs(overrides: Sequence[str], folders: OptionFolders, multirun: boo
                 problem = "found in an option that the sweep itself selects; expected it in one that all jobs have"
                 raise ConfigError(f"hydra.sweeper.params.{min(hidden)}: {problem}")
             node = _marked(node, job, folders)
-        yield Composition(node, job, swept)
+        yield Composition(node, job, _own_files(node, folders), swept)
+
+
+def _own_files(node: DictConfig, folders: OptionFolders) -> dict[str, Path]:
+    """File of each group whose option is in the user's folder."""
+    choices = node.hydra.runtime.choices.items() if folders.own else ()
+    files = {group: Path(folders.own or "", group, f"{option}.yaml") for group, option in choices}
+    return {group: file for group, file in files.items() if file.is_file()}
 
 
 @contextmanager
-def _naming(swept: Mapping[str, str] | None) -> Iterator[None]:
-    """Begin messages with the values that a sweep gives to the job."""
+def _naming(swept: Mapping[str, str] | None, file_of: Callable[[str], str] = lambda message: "") -> Iterator[None]:
+    """Begin messages with the values that a sweep gives to the job, and the file that states the refused value."""
     try:
         yield
     except ConfigError as error:
-        if not swept:
+        job = f"{','.join(f'{key}={value}' for key, value in swept.items())}: " if swept else ""
+        if not (place := job + file_of(str(error))):
             raise
-        raise ConfigError(f"{','.join(f'{key}={value}' for key, value in swept.items())}: {error}") from error
+        raise ConfigError(f"{place}{error}") from error
 
 
 class _Choice(NamedTuple):
@@ -353,9 +373,16 @@ def _check_own_files(overrides: Sequence[str], folders: OptionFolders) -> None:
     if folders.name is not None:
         chosen[f"--config-name {folders.name}"] = folders.name
     for text, name in chosen.items() if folders.own is not None else ():
-        file = Path(folders.own or "", f"{name}.yaml")
+        file, group = Path(folders.own or "", f"{name}.yaml"), name.partition("/")[0]
+        parent = Path(folders.own or "").parent
+        if (found := parent / f"{name}.yaml").is_file() and found.parent == folders.own:
+            raise ConfigError(
+                f"{text}: no such option; expected the folder of groups; for {found}, write --config-dir {parent}"
+            )
         if not file.is_file():
             continue
+        if group in ADDED_GROUPS and not re.search(r"^# *@package +_global_", file.read_text(errors="replace"), re.M):
+            raise ConfigError(f"{text}: {file}: expected '# @package _global_' as its first line")
         if (folders.main / f"{name}.yaml").is_file():
             problem = "has the name of a built-in file, which would be used instead"
             raise ConfigError(f"{text}: {file} {problem}; rename the file")

@@ -10,7 +10,7 @@ from typing import Any
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
-from unprocess_gen.config.option_files import ADDED_GROUPS, file_hint
+from unprocess_gen.config.option_files import file_hint
 from unprocess_gen.config.schema import BranchConfig, Config, ProvenanceConfig
 from unprocess_gen.config.settings import all_settings, settings_of
 from unprocess_gen.config.values import error_in_one_line
@@ -51,9 +51,6 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
 def _unknown_key(key: str, group: Any, overrides: Sequence[str]) -> str:
     """Name the keys that a group has in place of an unknown one."""
     written = _assignment(key, group, overrides)
-    if key in ADDED_GROUPS:
-        problem = f"the keys of the file are below '{key}'"
-        return f"{written}: {problem}; expected '# @package _global_' as its first line"
     place, _, name = key.rpartition(".")
     names = [field.name for field in fields(group)]
     allowed = "expected one of" if group is Config else f"{ITEMS.get(group, place)} has"

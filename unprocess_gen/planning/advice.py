@@ -95,7 +95,7 @@ def sensor_warning(config: Config) -> str:
     name = config.noise.name.removesuffix(OVERRIDDEN)
     return (
         f"noise={name} was calibrated with {_levels_text(calibrated)}, but is simulated with "
-        f"{_levels_text(chosen)} of the default sensor={default_options()['sensor']}; "
+        f"{_levels_text(chosen)}, the levels of the default sensor={default_options()['sensor']}; "
         f"{' '.join(fitting_sensor(calibrated, name))} gives the calibrated levels"
     )
 
