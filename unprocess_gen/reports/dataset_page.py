@@ -119,9 +119,6 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
 
 def _figure(panel: SheetPanel) -> tuple[str, str, str]:
     """Title, note and picture of a panel; no picture if it has none."""
-    shown = panel.overview
-    return (
-        panel.title,
-        panel.note,
-        "" if shown is None else data_uri(picture_jpeg(byte_codes(shown), JPEG_QUALITY), "jpeg"),
-    )
+    if panel.overview is None:
+        return panel.title, panel.note, ""
+    return panel.title, panel.note, data_uri(picture_jpeg(byte_codes(panel.overview), JPEG_QUALITY), "jpeg")
