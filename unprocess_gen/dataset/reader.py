@@ -229,16 +229,16 @@ class RawPairs(PairTable):
         names = first_of([repr(str(path)) for path in paths])
         return f"RawPairs({f'[{names}]' if isinstance(self.path, tuple) else names}, length={len(self)})"
 
-    def __iter__(self) -> Iterator[Sample]:
+    def __iter__(self) -> Iterator[Any]:
         return (self[number] for number in range(len(self)))
-
-    @overload
-    def __getitem__(self, number: SupportsIndex | str | tuple[int, int | str]) -> Sample: ...
 
     @overload
     def __getitem__(self, number: slice) -> RawPairs: ...
 
-    def __getitem__(self, number: Any) -> Any:  # a dict instead of a Sample with inputs
+    @overload
+    def __getitem__(self, number: SupportsIndex | str | tuple[int, int | str]) -> Any: ...
+
+    def __getitem__(self, number: Any) -> Any:  # a Sample, or a dict with inputs
         if isinstance(number, slice):
             return self._part(self._numbers[number])
         epoch, position = self._item(number)

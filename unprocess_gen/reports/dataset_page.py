@@ -100,7 +100,8 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
         if first["dark_frame"] and dark_frames is None:
             raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
         access = dark_folder(dark_frames) if dark_frames and first["dark_frame"] else None
-        for noise in (measure_noise(*pairs[number], access) for number in numbers):
+        for clean, noisy, row in map(pairs.__getitem__, numbers):
+            noise = measure_noise(clean, noisy, row, access)
             checks.add(noise)
             fits += filter(None, [fit_noise(noise)])
     except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
