@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,10 +13,12 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import PACKED
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.random_streams import even_corner
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.development import FILTERS, DevelopmentParameters
+from unprocess_gen.dataset.row import COLUMNS
 from unprocess_gen.dataset.training import frame_noise_std, to_light
 from unprocess_gen.simulation.reference import cfa
 
@@ -29,6 +32,9 @@ FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
 
 PICTURES = ("srgb", LINEAR_RGB)
 """Targets whose last axis is the channel; others have the sites of the frames."""
+
+TEXTS = {column.name for column in COLUMNS if column.type is number_or_text}
+"""Columns with numbers in some pairs and text in others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +76,17 @@ class Options:
         return even_corner(words, side, height, width)
 
     def item(
-        self, sample: Any, columns: Row, words: tuple[int, int], development: Callable[[], DevelopmentParameters]
+        self,
+        sample: Any,
+        columns: Row,
+        words: tuple[int, int],
+        development: Callable[[], DevelopmentParameters],
+        **cells: Value,
     ) -> Any:
-        """Sample or dict of a pair that has been cut, where ``columns`` are levels, pattern, layout and noise."""
+        """Sample or dict of a pair that has been cut, where ``columns`` are levels, pattern, layout and noise.
+
+        ``cells`` are those of columns that some rows lack.
+        """
         if self.flip:  # by the lowest bits, which do not decide the corner
             hows = tuple(how for bit, how in enumerate(FLIPS) if words[0] >> bit & 1)
             sample = cut(_flipped_sample(sample, columns, hows), columns, (0, 0), self.patch or 0)
@@ -87,7 +101,7 @@ class Options:
         if self.noise_map:
             arrays["noise_std"] = frame_noise_std(sample.noisy, columns, of_white=True)
         arrays = {name: self._layout(name, array, columns) for name, array in (arrays | sample.targets).items()}
-        row = {"row": sample.row} if self.rows else {}
+        row = {"row": stackable_row(sample.row, cells)} if self.rows else {}
         return {**arrays, "development": development(), **row}
 
     def _layout(self, name: str, sites: NDArray[Any], columns: Row) -> NDArray[Any]:
@@ -98,6 +112,12 @@ class Options:
         if self.inputs == "mosaic":
             return np.array(sites)
         return np.array(_even(sites)) if is_picture else cfa.pack(_even(sites), pattern)
+
+
+def stackable_row(row: Row, cells: Row) -> dict[str, Any]:
+    """Row whose columns have one type in every pair: NaN instead of None, text where some pairs have text."""
+    cells = {**cells, **{name: math.nan if value is None else value for name, value in row.items()}}
+    return {name: str(value) if name in TEXTS else value for name, value in cells.items()}
 
 
 def cut(sample: Any, columns: Row, corner: tuple[int, int], side: int) -> Any:

@@ -23,10 +23,10 @@ from unprocess_gen.core.random_streams import crop_words, frame_word
 from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.development import development_parameters
-from unprocess_gen.dataset.inputs import Options, cut
+from unprocess_gen.dataset.inputs import TEXTS, Options, cut, stackable_row
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
-from unprocess_gen.dataset.row import COLUMNS, has_frames
+from unprocess_gen.dataset.row import has_frames
 from unprocess_gen.dataset.shards import (
     Member,
     arrays_of,
@@ -101,30 +101,22 @@ class Sample(_Frames):
 
 _FramesAndTargets = namedtuple("_FramesAndTargets", "clean noisy row targets")
 
-_TEXTS = {column.name for column in COLUMNS if column.type is number_or_text}
-
 
 def stackable(sample: Sample | dict[str, Any], **cells: Value) -> Any:
     """Item of a pair, so that PyTorch's default ``collate_fn`` stacks it: a named tuple of a sample, or a dict.
 
-    Columns have one type in every pair: NaN instead of None, text where some pairs have text. ``cells`` are those of
-    columns that some rows lack.
+    ``cells`` are those of columns that some rows lack.
     """
     if isinstance(sample, dict):
-        return {**sample, "row": _stackable_row(sample["row"], cells)} if "row" in sample else sample
-    frames = sample.clean, sample.noisy, _stackable_row(sample.row, cells)
+        return sample
+    frames = sample.clean, sample.noisy, stackable_row(sample.row, cells)
     return _FramesAndTargets(*frames, sample.targets) if sample.targets else _Frames(*frames)
-
-
-def _stackable_row(row: Row, cells: Row) -> dict[str, Any]:
-    cells = {**cells, **{name: math.nan if value is None else value for name, value in row.items()}}
-    return {name: str(value) if name in _TEXTS else value for name, value in cells.items()}
 
 
 def row_of_batch(row: Row) -> Row:
     """Row as it was before `stackable`; others are the same."""
     cells = {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
-    return cells | {name: number_or_text(str(cells[name])) for name in _TEXTS & cells.keys() if cells[name] is not None}
+    return cells | {name: number_or_text(str(cells[name])) for name in TEXTS & cells.keys() if cells[name] is not None}
 
 
 def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
@@ -170,7 +162,7 @@ class RawPairs(PairTable):
     noise_map : bool
         Dicts have ``noise_std``: `noise_std` of the noisy frame, in the unit and shape of the frames.
     rows : bool
-        Dicts have ``row``.
+        Dicts have ``row``, with NaN for empty cells.
     clip_black : bool
         Dicts have no values below 0 in ``noisy`` and ``clean``.
 

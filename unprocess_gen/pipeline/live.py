@@ -214,7 +214,7 @@ class LivePairs(PairTable):
         row: Any = LiveRow(partial(image.row, plan, epoch, patch, pair))
         sample = LiveSample(clean, noisy, row, source.name, targets)
         columns = noise_columns(plan) if options.flip or of_white else {}
-        return options.item(sample, columns, words, partial(development_parameters, plan))
+        return options.item(sample, columns, words, partial(development_parameters, plan), epoch=0)
 
     def _part(self, numbers: NDArray[np.int64]) -> Self:
         part = super()._part(numbers)
