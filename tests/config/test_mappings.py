@@ -99,6 +99,7 @@ REFUSED = [
     ({"source": {"root": "${oc.env:UG_NOT_SET}"}}, "source.root: Environment variable 'UG_NOT_SET' not found"),
     ({"noise": {3: 1}}, r"noise\.3: the key is no text; expected the name of a setting"),
     ({"seed": np.float64(1)}, "seed: .*expected 0 to"),
+    ({"source": {"kind": "folder"}}, "source.kind=folder: is of the config.yaml of a dataset"),
     ({"sweep": "cameras"}, "the overrides describe a sweep"),
 ]
 

@@ -119,6 +119,8 @@ def load_config(
     """
     if isinstance(overrides, str):
         raise ConfigError(f"overrides={overrides!r}: one string; expected a list of strings; write [{overrides!r}]")
+    if not isinstance(overrides, Mapping | Sequence):
+        raise ConfigError(f"overrides={overrides!r:.60}: expected a list of strings, or a mapping")
     folders = OptionFolders(own=None if config_dir is None else Path(config_dir))
     given = overrides_of_mapping(overrides, folders.own) if isinstance(overrides, Mapping) else overrides
     return composed_config(given, folders)[0]

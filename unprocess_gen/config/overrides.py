@@ -27,6 +27,12 @@ WORDS_OF_HYDRA = ("null", "true", "false", "nan", "inf")
 
 def overrides_of_mapping(settings: Mapping[Any, Any], own: Path | None = None) -> list[str]:
     """Overrides for the keys of a mapping or DictConfig, whose interpolations are resolved in its own tree."""
+    source = settings.get("source")
+    if isinstance(source, Mapping) and source.get("kind") in ("folder", "synthetic"):
+        raise ConfigError(
+            f"source.kind={source['kind']}: is of the config.yaml of a dataset; expected settings; regenerate it by "
+            "gen-dataset again, or give the folder to LivePairs"
+        )
     try:
         tree = settings if isinstance(settings, DictConfig) else OmegaConf.create(dict(settings))
         return [*_overrides(tree, Config, "", {}, (conf_dir(), *([] if own is None else [own])))]

@@ -10,7 +10,6 @@ import numpy as np
 from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.simulation.plan import Plan
-from unprocess_gen.simulation.reference import isp
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 
 FILTERS = (*PATTERNS, MONO)
@@ -68,6 +67,8 @@ def development_parameters(row: Mapping[str, Value] | Plan) -> DevelopmentParame
     DamageError
         If the row is not the row of a pair.
     """
+    from unprocess_gen.simulation.reference import isp  # imports OpenCV, which the readers do not need
+
     plan = row if isinstance(row, Plan) else plan_from_row(row)
     values = (
         FILTERS.index(plan.sensor.pattern),

@@ -59,7 +59,7 @@ class Options:
         if self.patch is not None and (self.patch < 2 or self.patch % 2):
             raise ConfigError(f"{self.reader}: patch={self.patch}: out of range; expected an even number from 2")
         if self.flip and self.patch is None:
-            raise ConfigError(f"{self.reader}: flip=True: leaves out sites; expected patch, which all items have")
+            raise ConfigError(f"{self.reader}: flip=True: changes sizes; expected patch, the side of all items")
 
     @property
     def side(self) -> int | None:
