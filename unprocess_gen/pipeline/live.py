@@ -41,7 +41,7 @@ from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import draw_split, next_dark_frame, redraw_plan
-from unprocess_gen.planning.raw_source import parts_of
+from unprocess_gen.planning.raw_source import parts_of, stated_source
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.frames import Pair, Patch
@@ -274,7 +274,7 @@ class LivePairs(PairTable):
         if self._redraw == "all":
             facts = self._facts.get(number)
             if facts is None:
-                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan))
+                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan), stated_source(plan))
                 self._facts.keep(number, facts)
             plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
         if plan.dark and settings.dark_frames is not None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import Float, Srgb
+from unprocess_gen.core.arrays import Float, Srgb, last_code
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import filters
 from unprocess_gen.simulation.reference.unprocess import camera_light
@@ -60,7 +60,7 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     noise than the others and are left out.
     """
     codes = _green_sites(srgb, plan.sensor.pattern)
-    last, plane = int(np.iinfo(srgb.dtype).max), 1 if "R" in plan.sensor.pattern[:2] else 2
+    last, plane = last_code(srgb), 1 if "R" in plan.sensor.pattern[:2] else 2
     black, white = (levels[plane] for levels in plan.source.code_levels) if plan.source.is_raw else (0, last)
     codes = codes[((codes > 0) & (codes < white)).all(axis=(1, 2, 3))]
     quiet = np.argsort(_laplacian_sums(codes[..., 1].astype(np.int64)), kind="stable")[: (len(codes) + 1) // 2]

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16
+from unprocess_gen.core.exact_distributions import power_of_two
 from unprocess_gen.core.fields import (
     FAILED,
     LARGEST,
@@ -41,6 +42,9 @@ _FILE_LEVELS = "{} levels of the raw file: R, G of the red rows, G of the blue r
 CODE_RANGE = 65535.0
 """Largest code of a raw source."""
 
+MOST_LIGHT = 65536.0
+"""Light of linear sources above it, in units of white, is limited to it, so that float32 kernels stay finite."""
+
 
 # ---------------------------------------------------------------------------------------- allowed values and conditions
 
@@ -53,6 +57,7 @@ LIST = Text(
 )
 HEX_KEY = Text("([0-9a-f]{16})?|none", "16 hexadecimal digits", write="{:016x}".format, read=lambda text: int(text, 16))
 HEX_128, HEX_256 = (Text(f"([0-9a-f]{{{n}}})?", f"{n} hexadecimal digits") for n in (32, 64))
+_XY = r"-?\d{1,3}(\.\d{1,17})?(e-\d\d)?"
 _LEVEL = r"\d{1,5}(\.\d{1,17})?(e-\d\d)?"
 LEVELS = Text(
     rf"({_LEVEL}(;{_LEVEL}){{3}})?",
@@ -72,11 +77,16 @@ COUNT = Integers(0, 2**63 - 1)
 SHARE = Numbers(0, 1)
 GAIN = Numbers(1e-4, 1e4)
 FINITE = Numbers(-LARGEST, LARGEST)
+PRIMARIES = Text(
+    rf"srgb|p3|rec2020|xyz|acescg|camera|{_XY}(;{_XY}){{7}}",
+    "srgb, p3, rec2020, xyz, acescg, camera, or eight numbers, separated by ;",
+)
 COORDINATE = Integers(0, 2**32 - 1)
 """Pixel coordinates and frame numbers are 32-bit counters of the random streams."""
 BAYER = "RGGB", "BGGR", "GRBG", "GBRG"
 
 RAW = Condition("source.kind is not raw", lambda config: config.source.kind == "raw")
+LINEAR = Condition("source.kind is not linear", lambda config: config.source.kind == "linear")
 CLIPS = Condition("source.clips is false", lambda config: config.source.clips)
 SPLITS = Condition("split is null", lambda config: config.split is not None)
 LIGHTS = Condition("gains.light is null", lambda config: config.gains.light is not None)
@@ -231,7 +241,7 @@ def _of_raw(meaning: str, limit: Limit, unit: str = "", stated: bool = False) ->
 
 
 class SourcePlan(PlanRecord, frozen=True):
-    """Preparation of the source's pixels; the fields of raw sources have their defaults for photographs."""
+    """Preparation of the source's pixels; fields of other kinds of sources have their defaults."""
 
     # fmt: off
     downscale: Annotated[int, Field(
@@ -256,7 +266,17 @@ class SourcePlan(PlanRecord, frozen=True):
         Numbers(0), "DN", stated=True)] = 0.0
     own_b_dn2: Annotated[float, _of_raw(
         "variance at black of the raw source itself in the clean frame", Numbers(0), "DN²", stated=True)] = 0.0
+    primaries: Annotated[str, Field(
+        "primaries of a linear source: a name, or x and y of red, green, blue and white as its file states them",
+        PRIMARIES, needs=LINEAR)] = ""
+    pixels_xxh3: Annotated[str, Field(
+        "XXH3-128 of the pixels that the file was decoded to", HEX_128, needs=LINEAR)] = ""
     # fmt: on
+
+    @property
+    def is_linear(self) -> bool:
+        """True for scene-linear pictures."""
+        return self.primaries != ""
 
     @property
     def is_raw(self) -> bool:
@@ -322,12 +342,15 @@ class ScenePlan(PlanRecord, frozen=True):
     exposure_ratio: Annotated[float, Field(
         "divisor of the light in the photograph: 100 leaves a hundredth; frames are not brightened afterwards",
         Numbers(1e-3, 1e6))]
+    ev: Annotated[float, Field(
+        "exposure of a linear source, whose light is multiplied by 2^ev", Numbers(-64, 64), "stops",
+        needs=LINEAR)] = 0.0
     # fmt: on
 
     @property
     def exposure(self) -> float:
         """Factor applied to the light of the scene."""
-        return 1 / self.exposure_ratio
+        return power_of_two(self.ev) / self.exposure_ratio
 
 
 class NoisePlan(PlanRecord, frozen=True):
@@ -580,6 +603,11 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         if not self.source.is_raw:
             return 0.0
         return (self.sensor.limits_dn[0] - self.sensor.black_level_dn) / self.sensor.span_dn
+
+    @property
+    def most_light(self) -> float:
+        """Light up to which the noise follows it: `brightest`, where light is clipped; more for linear sources."""
+        return MOST_LIGHT if self.source.is_linear else self.brightest
 
     @property
     def brightest_dn(self) -> float:

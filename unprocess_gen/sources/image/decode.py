@@ -36,6 +36,7 @@ import numpy as np
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.simulation.facts import RawParts
+from unprocess_gen.simulation.plan import SourcePlan
 from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
 
@@ -79,13 +80,15 @@ _COLOUR_16 = _COLOUR | cv2.IMREAD_ANYDEPTH
 class Photograph:
     """Decoded pixels ``srgb``, uint8 or uint16 [H, W, 3], R, G, B, after applying the EXIF ``orientation``.
 
-    Of a raw source, they are codes of its camera RGB, and ``raw`` is what the file states. ``note`` is a warning.
+    Of a raw source, they are codes of its camera RGB, and ``raw`` is what the file states. Of a linear source, they are
+    light, float32, and ``source`` is what the file states. ``note`` is a warning.
     """
 
     srgb: Srgb
     orientation: int
     raw: RawParts | None = None
     note: str = ""
+    source: SourcePlan | None = None
 
 
 def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Photograph:

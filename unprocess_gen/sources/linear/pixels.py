@@ -1,0 +1,34 @@
+"""Check the light of a linear source, and describe it for a plan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.errors import SourceError
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.simulation.plan import SourcePlan
+
+SRGB = "srgb"
+"""Primaries of files that state none."""
+
+
+def linear_pixels(pixels: NDArray[Any]) -> NDArray[np.float32]:
+    """Convert decoded light to float32 [H, W, 3] in native byte order; SourceError if it is no finite light."""
+    actual = f"{pixels.dtype} {list(pixels.shape)}"
+    if pixels.dtype not in (np.float16, np.float32) or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
+        raise SourceError("unsupported", f"is {actual}; expected light [H, W, 3] of float16 or float32")
+    light = np.ascontiguousarray(pixels, np.float32)
+    if not np.isfinite(light).all():
+        count = int((~np.isfinite(light)).any(axis=2).sum())
+        raise SourceError("corrupt", f"has {count} pixels that are NaN or infinite; expected finite light")
+    return light
+
+
+def linear_source(config: SourceConfig, light: Srgb, stated: str = SRGB) -> SourcePlan:
+    """Source of a plan: its downscaling, primaries, which the settings give or the file states, and its digest."""
+    return SourcePlan(config.downscale, "off", primaries=config.primaries or stated, pixels_xxh3=array_xxh3(light))
