@@ -253,7 +253,7 @@ class LivePairs(PairTable):
         redraws = self._redraw == "all"
         plan_epoch = epoch if redraws or image.plan.dark else 0
         settings, patch, frame = self._datasets[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
-        kept = self._kept[srgb.itemsize > 1 or image.plan.source.dequantize != "off"]
+        kept = self._kept[srgb.itemsize == 2 or image.plan.source.dequantize != "off"]
         side = self._options.side
         shape = (patch.height, patch.width) if side is None else (side, side)
         key = place, image.plan.stream_key, image.plan.place, plan_epoch, shape
