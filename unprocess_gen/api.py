@@ -196,7 +196,7 @@ def make_pair(
         raise ConfigError("make_pair: the plan is of a raw frame; expected that of a photograph; use ug.LivePairs")
     elif seed is None and key is None:
         recorded, patches = _recorded(pixels, config.source.downscale, config.output.layout)
-        plan = config.replace(pixels_xxh3=array_xxh3(recorded)) if is_linear else config
+        plan = config.replace(pixels_xxh3=array_xxh3(pixels)) if is_linear else config
         source, image = _array_source(pixels, None), PlannedImage(recorded, (plan,), patches)
     else:
         raise ConfigError("make_pair: a plan has its own seed and key; expected them with a config only")
@@ -428,7 +428,7 @@ def plan_array(pixels: Srgb, settings: PairSettings, key: str | int | None) -> t
     """Plan the pair of an array; its identity is the digest of ``key``, or of the array itself."""
     config, source = settings.config, _array_source(pixels, key)
     recorded, _ = _recorded(pixels, config.source.downscale, config.output.layout)
-    stated = linear_source(config.source, recorded) if config.source.kind == "linear" else None
+    stated = linear_source(config.source, pixels) if config.source.kind == "linear" else None
     return source, plan_pixels(settings, Photograph(recorded, 1, source=stated), source, source.sha256 or "")
 
 

@@ -280,7 +280,7 @@ def _finish(folder: OutFolder, run: RunFile, process: dict[str, Any]) -> dict[st
         if missing:
             raise _missing_error(folder, run, missing)
         (folder / "manifest.csv").commit(manifest)
-        decoders = decoder_versions() if run.source.kind == "raw" else {}
+        decoders = decoder_versions(run.source.kind)
         versions = {package: version(package) for package in PACKAGES} | decoders
         machine = {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
         facts = count_facts(counts) | run.facts() | {"run": process | machine, "versions": versions}

@@ -349,6 +349,8 @@ class LiveImage:
     def cache_name(self) -> str:
         """Name of the decoded image in a `PixelCache`."""
         prepared = self.plan.source
+        if prepared.is_linear:
+            return f"{prepared.pixels_xxh3}-{prepared.downscale}"
         if not prepared.is_raw:
             return f"{self.sha256}-{prepared.downscale}"
         means = prepared.raw_pattern, *prepared.raw_black_dn, *prepared.raw_white_dn

@@ -50,12 +50,13 @@ class RecordedPhotographs:
         _, _, sha256, photograph = self._kept
         if sha256 != recorded:
             raise SourceChangedError(_changed(sha256, recorded))
-        if photograph.raw is not None and photograph.raw.source.mosaic_xxh3 != prepared.mosaic_xxh3:
-            raise SourceChangedError(
-                f"its file is the same, but is decoded to another mosaic: XXH3-128 is "
-                f"{photograph.raw.source.mosaic_xxh3}, the row records {prepared.mosaic_xxh3}; expected the version of "
-                "LibRaw (rawpy) that dataset.json records"
-            )
+        decoded = photograph.raw.source if photograph.raw is not None else photograph.source
+        for name, decoder in {"mosaic_xxh3": "LibRaw (rawpy)", "pixels_xxh3": "the decoder"}.items():
+            if decoded is not None and (actual := getattr(decoded, name)) != (expected := getattr(prepared, name)):
+                raise SourceChangedError(
+                    f"its file is the same, but is decoded to other pixels: XXH3-128 is {actual}, the row records "
+                    f"{expected}; expected the version of {decoder} that dataset.json records"
+                )
         return photograph
 
 
@@ -63,6 +64,8 @@ def _settings_of(root: str | None, source: Source, prepared: SourcePlan) -> Sour
     """Settings with which the source of a row is decoded."""
     place = None if source.size_bytes == 0 else root  # synthetic pictures have no bytes
     config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
+    if prepared.is_linear:
+        return replace(config, kind="linear", primaries=prepared.primaries)
     if not prepared.is_raw:
         return config
     pattern = None if PurePosixPath(source.path).suffix.lower() in RAW_FILES else prepared.raw_pattern

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,44 @@ from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.simulation.plan import SourcePlan
+from unprocess_gen.simulation.plan import PRIMARIES, SourcePlan
+from unprocess_gen.simulation.reference.colour import IDENTITY
+from unprocess_gen.simulation.reference.primaries import PRIMARIES as CHROMATICITIES
+from unprocess_gen.simulation.reference.primaries import to_camera
 
 SRGB = "srgb"
 """Primaries of files that state none."""
+
+
+class Light(NamedTuple):
+    """Decoded pixels [H, W, 3], their primaries as `SourcePlan.primaries`, and a note about what was left out."""
+
+    pixels: NDArray[Any]
+    primaries: str = SRGB
+    note: str = ""
+
+
+def chromaticity_text(numbers: Iterable[float]) -> str:
+    """Name, or text in six decimals, of the chromaticities that a file states: x, y of red, green, blue and white.
+
+    SourceError unless they are primaries.
+    """
+    text = _spelled(numbers)
+    try:
+        if not PRIMARIES.allows(text):
+            raise ValueError("they are no eight numbers")
+        to_camera(IDENTITY, text)
+    except (ValueError, ZeroDivisionError) as error:
+        raise SourceError("corrupt", f"states the chromaticities {text[:80]} ({error}); expected primaries") from error
+    return NAMES.get(text, text)
+
+
+def _spelled(numbers: Iterable[float]) -> str:
+    return ";".join(f"{number:.6f}".rstrip("0").rstrip(".") for number in numbers)
+
+
+NAMES = {_spelled(numbers): name for name, numbers in CHROMATICITIES.items()}
+"""Names of known chromaticities."""
 
 
 def linear_pixels(pixels: NDArray[Any]) -> NDArray[np.float32]:
