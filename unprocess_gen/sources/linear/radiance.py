@@ -55,7 +55,7 @@ def decode_radiance(content: bytes, max_pixels: int) -> Light:
     if row < height:
         raise SourceError("corrupt", f"ends, or contradicts itself, in row {row} of {height}")
     step = np.where(codes[..., 3:] > 0, np.ldexp(1.0, codes[..., 3:].astype(np.int64) - 136), 0.0)
-    with np.errstate(over="ignore"):  # infinite light is refused
+    with np.errstate(over="ignore", under="ignore"):  # infinite light is refused
         return Light((codes[..., :3] * step / exposure).astype(np.float32), stated)
 
 
