@@ -205,11 +205,13 @@ def _read_integers(readout: Any, noise: Any, n: int, output: Output, strip: Stri
     listed, has_clipped = _round_and_list(noise, base, low, high, strip, buffers)
     for m in range(listed):
         site = np.int64(buffers.uncertain[m])  # as below: Numba compiles a function for each type of index
+        if buffers.unrounded_dn[site] >= limits.pinned_from:  # replaced below
+            continue
         dn = np.float32((_exact_site(noise, n, site, strip, buffers) + ROUND) - ROUND)
         has_clipped = _replace(site, dn, low, high, buffers) or has_clipped
     if output.may_saturate and readout.far_dn < np.inf:
         for x in range(strip.first, strip.after):
-            if buffers.unrounded_dn[x] >= readout.far_dn:
+            if readout.far_dn <= buffers.unrounded_dn[x] < limits.pinned_from:
                 far_dn = np.float32((_exact_site(noise, n, x, strip, buffers) + ROUND) - ROUND)
                 has_clipped = _replace(x, far_dn, low, high, buffers) or has_clipped
     if output.may_saturate and limits.pinned_from < np.inf:
