@@ -81,7 +81,7 @@ scene: daylight indoor long_exposure low_light night video_night
 effects: default
 output: webdataset
 executor: local dask
-experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training
+experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training hdr_scenes
 experiment: many_highlights no_highlights
 sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
 """

@@ -117,11 +117,14 @@ class LinearLight32(Unprocessing32):
     """Parameters of a clean frame of a linear source in float32, as `LinearLight`."""
 
 
+KINDS = (Unprocessing, Unprocessing32), (LinearLight, LinearLight32)
+"""Records of codes and of light, each in float64 and in float32."""
+
+
 def unprocessing_of(plan: Plan, codes: int, origin: tuple[int, int], in_float32: bool = False) -> Unprocessing:
     """Numbers of a clean frame from ``codes`` codes, or from light, in float64 or float32."""
-    is_raw, is_linear = plan.source.is_raw, plan.source.is_linear
-    kinds = (Unprocessing, Unprocessing32), (LinearLight, LinearLight32)
-    kind: Any = kinds[is_linear][in_float32]
+    is_raw = plan.source.is_raw
+    kind: type[Unprocessing] = KINDS[plan.source.is_linear][in_float32]
     channels = _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2, is_raw)
     f: Any = np.float32 if in_float32 else float
     exposure, brightest, threshold = plan.scene.exposure, plan.brightest, plan.isp.highlight_threshold
@@ -139,7 +142,7 @@ def unprocessing_of(plan: Plan, codes: int, origin: tuple[int, int], in_float32:
     sites = np.empty((4, *channels.shape), dtype=f)
     _fill_sites(gains, scale, limit, has_term, channels, sites)
     limits, light_per_signal, site_gains, headroom = sites
-    numbers: Unprocessing = kind(
+    return kind(
         products=_products(plan, codes, matrix, gains, ones if gray_mean else scale, f),
         code_count=codes,
         site_channels=channels,
@@ -154,7 +157,7 @@ def unprocessing_of(plan: Plan, codes: int, origin: tuple[int, int], in_float32:
         darkest=f(plan.darkest * (1 + FLOAT32_MARGIN) if in_float32 else plan.darkest),
         brightest=f(brightest),
         clipped=f(brightest * (1 + FLOAT32_MARGIN) if in_float32 else brightest),
-        white=f(MOST_LIGHT if is_linear else np.inf if exposure == 1 else 1 + FLOAT32_MARGIN if in_float32 else 1),
+        white=f(_white_of(plan, in_float32)),
         clean_dn=f(brightest * span_dn if in_float32 else round(plan.brightest_dn)),
         black_dn=np.uint32(black_dn) if in_float32 else float(black_dn),
         span_dn=f(span_dn),
@@ -165,7 +168,13 @@ def unprocessing_of(plan: Plan, codes: int, origin: tuple[int, int], in_float32:
         headroom=headroom,
         response=EQUAL_RESPONSE,
     )
-    return numbers
+
+
+def _white_of(plan: Plan, in_float32: bool) -> float:
+    """Return the light that counts as clipped before the exposure, or the most light of a linear source."""
+    if plan.source.is_linear:
+        return MOST_LIGHT
+    return np.inf if plan.scene.exposure == 1 else 1 + FLOAT32_MARGIN if in_float32 else 1.0
 
 
 def _linear_limit(plan: Plan, brightest: float, exposure: float, gain: float) -> float:
