@@ -175,6 +175,11 @@ def invert(entries: Matrix) -> Matrix:
     ValueError
         If the matrix is singular.
     """
+    return matrix([float(entry) for entry in exact_inverse(entries)])
+
+
+def exact_inverse(entries: Sequence[float | Fraction]) -> list[Fraction]:
+    """Invert nine numbers, row by row, in fractions; ValueError if the matrix is singular."""
     a, b, c, d, e, f, g, h, i = (Fraction(entry) for entry in entries)
     cofactors = (
         *(e * i - f * h, c * h - b * i, b * f - c * e),
@@ -184,7 +189,7 @@ def invert(entries: Matrix) -> Matrix:
     determinant = a * cofactors[0] + b * cofactors[3] + c * cofactors[6]
     if determinant == 0:
         raise ValueError("the camera matrix is singular")
-    return matrix([float(cofactor / determinant) for cofactor in cofactors])
+    return [cofactor / determinant for cofactor in cofactors]
 
 
 def condition(entries: Matrix) -> float:
