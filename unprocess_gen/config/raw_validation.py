@@ -13,7 +13,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import value_text
 from unprocess_gen.simulation.reference.cfa import MONO
 
-PHOTOGRAPH_SETTINGS = {"downscale": 1, "dequantize": "off", "icc": "ignore"}
+PHOTOGRAPH_SETTINGS = {"downscale": 1, "dequantize": "off", "icc": "convert"}
 """Keys of the source that prepare photographs, with the value of raw sources."""
 RAW_SETTINGS = {"shrink": 1, "own_noise": "keep", **{f"raw.{name}": None for name in settings_of(RawConfig)}}
 """Keys of raw sources, with the value of photographs."""

@@ -31,6 +31,7 @@ from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS
 from unprocess_gen.simulation.effects.prediction import STATISTICS
 from unprocess_gen.simulation.facts import Facts, RawParts
 from unprocess_gen.simulation.plan import Physics
+from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 
 MIN_OUTLIERS = 0.1
 """Expected outliers per frame from which hot and dead pixels are simulated."""
@@ -42,15 +43,19 @@ BODY_CLIP = 100
 """Frames of a clip for which they are decided."""
 
 
-def facts_of(srgb: Srgb, frames: int = 1, raw: RawParts | None = None) -> Facts:
-    """Return the integer facts about decoded pixels that planning may use; ``frames`` is the length of the clip."""
+def facts_of(srgb: Srgb, frames: int = 1, raw: RawParts | None = None, profile: Profile = UNCONVERTED) -> Facts:
+    """Return the facts about decoded pixels that planning may use; ``frames`` is the length of the clip."""
     height, width = srgb.shape[:2]
-    return Facts(width, height, int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(srgb.max()), frames, raw)
+    codes = int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(srgb.max())
+    return Facts(width, height, *codes, frames, raw, profile)
 
 
-def facts_for(config: Config, srgb: Srgb, frames: int = 1, raw: RawParts | None = None) -> Facts | None:
+def facts_for(
+    config: Config, srgb: Srgb, frames: int = 1, raw: RawParts | None = None, profile: Profile = UNCONVERTED
+) -> Facts | None:
     """Return `facts_of` the pixels for a physical noise profile or a raw source; others need none."""
-    return facts_of(srgb, frames, raw) if interpretation.is_physical(config.noise) or raw is not None else None
+    is_needed = interpretation.is_physical(config.noise) or raw is not None
+    return facts_of(srgb, frames, raw, profile) if is_needed else None
 
 
 class Prediction(NamedTuple):

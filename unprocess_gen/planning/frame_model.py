@@ -16,7 +16,8 @@ from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contrib
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, SourcePlan
-from unprocess_gen.simulation.tone_curves import linear_table
+from unprocess_gen.simulation.profiles import light_tables
+from unprocess_gen.simulation.reference.colour import from_primaries
 
 MASKING = tuple(effect for effect in EFFECTS if effect.masks)
 """Random effects of single pixels, which mask others."""
@@ -41,13 +42,17 @@ def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float
 
     Every treatment of highlights maps light i to at least k·i and at most i·max(1, k), where k is the inverse gain.
     """
-    curve = linear_table(isp.tone, isp.gamma, facts.codes)
-    low, high = float(curve[facts.dark_code]), float(curve[facts.bright_code])
+    tables = light_tables(facts.profile, isp.tone, isp.gamma, facts.codes)
+    lows, highs = ([float(table[code]) for table in tables] for code in (facts.dark_code, facts.bright_code))
+    rgb2cam = from_primaries(camera.rgb2cam, facts.profile.to_srgb)
     lowest, highest = math.inf, -math.inf
     for channel, k in enumerate(camera.inverse_gains):
-        r, g, b = camera.rgb2cam[3 * channel : 3 * channel + 3]
-        least = r * (low if r > 0 else high) + g * (low if g > 0 else high) + b * (low if b > 0 else high)
-        most = r * (high if r > 0 else low) + g * (high if g > 0 else low) + b * (high if b > 0 else low)
+        row = rgb2cam[3 * channel : 3 * channel + 3]
+        ends = [
+            (w * low, w * high) if w > 0 else (w * high, w * low) for w, low, high in zip(row, lows, highs, strict=True)
+        ]
+        (r, red), (g, green), (b, blue) = ends
+        least, most = r + g + b, red + green + blue
         lowest, highest = min(lowest, least * k), max(highest, most * max(k, 1.0))
     return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
 

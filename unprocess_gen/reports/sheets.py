@@ -34,7 +34,9 @@ from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
+from unprocess_gen.simulation.profiles import light_tables
 from unprocess_gen.simulation.reference import unprocess
+from unprocess_gen.simulation.reference.colour import from_primaries
 from unprocess_gen.sources.patches import crop_patch
 from unprocess_gen.sources.recorded_photographs import RecordedPhotographs
 
@@ -80,6 +82,7 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
         try:
             photograph = sources.load(source_of(row), str(row["source_sha256"]), plan.source)
             part = crop_patch(photograph.srgb, patch_from_row(row))
+            plan = plan.decoded(photograph.profile, photograph.pixels_xxh3)
         except (SourceChangedError, DamageError, ConfigError) as error:  # the sheet is drawn without this photograph
             missing = str(error)
         yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan, part, missing)
@@ -182,11 +185,17 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
         (black, *_), (white, *_) = plan.source.code_levels
         yield "levels", "black 0, white 1", (values * CODE_RANGE - black) / (white - black)
         return
-    values = unprocess.INVERSE_TONES[isp.tone](values, 1 - values)
-    yield "tone curve inverted", isp.tone, values
-    values = unprocess.expand_gamma(values, isp.gamma)
-    yield "gamma inverted", f"gamma {isp.gamma}", values
-    values = unprocess.apply_ccm(values, camera.rgb2cam)
+    profile = plan.source.profile
+    if profile.is_srgb:
+        values = unprocess.INVERSE_TONES[isp.tone](values, 1 - values)
+        yield "tone curve inverted", isp.tone, values
+        values = unprocess.expand_gamma(values, isp.gamma)
+        yield "gamma inverted", f"gamma {isp.gamma}", values
+    else:
+        tables, levels = light_tables(profile, isp.tone, isp.gamma, 256), np.linspace(0, 1, 256)
+        values = np.stack([np.interp(values[..., n], levels, table) for n, table in enumerate(tables)], axis=-1)
+        yield "curves inverted", f"{profile.name}, {isp.tone}, gamma {isp.gamma}", values
+    values = unprocess.apply_ccm(values, from_primaries(camera.rgb2cam, profile.to_srgb))
     yield "colour matrix inverted", f"camera {camera.camera}", values
     gains = ", ".join(f"{gain:.3g}" for gain in camera.inverse_gains)
     values = unprocess.invert_gains(values, camera.inverse_gains, isp.highlight, isp.highlight_threshold)

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 from unprocess_gen.core.arrays import Raw
 from unprocess_gen.simulation.plan import CameraPlan, IspPlan, SensorPlan, SourcePlan
+from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 
 
 class DarkPixels(Protocol):
@@ -45,7 +46,8 @@ class Facts:
     """Facts about an image's pixels that a plan may depend on: integers, identical on every machine.
 
     ``dark_code`` and ``bright_code`` are the lowest and highest code in any channel, of ``codes`` possible codes.
-    ``frames`` is the number of frames in the clip, 1 for a photograph. ``raw`` is what the file of a raw source states.
+    ``frames`` is the number of frames in the clip, 1 for a photograph. ``raw`` is what the file of a raw source states,
+    ``profile`` has the colours of a photograph.
     """
 
     width: int
@@ -55,6 +57,7 @@ class Facts:
     bright_code: int
     frames: int = 1
     raw: RawParts | None = None
+    profile: Profile = UNCONVERTED
 
 
 class RawParts(NamedTuple):

@@ -26,9 +26,9 @@ from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 from unprocess_gen.simulation.kernels.site_patterns import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.strips import Buffers, SiteMap, Strip, count_outside, strip_values
 from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.profiles import light_tables
 from unprocess_gen.simulation.reference.cfa import tile
-from unprocess_gen.simulation.reference.colour import Matrix
-from unprocess_gen.simulation.tone_curves import linear_table
+from unprocess_gen.simulation.reference.colour import Matrix, from_primaries
 
 _0, _8 = np.uint64(0), np.uint64(8)
 _ROW_SITES = VECTOR_WIDTH + 2
@@ -53,7 +53,8 @@ def is_steep(plan: Plan) -> bool:
     camera, isp, exposure = plan.camera, plan.isp, plan.scene.exposure
     if plan.source.is_raw:  # its light has no colours and gains
         return exposure > MAX_ERROR_GAIN
-    rows = [sum(abs(entry) for entry in camera.rgb2cam[start : start + 3]) * exposure for start in (0, 3, 6)]
+    rgb2cam = from_primaries(camera.rgb2cam, plan.source.profile.to_srgb)
+    rows = [sum(abs(entry) for entry in rgb2cam[start : start + 3]) * exposure for start in (0, 3, 6)]
     highlights = 0.0 if isp.highlight == "none" else 1 + 2 / (1 - isp.highlight_threshold)
     return any(
         row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN
@@ -160,7 +161,9 @@ def _products(plan: Plan, codes: int, scale: tuple[float, ...], dtype: Any) -> N
     if plan.source.is_raw:
         return np.asarray(_raw_products(plan, codes) * np.array(scale)[:, None, None], dtype)
     products = np.empty((3, 3, codes), dtype)
-    _fill_products(plan.camera.rgb2cam, linear_table(plan.isp.tone, plan.isp.gamma, codes), scale, products)
+    profile = plan.source.profile
+    curves = light_tables(profile, plan.isp.tone, plan.isp.gamma, codes)
+    _fill_products(from_primaries(plan.camera.rgb2cam, profile.to_srgb), curves, scale, products)
     return products
 
 
@@ -169,10 +172,11 @@ def _products(plan: Plan, codes: int, scale: tuple[float, ...], dtype: Any) -> N
 
 @kernel
 def _fill_products(
-    matrix: Matrix, curve: NDArray[np.float64], scale: tuple[float, ...], products: NDArray[Any]
+    matrix: Matrix, curves: tuple[NDArray[np.float64], ...], scale: tuple[float, ...], products: NDArray[Any]
 ) -> None:
     for channel in range(3):
         for entry in range(3):
+            curve = curves[entry]
             for code in range(curve.size):
                 products[channel, entry, code] = matrix[3 * channel + entry] * curve[code] * scale[channel]
 

@@ -31,12 +31,12 @@ BRADFORD = [Fraction(n, 10000) for n in (8951, 2664, -1614, -7502, 17135, 367, 3
 """Matrix from XYZ to the cone responses that are scaled to adapt colours to another white (ISO 15076-1, annex E)."""
 
 
-def primaries2xyz(chromaticities: Sequence[float]) -> Exact:
+def primaries2xyz(chromaticities: Sequence[float | Fraction]) -> Exact:
     """Compute the matrix from linear RGB to XYZ with the white `D50`; its columns are the colorants of ICC profiles.
 
     Parameters
     ----------
-    chromaticities : sequence of float
+    chromaticities : sequence of float or Fraction
         x, y of red, green, blue and white.
 
     Returns
@@ -49,7 +49,7 @@ def primaries2xyz(chromaticities: Sequence[float]) -> Exact:
     ValueError
         If the primaries lie on a line, or white is no light.
     """
-    x, y = [*map(Fraction, chromaticities[::2])], [*map(Fraction, chromaticities[1::2])]
+    x, y = ([Fraction(number) for number in chromaticities[start::2]] for start in (0, 1))
     red_x, green_x, blue_x, white_x = x
     red_y, green_y, blue_y, white_y = y
     if white_y <= 0:
@@ -76,7 +76,7 @@ def xyz2srgb(colorants: Sequence[float | Fraction]) -> Matrix:
     return matrix([float(entry) for entry in _product(_xyz2srgb(), [Fraction(entry) for entry in colorants])])
 
 
-def primaries2srgb(chromaticities: Sequence[float]) -> Matrix:
+def primaries2srgb(chromaticities: Sequence[float | Fraction]) -> Matrix:
     """Compute the matrix from linear RGB to linear sRGB; arguments and errors are those of `primaries2xyz`."""
     return xyz2srgb(primaries2xyz(chromaticities))
 

@@ -1,4 +1,4 @@
-"""Read the headers of JPEG, PNG, TIFF, WebP and BMP files without decoding pixels.
+"""Read the headers of JPEG, PNG, TIFF, WebP, BMP, HEIC and AVIF files without decoding pixels.
 
 A header takes 5 to 200 µs, whatever size it declares, plus the search for a JPEG's last marker at about 1 GB/s. The
 shape of the decoded array is compared with the header later (`decode`). Why no library reads them:
@@ -18,9 +18,10 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from unprocess_gen.core.errors import SourceError
+from unprocess_gen.sources.image.heif import heif_facts, open_heic
 
 _MOST_PIECES = 2**18
 """Largest number of segments or chunks: 2^26 pixels of 16-bit RGBA in pieces of 2 KiB. Walking them takes 0.5 s."""
@@ -34,10 +35,13 @@ _EXIF_PREFIX, _TIFF_MAGIC = b"Exif\0\0", (b"II*\0", b"MM\0*")
 class Header:
     """Header of a picture: its size as stored, in pixels, before the EXIF ``orientation`` is applied, and its kind.
 
-    ``bits`` are those of the decoded array, 8 or 16. ``mode`` is ``cmyk``, ``white_is_zero``, or empty. ``has_alpha``
-    is also true for a transparent colour. ``frames`` counts full pages of a TIFF, and is 2 for an animation. ``cicp``
-    (primaries, transfer, matrix and full-range flag of a PNG, ITU-T H.273) overrides the profile ``icc``. ``missing``
-    says what the file lacks if it was cut.
+    ``bits`` are those of the decoded array, 8 or 16; ``code_bits`` are 10 or 12 if codes of HEIC and AVIF have fewer.
+    ``mode`` is ``cmyk``, ``white_is_zero``, or empty. ``has_alpha`` is also true for a transparent colour. ``frames``
+    counts full pages of a TIFF, and is 2 for an animation. ``missing`` says what the file lacks if it was cut; ``note``
+    is a warning.
+
+    Colours are declared by ``cicp`` (primaries, transfer, matrix and full-range flag, ITU-T H.273), which overrides the
+    profile ``icc``, which overrides the chunks ``gamma`` and ``chromaticities`` of a PNG.
     """
 
     format: str
@@ -49,7 +53,12 @@ class Header:
     orientation: int = 1
     frames: int = 1
     icc: bytes = b""
-    cicp: bytes | None = None
+    cicp: tuple[int, ...] | None = None
+    gamma: bytes = b""
+    chromaticities: bytes = b""
+    is_gray: bool = False
+    code_bits: int = 8
+    note: str = ""
     missing: str = ""
 
 
@@ -60,7 +69,7 @@ def probe(data: bytes) -> Header:
     """
     if not data:
         raise SourceError("empty", "the file has 0 bytes")
-    name = next((name for name, (magic, _) in _FORMATS.items() if data.startswith(magic)), None)
+    name = next((name for name, (magic, _) in _FORMATS.items() if re.match(magic, data, re.DOTALL)), None)
     if name is None:
         if other := next((other for other, magic in _OTHER_FORMATS.items() if re.match(magic, data, re.DOTALL)), None):
             raise SourceError("unsupported", f"{other}; convert it to JPEG, PNG or TIFF")
@@ -118,7 +127,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _jpeg(data: bytes) -> Header:
-    frame, exif, profile, marker, scans = None, b"", dict[bytes, bytes](), 0, 0
+    frame, exif, profile, marker, scans, note = None, b"", dict[bytes, bytes](), 0, 0, ""
     for marker, payload in _bounded(_jpeg_segments(data)):
         scans += marker == _JPEG_SCAN
         if marker in _JPEG_FRAMES and frame is None:
@@ -127,6 +136,8 @@ def _jpeg(data: bytes) -> Header:
             exif = exif or payload
         elif marker == _JPEG_ICC and payload.startswith(b"ICC_PROFILE\0"):
             profile[payload[12:13]] = payload[14:]
+        elif marker == _JPEG_ICC and payload.startswith(b"MPF\0"):
+            note = "contains other pictures or a gain map (MPO, Ultra HDR), of which nothing is used"
     if frame is None:
         raise SourceError("corrupt" if marker == _JPEG_END else "truncated", "the JPEG file has no frame header")
     if scans > _JPEG_MOST_SCANS:
@@ -135,8 +146,18 @@ def _jpeg(data: bytes) -> Header:
     if kind > _JPEG_LAST_HUFFMAN or depth != 8 or components not in (1, 3, 4):
         raise _unsupported(f"a JPEG of type SOF{kind - 0xC0} with {components} components of {depth} bits")
     mode, missing = "cmyk" if components == 4 else "", "" if marker == _JPEG_END else "its end-of-image marker"
-    icc = b"".join(profile[number] for number in sorted(profile))
-    return Header("jpeg", width, height, 8, mode, orientation=_orientation(exif), icc=icc, missing=missing)
+    icc = b"".join(profile[number] for number in sorted(profile))[:_MAX_PROFILE_BYTES]
+    return Header(
+        "jpeg",
+        width,
+        height,
+        mode=mode,
+        orientation=_orientation(exif),
+        icc=icc,
+        is_gray=components == 1,
+        missing=missing,
+        note=note,
+    )
 
 
 # PNG ------------------------------------------------------------------------------------------------------------------
@@ -162,6 +183,7 @@ def _png(data: bytes) -> Header:
     cicp = chunks.get(b"cICP")
     if cicp is not None and len(cicp) != 4:
         raise _corrupt(f"the cICP chunk has {len(cicp)} bytes, expected 4")
+    gamma, chromaticities = (b"" if b"sRGB" in chunks else chunks.get(kind, b"") for kind in (b"gAMA", b"cHRM"))
     icc = chunks.get(b"iCCP", b"")
     with suppress(zlib.error):  # a broken one stays compressed, and never counts as sRGB
         icc = zlib.decompressobj().decompress(icc.partition(b"\0")[2][1:], _MAX_PROFILE_BYTES)  # name, zero, method
@@ -174,7 +196,10 @@ def _png(data: bytes) -> Header:
         orientation=_orientation(chunks.get(b"eXIf", b"")),
         frames=2 if b"acTL" in chunks else 1,
         icc=icc,
-        cicp=cicp,
+        cicp=None if cicp is None else tuple(cicp),
+        gamma=gamma,
+        chromaticities=chromaticities,
+        is_gray=colour in (0, 4),
         missing="" if b"IEND" in chunks else "its IEND chunk",
     )
 
@@ -281,6 +306,7 @@ def _tiff(data: bytes) -> Header:
         orientation=page.orientation,
         frames=sum(not other.is_thumbnail for other in pages),
         icc=bytes(value % 256 for value in page.values(_PROFILE, 0)) if _PROFILE in page.places else b"",
+        is_gray=photometric in (_TIFF_WHITE_IS_ZERO, _TIFF_BLACK_IS_ZERO),
         missing=_tiff_missing(page),
     )
 
@@ -386,21 +412,56 @@ def _bmp(data: bytes) -> Header:
     return Header("bmp", width, abs(height), missing=missing)
 
 
+# HEIC and AVIF --------------------------------------------------------------------------------------------------------
+
+
+def _heif(data: bytes) -> Header:
+    facts = heif_facts(data)
+    exif, is_avif = b"", facts.bits > 0
+    if facts.missing:
+        raise SourceError("truncated", f"the file lacks {facts.missing}")
+    if is_avif:
+        from PIL import AvifImagePlugin
+
+        try:
+            picture: Any = AvifImagePlugin.AvifImageFile(io.BytesIO(data))
+        except (OSError, SyntaxError, ValueError) as error:
+            raise _corrupt(f"the AVIF file has no picture ({type(error).__name__})") from error
+        frames, bits, exif = picture.n_frames, facts.bits, picture.info.get("exif", b"")
+    else:
+        picture = open_heic(data)
+        frames, bits = len(picture), picture.info["bit_depth"]
+    width, height = picture.size
+    return Header(
+        "avif" if is_avif else "heic",
+        width,
+        height,
+        16 if bits > 8 else 8,
+        has_alpha="A" in picture.mode,
+        orientation=_orientation(exif),
+        frames=frames,
+        icc=facts.icc,
+        cicp=facts.cicp,
+        is_gray=picture.mode.startswith(("L", "I")),
+        code_bits=bits,
+        note=facts.note,
+    )
+
+
 # The formats ----------------------------------------------------------------------------------------------------------
 
 
-_FORMATS: dict[str, tuple[tuple[bytes, ...], Callable[[bytes], Header]]] = {
-    "jpeg": ((b"\xff\xd8\xff",), _jpeg),
-    "png": ((b"\x89PNG\r\n\x1a\n",), _png),
-    "tiff": (_TIFF_MAGIC, _tiff),
-    "webp": ((b"RIFF",), _webp),
-    "bmp": ((b"BM",), _bmp),
+_FORMATS: dict[str, tuple[bytes, Callable[[bytes], Header]]] = {
+    "jpeg": (rb"\xff\xd8\xff", _jpeg),
+    "png": (rb"\x89PNG\r\n\x1a\n", _png),
+    "tiff": (rb"II\*\0|MM\0\*", _tiff),
+    "webp": (rb"RIFF", _webp),
+    "bmp": (rb"BM", _bmp),
+    "heic": (rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1|avi[fs])", _heif),
 }
-"""First bytes and reader of each format."""
+"""First bytes and reader of each format; the reader of HEIC is that of AVIF too."""
 
 _OTHER_FORMATS = {
-    "AVIF": rb"....ftypavi[fs]",
-    "HEIC": rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1)",
     "JPEG XL": rb"\xff\x0a|\0\0\0\x0cJXL ",
     "JPEG 2000": rb"\xff\x4f\xff\x51|\0\0\0\x0cjP  ",
     "GIF": rb"GIF8",
