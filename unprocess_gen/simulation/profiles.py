@@ -28,6 +28,9 @@ parametricCurveType 4); or equally spaced values of 16 bits, big-endian, between
 Curves = tuple[Curve | None, Curve | None, Curve | None]
 """Curves of red, green and blue; None is the curve of sRGB."""
 
+NO_LIGHT = Decimal("1e-30")
+"""Light up to which curves are black; floats hold the root of it."""
+
 PROFILE_DIGITS = 25
 """Decimal digits in which light is computed; it is rounded once to float64."""
 
@@ -75,16 +78,13 @@ def _table(curve: Curve, tone: str, gamma: str, codes: int) -> Float:
 
 
 def curve_light(curve: Curve, chosen: Iterable[int], codes: int) -> list[Decimal]:
-    """Light of some of the codes by a curve, relative to white and clipped to [0, 1]; white must have light."""
+    """Light of some of the codes by a curve, relative to that of white, which ValueError says is not nearly 1."""
     with localcontext(prec=PROFILE_DIGITS):
-        white, no_light = _light(curve, codes - 1, codes), Decimal(0)
-        return [min(max(_light(curve, code, codes) / white, no_light), Decimal(1)) for code in chosen]
-
-
-def white_light(curve: Curve) -> float:
-    """Light at white by a curve, before it is divided by this number."""
-    with localcontext(prec=PROFILE_DIGITS):
-        return float(_light(curve, 1, 2))
+        white = _light(curve, codes - 1, codes)
+        if abs(white - 1) > Decimal("0.02"):
+            raise ValueError("a curve does not rise from black to white")
+        light = (_light(curve, code, codes) / white for code in chosen)
+        return [min(y, Decimal(1)) if y > NO_LIGHT else Decimal(0) for y in light]
 
 
 def _light(curve: Curve, code: int, codes: int) -> Decimal:

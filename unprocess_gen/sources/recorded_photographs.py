@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import PurePosixPath
 
@@ -46,12 +44,20 @@ class RecordedPhotographs:
                 "expected its folder; give source.root=…"
             )
         config = _settings_of(self._root, source, prepared)
-        with _as_damage(recorded):
+        try:
             if self._kept is None or self._kept[:2] != (config, source):
                 self._kept = None  # frees the last photograph first: two at a time would take twice the memory
                 self._kept = config, source, *load_source(config, source)
+        except SourceError as error:
+            if error.sha256 not in (None, recorded):
+                raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
+            text = f"its source cannot be used ({error})"
+            raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {RESTORE}")) from error
+        except MachineError as error:
+            raise SourceChangedError(f"{str(error).partition(';')[0]}; {RESTORE}") from error
         _, _, sha256, photograph = self._kept
-        _check_sha256(sha256, recorded)
+        if sha256 != recorded:
+            raise SourceChangedError(_changed(sha256, recorded))
         if photograph.profile.name != prepared.profile.name:
             names = photograph.profile.name, prepared.profile.name
             raise DamageError("its source has the colour profile {!r}, the row records {!r}".format(*names))
@@ -64,7 +70,7 @@ class RecordedPhotographs:
         return photograph
 
     def with_profile(self, plan: Plan, source: Source, recorded: str) -> Plan:
-        """Add the colours of its source to the plan of a row; raise as `load`.
+        """Add the colours of its source to the plan of a row; SourceChangedError if its bytes are others.
 
         Only headers are read: with a cache of pixels, each worker would otherwise decode each photograph once.
         """
@@ -72,31 +78,11 @@ class RecordedPhotographs:
             return plan
         profile = self._profiles.get(recorded)
         if profile is None:
-            with _as_damage(recorded):
-                content = read_bytes(self._root, source)
-                profile = self._profiles.keep(recorded, read_profile(content))
-            _check_sha256(hashlib.sha256(content).hexdigest(), recorded)
+            content = read_bytes(self._root, source)
+            if (sha256 := hashlib.sha256(content).hexdigest()) != recorded:
+                raise SourceChangedError(_changed(sha256, recorded))
+            profile = self._profiles.keep(recorded, read_profile(content))
         return plan.decoded(profile, plan.source.pixels_xxh3)
-
-
-@contextmanager
-def _as_damage(recorded: str) -> Iterator[None]:
-    """Raise what a source cannot be used for as `RecordedPhotographs.load` does."""
-    try:
-        yield
-    except SourceError as error:
-        if error.sha256 not in (None, recorded):
-            _check_sha256(str(error.sha256), recorded)
-        text = f"its source cannot be used ({error})"
-        raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {RESTORE}")) from error
-    except MachineError as error:
-        raise SourceChangedError(f"{str(error).partition(';')[0]}; {RESTORE}") from error
-
-
-def _check_sha256(sha256: str, recorded: str) -> None:
-    """Raise SourceChangedError for another SHA-256 than the recorded one."""
-    if sha256 != recorded:
-        raise SourceChangedError(f"its source has changed: SHA-256 is {sha256}, the row records {recorded}; {RESTORE}")
 
 
 def _settings_of(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
@@ -110,3 +96,7 @@ def _settings_of(root: str | None, source: Source, prepared: SourcePlan) -> Sour
     black = set(prepared.raw_black_dn)  # several are those of the file
     raw = RawConfig(pattern, black.pop() if len(black) == 1 else None, prepared.raw_white_dn[0])
     return replace(config, kind="raw", shrink=prepared.shrink, raw=raw)
+
+
+def _changed(sha256: str, recorded: str) -> str:
+    return f"its source has changed: SHA-256 is {sha256}, the row records {recorded}; {RESTORE}"

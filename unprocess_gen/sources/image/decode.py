@@ -25,7 +25,7 @@ from __future__ import annotations
 import logging
 import re
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import cv2
@@ -38,7 +38,7 @@ from unprocess_gen.simulation.facts import RawParts
 from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
-from unprocess_gen.sources.image.heif import decode_heic, widened
+from unprocess_gen.sources.image.heif import open_heic, widened
 from unprocess_gen.sources.image.profiles import profile_of
 
 _LOGGER = logging.getLogger(__name__)
@@ -105,12 +105,12 @@ def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Ph
     profile = _profile(header, icc)
     is_stored = header.has_alpha or (header.format == "tiff" and header.bits == 16)  # B, G, R, alpha by OpenCV
     if header.format == "heic":
-        decoded = decode_heic(data)
+        decoded: Srgb = open_heic(data, is_decoded=True)
     else:
-        flags = cv2.IMREAD_UNCHANGED if is_stored else _COLOUR_16 if header.bits == 16 else _COLOUR
+        flags = cv2.IMREAD_UNCHANGED if is_stored else _COLOUR_16 if header.bits > 8 else _COLOUR
         decoded = _decode_by_opencv(data, header, flags, name)
-    if header.code_bits > 8:
-        decoded = widened(decoded, header.code_bits)
+    if header.bits not in (8, 16):
+        decoded, header = widened(decoded, header.bits), replace(header, bits=16)
     _check(decoded, header)
     if header.mode == "white_is_zero" and header.bits == 16:
         np.subtract(65535, decoded, out=decoded)

@@ -1,4 +1,4 @@
-"""Read the headers of JPEG, PNG, TIFF, WebP, BMP, HEIC and AVIF files without decoding pixels.
+"""Read the headers of photographs without decoding pixels.
 
 A header takes 5 to 200 µs, whatever size it declares, plus the search for a JPEG's last marker at about 1 GB/s. The
 shape of the decoded array is compared with the header later (`decode`). Why no library reads them:
@@ -16,12 +16,12 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, TypeVar
 
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.sources.image.heif import heif_facts, open_heic
+from unprocess_gen.sources.image.heif import SEQUENCES, avif_facts, open_heic
 
 _MOST_PIECES = 2**18
 """Largest number of segments or chunks: 2^26 pixels of 16-bit RGBA in pieces of 2 KiB. Walking them takes 0.5 s."""
@@ -35,13 +35,12 @@ _EXIF_PREFIX, _TIFF_MAGIC = b"Exif\0\0", (b"II*\0", b"MM\0*")
 class Header:
     """Header of a picture: its size as stored, in pixels, before the EXIF ``orientation`` is applied, and its kind.
 
-    ``bits`` are those of the decoded array, 8 or 16; ``code_bits`` are 10 or 12 if codes of HEIC and AVIF have fewer.
+    ``bits`` are those of the decoded array, 8 or 16; of HEIC and AVIF, those of the codes, which may be 10 or 12.
     ``mode`` is ``cmyk``, ``white_is_zero``, or empty. ``has_alpha`` is also true for a transparent colour. ``frames``
-    counts full pages of a TIFF, and is 2 for an animation. ``missing`` says what the file lacks if it was cut; ``note``
-    is a warning.
+    counts full pages of a TIFF, and is 2 for an animation. ``missing`` says what the file lacks if it was cut.
 
-    Colours are declared by ``cicp`` (primaries, transfer, matrix and full-range flag, ITU-T H.273), which overrides the
-    profile ``icc``, which overrides the chunks ``gamma`` and ``chromaticities`` of a PNG.
+    ``cicp`` (primaries, transfer, matrix and full-range flag, ITU-T H.273) overrides the profile ``icc``, which
+    overrides the chunks ``gamma`` and ``chromaticities`` of a PNG.
     """
 
     format: str
@@ -56,10 +55,8 @@ class Header:
     cicp: tuple[int, ...] | None = None
     gamma: bytes = b""
     chromaticities: bytes = b""
-    is_gray: bool = False
-    code_bits: int = 8
-    note: str = ""
     missing: str = ""
+    note: str = ""
 
 
 def probe(data: bytes) -> Header:
@@ -137,7 +134,7 @@ def _jpeg(data: bytes) -> Header:
         elif marker == _JPEG_ICC and payload.startswith(b"ICC_PROFILE\0"):
             profile[payload[12:13]] = payload[14:]
         elif marker == _JPEG_ICC and payload.startswith(b"MPF\0"):
-            note = "contains other pictures or a gain map (MPO, Ultra HDR), of which nothing is used"
+            note = "contains other pictures or a gain map (MPO, Ultra HDR), which are not used"
     if frame is None:
         raise SourceError("corrupt" if marker == _JPEG_END else "truncated", "the JPEG file has no frame header")
     if scans > _JPEG_MOST_SCANS:
@@ -146,18 +143,8 @@ def _jpeg(data: bytes) -> Header:
     if kind > _JPEG_LAST_HUFFMAN or depth != 8 or components not in (1, 3, 4):
         raise _unsupported(f"a JPEG of type SOF{kind - 0xC0} with {components} components of {depth} bits")
     mode, missing = "cmyk" if components == 4 else "", "" if marker == _JPEG_END else "its end-of-image marker"
-    icc = b"".join(profile[number] for number in sorted(profile))[:_MAX_PROFILE_BYTES]
-    return Header(
-        "jpeg",
-        width,
-        height,
-        mode=mode,
-        orientation=_orientation(exif),
-        icc=icc,
-        is_gray=components == 1,
-        missing=missing,
-        note=note,
-    )
+    icc, size = b"".join(profile[number] for number in sorted(profile)), (width, height)
+    return Header("jpeg", *size, 8, mode, orientation=_orientation(exif), icc=icc, missing=missing, note=note)
 
 
 # PNG ------------------------------------------------------------------------------------------------------------------
@@ -199,7 +186,6 @@ def _png(data: bytes) -> Header:
         cicp=None if cicp is None else tuple(cicp),
         gamma=gamma,
         chromaticities=chromaticities,
-        is_gray=colour in (0, 4),
         missing="" if b"IEND" in chunks else "its IEND chunk",
     )
 
@@ -306,7 +292,6 @@ def _tiff(data: bytes) -> Header:
         orientation=page.orientation,
         frames=sum(not other.is_thumbnail for other in pages),
         icc=bytes(value % 256 for value in page.values(_PROFILE, 0)) if _PROFILE in page.places else b"",
-        is_gray=photometric in (_TIFF_WHITE_IS_ZERO, _TIFF_BLACK_IS_ZERO),
         missing=_tiff_missing(page),
     )
 
@@ -372,28 +357,48 @@ def _orientation(block: bytes) -> int:
         return 1
 
 
-# WebP -----------------------------------------------------------------------------------------------------------------
+# WebP, AVIF, HEIC -----------------------------------------------------------------------------------------------------
 
 
 def _webp(data: bytes) -> Header:
     lacking = 8 + struct.unpack_from("<I", data, 4)[0] - len(data)
     if lacking > 0:
         raise SourceError("truncated", f"the file lacks {lacking} bytes of its RIFF block")
-    from PIL import Image, WebPImagePlugin
+    return _by_pillow("webp", data)
 
+
+def _by_pillow(name: str, data: bytes) -> Header:
+    from PIL import AvifImagePlugin, Image, WebPImagePlugin
+
+    readers: dict[str, Any] = {"webp": WebPImagePlugin.WebPImageFile, "avif": AvifImagePlugin.AvifImageFile}
     try:
-        picture = WebPImagePlugin.WebPImageFile(io.BytesIO(data))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise _corrupt(f"the WebP file has no picture ({type(error).__name__})") from error
-    facts = picture.info
+        picture = readers[name](io.BytesIO(data))
+    except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
+        raise _corrupt(f"the {name} file has no picture ({type(error).__name__})") from error
+    facts, (width, height) = picture.info, picture.size
     return Header(
-        "webp",
-        *picture.size,
+        name,
+        width,
+        height,
         has_alpha=picture.mode == "RGBA",
         orientation=_orientation(facts.get("exif", b"")),
         frames=picture.n_frames,
         icc=facts.get("icc_profile", b""),
     )
+
+
+def _avif(data: bytes) -> Header:
+    header, (bits, points) = _by_pillow("avif", data), avif_facts(data)
+    return replace(header, bits=bits, cicp=None if header.icc or points is None else (*points, 0, 1))
+
+
+def _heic(data: bytes) -> Header:
+    facts, (width, height), mode, frames = open_heic(data)
+    icc, points = facts.get("icc_profile") or b"", facts.get("nclx_profile")
+    cicp = None if icc or not points else (points["color_primaries"], points["transfer_characteristics"], 0, 1)
+    frames, has_alpha = frames + (data[8:12] in SEQUENCES), "A" in mode
+    colours: dict[str, Any] = {"icc": icc, "cicp": cicp}
+    return Header("heic", width, height, facts["bit_depth"], has_alpha=has_alpha, frames=frames, **colours)
 
 
 # BMP ------------------------------------------------------------------------------------------------------------------
@@ -412,42 +417,6 @@ def _bmp(data: bytes) -> Header:
     return Header("bmp", width, abs(height), missing=missing)
 
 
-# HEIC and AVIF --------------------------------------------------------------------------------------------------------
-
-
-def _heif(data: bytes) -> Header:
-    facts = heif_facts(data)
-    exif, is_avif = b"", facts.bits > 0
-    if facts.missing:
-        raise SourceError("truncated", f"the file lacks {facts.missing}")
-    if is_avif:
-        from PIL import AvifImagePlugin
-
-        try:
-            picture: Any = AvifImagePlugin.AvifImageFile(io.BytesIO(data))
-        except (OSError, SyntaxError, ValueError) as error:
-            raise _corrupt(f"the AVIF file has no picture ({type(error).__name__})") from error
-        frames, bits, exif = picture.n_frames, facts.bits, picture.info.get("exif", b"")
-    else:
-        picture = open_heic(data)
-        frames, bits = len(picture), picture.info["bit_depth"]
-    width, height = picture.size
-    return Header(
-        "avif" if is_avif else "heic",
-        width,
-        height,
-        16 if bits > 8 else 8,
-        has_alpha="A" in picture.mode,
-        orientation=_orientation(exif),
-        frames=frames,
-        icc=facts.icc,
-        cicp=facts.cicp,
-        is_gray=picture.mode.startswith(("L", "I")),
-        code_bits=bits,
-        note=facts.note,
-    )
-
-
 # The formats ----------------------------------------------------------------------------------------------------------
 
 
@@ -457,9 +426,10 @@ _FORMATS: dict[str, tuple[bytes, Callable[[bytes], Header]]] = {
     "tiff": (rb"II\*\0|MM\0\*", _tiff),
     "webp": (rb"RIFF", _webp),
     "bmp": (rb"BM", _bmp),
-    "heic": (rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1|avi[fs])", _heif),
+    "avif": (rb"....ftyp(?:avi[fs]|mif1....(?:....){0,9}?avif)", _avif),  # mif1 names the codec among the next brands
+    "heic": (rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1)", _heic),
 }
-"""First bytes and reader of each format; the reader of HEIC is that of AVIF too."""
+"""First bytes and reader of each format."""
 
 _OTHER_FORMATS = {
     "JPEG XL": rb"\xff\x0a|\0\0\0\x0cJXL ",
