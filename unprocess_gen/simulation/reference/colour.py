@@ -127,10 +127,19 @@ def rgb2cam(xyz2cam: Matrix) -> Matrix:
 
 
 def from_primaries(rgb2cam: Matrix, to_srgb: Sequence[float] | None) -> Matrix:
-    """Compute the matrix from linear RGB of a photograph to the camera, whose rows sum to exactly 1.
+    """Compute the matrix from linear RGB of a photograph to the camera.
 
-    ``to_srgb`` is the matrix from its primaries to linear sRGB, whose rows sum to nearly 1; None for photographs in
-    sRGB.
+    Parameters
+    ----------
+    rgb2cam : Matrix
+        Matrix from linear sRGB to the camera, whose rows sum to 1.
+    to_srgb : sequence of float, optional
+        Matrix from the primaries of the photograph to linear sRGB, whose rows sum to nearly 1; None for sRGB.
+
+    Returns
+    -------
+    Matrix
+        The product, whose rows sum to exactly 1.
     """
     if to_srgb is None:
         return rgb2cam

@@ -72,7 +72,18 @@ def _xyz2srgb() -> Exact:
 
 
 def xyz2srgb(colorants: Sequence[float | Fraction]) -> Matrix:
-    """Compute the matrix to linear sRGB from one to XYZ with the white `D50`, nine numbers row by row."""
+    """Compute the matrix to linear sRGB from that to XYZ with the white `D50`.
+
+    Parameters
+    ----------
+    colorants : sequence of float or Fraction
+        Matrix to XYZ, nine numbers row by row.
+
+    Returns
+    -------
+    Matrix
+        The matrix to linear sRGB, each entry rounded once.
+    """
     return matrix([float(entry) for entry in _product(_xyz2srgb(), [Fraction(entry) for entry in colorants])])
 
 
