@@ -41,12 +41,14 @@ from unprocess_gen.simulation.plan import (
     HEX_KEY,
     LEVELS,
     LIST,
+    PROFILE,
     DarkFramePlan,
     Plan,
     PlanRecord,
     fields_of,
     part_in,
 )
+from unprocess_gen.simulation.profiles import Profile
 
 CONTRACT = [
     *("key", "source", "source_sha256", "status", "reason", "width", "height", "orientation", "shard", "seed"),
@@ -101,6 +103,7 @@ def values_of(field: Field) -> st.SearchStrategy[Any]:
         LEVELS: st.tuples(*[st.integers(0, 65535).map(float)] * 4),
         GAMMA: st.just("srgb") | st.floats(0.1, 10),
         FLAG: st.booleans(),
+        PROFILE: word.map(Profile),
     }
     if limit in strategies:
         return strategies[limit]
@@ -152,7 +155,8 @@ def test_columns_have_the_order_of_the_contract() -> None:
         (["noise.levels=[{a: 1, b: 2}]"], set[str]()),
         (["split={a: 0.5, b: 0.5}"], {"split"}),
         (["gains=by_light"], {"light", "cct_k"}),
-        (["source.root=photos"], {"source_noise_dn"}),
+        (["source.root=photos"], {"source_noise_dn", "profile", "pixels_xxh3"}),
+        (["source.root=photos", "source.icc=ignore", "source.include=['*.png']"], {"source_noise_dn"}),
         (["scene=night"], {"light_clipped_high"}),
         (["output.clean_dtype=float32"], {"clean_dtype"}),
         (["output.targets=[linear_rgb]"], {"targets"}),
