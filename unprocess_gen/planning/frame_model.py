@@ -43,16 +43,13 @@ def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float
     Every treatment of highlights maps light i to at least k·i and at most i·max(1, k), where k is the inverse gain.
     """
     tables = light_tables(facts.profile, isp.tone, isp.gamma, facts.codes)
-    lows, highs = ([float(table[code]) for table in tables] for code in (facts.dark_code, facts.bright_code))
+    (r0, g0, b0), (r1, g1, b1) = ([float(t[code]) for t in tables] for code in (facts.dark_code, facts.bright_code))
     rgb2cam = from_primaries(camera.rgb2cam, facts.profile.to_srgb)
     lowest, highest = math.inf, -math.inf
     for channel, k in enumerate(camera.inverse_gains):
-        row = rgb2cam[3 * channel : 3 * channel + 3]
-        ends = [
-            (w * low, w * high) if w > 0 else (w * high, w * low) for w, low, high in zip(row, lows, highs, strict=True)
-        ]
-        (r, red), (g, green), (b, blue) = ends
-        least, most = r + g + b, red + green + blue
+        r, g, b = rgb2cam[3 * channel : 3 * channel + 3]
+        least = r * (r0 if r > 0 else r1) + g * (g0 if g > 0 else g1) + b * (b0 if b > 0 else b1)
+        most = r * (r1 if r > 0 else r0) + g * (g1 if g > 0 else g0) + b * (b1 if b > 0 else b0)
         lowest, highest = min(lowest, least * k), max(highest, most * max(k, 1.0))
     return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
 

@@ -65,7 +65,7 @@ class RecordedPhotographs:
         if digest != (expected := prepared.pixels_xxh3 or prepared.mosaic_xxh3):
             raise SourceChangedError(
                 f"its file is the same, but is decoded to other pixels: XXH3-128 is {digest}, the row records "
-                f"{expected}; expected the versions of LibRaw (rawpy) and libheif that dataset.json records"
+                f"{expected}; expected the versions of the decoders that dataset.json records"
             )
         return photograph
 
