@@ -43,7 +43,7 @@ from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
 from unprocess_gen.sources.image.decode import Photograph
-from unprocess_gen.sources.linear.pixels import linear_pixels, linear_source
+from unprocess_gen.sources.linear.pixels import linear_photograph, linear_pixels
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.patches import list_patches
 
@@ -428,8 +428,10 @@ def plan_array(pixels: Srgb, settings: PairSettings, key: str | int | None) -> t
     """Plan the pair of an array; its identity is the digest of ``key``, or of the array itself."""
     config, source = settings.config, _array_source(pixels, key)
     recorded, _ = _recorded(pixels, config.source.downscale, config.output.layout)
-    stated = linear_source(config.source, pixels) if config.source.kind == "linear" else None
-    return source, plan_pixels(settings, Photograph(recorded, 1, source=stated), source, source.sha256 or "")
+    is_linear = config.source.kind == "linear"
+    photograph = linear_photograph(config.source, pixels) if is_linear else Photograph(pixels, 1)
+    photograph = dataclasses.replace(photograph, srgb=recorded)
+    return source, plan_pixels(settings, photograph, source, source.sha256 or "")
 
 
 def _array_source(pixels: Srgb, key: str | int | None) -> Source:

@@ -42,7 +42,7 @@ from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.tone_curves import linear_table
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.decode import decode
-from unprocess_gen.sources.linear.pixels import linear_source
+from unprocess_gen.sources.linear.pixels import linear_photograph
 
 TWO_NUMBERS = "noise=imx385_iso3200"
 PROFILES = ("sony_a7s2", "nikon_d850")
@@ -129,7 +129,7 @@ class Bench:
 
     def plans(self, settings: str) -> tuple[Plan, ...]:
         config = config_of(settings)
-        source = linear_source(config.source, self.srgb) if config.source.kind == "linear" else None
+        source = linear_photograph(config.source, self.srgb).source if config.source.kind == "linear" else None
         return plan_pairs(config, f"{self.number:064x}", facts=facts_for(config, self.srgb, source=source))
 
     def pair(self, settings: str, is_new_body: bool = True) -> Work:

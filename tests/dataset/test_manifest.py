@@ -42,12 +42,14 @@ from unprocess_gen.simulation.plan import (
     LEVELS,
     LIST,
     PRIMARIES,
+    PROFILE,
     DarkFramePlan,
     Plan,
     PlanRecord,
     fields_of,
     part_in,
 )
+from unprocess_gen.simulation.profiles import Profile
 
 CONTRACT = [
     *("key", "source", "source_sha256", "status", "reason", "width", "height", "orientation", "shard", "seed"),
@@ -103,6 +105,7 @@ def values_of(field: Field) -> st.SearchStrategy[Any]:
         GAMMA: st.just("srgb") | st.floats(0.1, 10),
         FLAG: st.booleans(),
         PRIMARIES: st.sampled_from(["acescg", "0.64;0.33;0.3;0.6;-0.15;6e-05;0.3127;0.329"]),
+        PROFILE: word.map(Profile),
     }
     if limit in strategies:
         return strategies[limit]
@@ -154,7 +157,8 @@ def test_columns_have_the_order_of_the_contract() -> None:
         (["noise.levels=[{a: 1, b: 2}]"], set[str]()),
         (["split={a: 0.5, b: 0.5}"], {"split"}),
         (["gains=by_light"], {"light", "cct_k"}),
-        (["source.root=photos"], {"source_noise_dn"}),
+        (["source.root=photos"], {"source_noise_dn", "profile", "pixels_xxh3"}),
+        (["source.root=photos", "source.icc=ignore", "source.include=['*.png']"], {"source_noise_dn"}),
         (["scene=night"], {"light_clipped_high"}),
         (["output.clean_dtype=float32"], {"clean_dtype"}),
         (["output.targets=[linear_rgb]"], {"targets"}),

@@ -279,7 +279,7 @@ def test_datasets_of_raw_sources_are_complete(dataset: Path) -> None:
 def test_another_decoded_mosaic_is_not_another_file(dataset: Path, tmp_path: Path) -> None:
     pairs = ug.RawPairs(dataset)
     row = {**pairs[0].row, "mosaic_xxh3": "0" * 32}
-    with pytest.raises(SourceChangedError, match="file is the same, but is decoded to another mosaic"):
+    with pytest.raises(SourceChangedError, match="file is the same, but is decoded to other pixels"):
         PairRegenerator(str(dataset.parent / "frames")).regenerate(row)
     np.save(tmp_path / "0.npy", np.zeros((64, 72), np.uint16))
     with pytest.raises(SourceChangedError, match="SHA-256"):

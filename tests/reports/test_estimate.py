@@ -32,7 +32,8 @@ def test_sources_are_sampled_and_their_sizes_give_the_bytes(
     assert (estimate.exact, estimate.pairs, estimate.run.shards) == (is_exact, 2 * count, -(-count // 8))
     assert made.bytes < estimate.bytes < 4 * made.bytes  # the rows of these pairs take less than 8 kB
     lines = format_estimate(estimate).splitlines()
-    assert lines[2].startswith(f"bytes     about {estimate.bytes:,} in shards, ")
+    assert lines[1] == f"profiles  {count if read_all else SAMPLE} sRGB"
+    assert lines[3].startswith(f"bytes     about {estimate.bytes:,} in shards, ")
 
 
 def test_time_has_start_up_and_pairs_by_the_workers_with_a_shard(settings: Settings, tmp_path: Path) -> None:
@@ -150,11 +151,11 @@ def test_every_noise_level_is_listed(run_main: RunMain, tmp_path: Path) -> None:
 
 def test_unmatched_files_are_counted_by_suffix_with_advice(settings: Settings, tmp_path: Path) -> None:
     folder = fill(tmp_path / "p", 1)
-    for name in ("a.heic", "b.heic", "c.txt"):
+    for name in ("a.jxl", "b.jxl", "c.txt"):
         (folder / name).touch()
     config = settings(f"source.root={folder}")
     line = format_estimate(estimate_run(config, 1, True)).splitlines()[1]
-    assert "3 files are not matched by source.include (2 .heic, 1 .txt); convert " in line
+    assert "3 files are not matched by source.include (2 .jxl, 1 .txt); convert " in line
 
 
 def test_sources_of_numbers_are_stated_on_request(run_main: RunMain) -> None:

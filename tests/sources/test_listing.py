@@ -90,12 +90,12 @@ def test_folder_with_the_name_of_a_photograph_is_no_source(tmp_path: Path) -> No
 
 
 def test_unmatched_files_are_counted_by_suffix_with_advice(tmp_path: Path) -> None:
-    fill(tmp_path, "a.jpg", "notes.txt", "sub/more.TXT", "b.HEIC", "LICENSE", "c.png")
+    fill(tmp_path, "a.jpg", "notes.txt", "sub/more.TXT", "b.JXL", "LICENSE", "c.png")
     unmatched = listed(tmp_path).unmatched
-    assert unmatched == {".txt": 2, "": 1, ".heic": 1, ".png": 1}
+    assert unmatched == {".txt": 2, "": 1, ".jxl": 1, ".png": 1}
     sentence = unmatched_sentence(unmatched)
     assert sentence.startswith("5 files are not matched by source.include (2 .txt, 1 without suffix, ")
-    assert sentence.endswith("; extend source.include to read .png; convert .heic to JPEG, PNG or TIFF")
+    assert sentence.endswith("; extend source.include to read .png; convert .jxl to JPEG, PNG or TIFF")
     assert unmatched_sentence({}) == ""
     assert "9 .e, 19 others" in unmatched_sentence({f".{letter}": 9 for letter in "abcdefg"} | {"": 1})
     fill(tmp_path / "raw", "a.cr2", "b.dng", "c.dng")

@@ -129,10 +129,10 @@ def test_summary_and_plan_name_files_that_nothing_matches(run_main: RunMain, tmp
     photos = tmp_path / "photos"
     photos.mkdir()
     Image.fromarray(pixels(1, 9, 14)).save(photos / "a.png")
-    (photos / "b.HEIC").touch()
+    (photos / "b.JXL").touch()
     for command in ([], ["plan"]):
         done = run_main(*command, f"source.root={photos}", "n_jobs=1")
-        assert "1 file is not matched by source.include (1 .heic)" in done.out, done
+        assert "1 file is not matched by source.include (1 .jxl)" in done.out, done
 
 
 def test_clip_of_different_photographs_gives_warnings(run_main: RunMain, tmp_path: Path) -> None:

@@ -117,8 +117,8 @@ class SourceConfig(Group):
     max_failed
         number of failed sources up to which a run exits with code 0; with more it exits with code 3
     icc
-        colour profiles of photographs: ignore reads pixels as sRGB; with refuse, images with another profile
-        fail
+        colour profiles of photographs: convert reads colours as the profile says; ignore reads pixels as sRGB; with
+        refuse, images with another profile fail
     clips
         treat each folder as a clip: its frames share camera, gains, noise level and fixed patterns
     patch
@@ -138,7 +138,8 @@ class SourceConfig(Group):
     list: Optional[str] = key(
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False)
     include: tuple[str, ...] = key(
-        ("*.jpg", "*.jpeg", "*.jpe", "*.jfif", "*.mpo", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp"),
+        ("*.jpg", "*.jpeg", "*.jpe", "*.jfif", "*.mpo", "*.png", "*.tif", "*.tiff", "*.webp", "*.bmp", "*.heic",
+         "*.heif", "*.hif", "*.avif"),
         Limit("a list of at least one pattern such as '*.jpg'", limits.are_texts))
     exclude: tuple[str, ...] = key((), Limit("a list of patterns such as '*_thumb.jpg'", limits.are_texts))
     recursive: bool = key(True, limits.BOOLEAN)
@@ -146,7 +147,7 @@ class SourceConfig(Group):
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
     min_side: Optional[int] = key(None, Integers(1, 2**20), unit="pixels", null="images of any size")
     max_failed: int = key(0, Integers(0, 10**9), decides_data=False)
-    icc: str = key("ignore", Choice("ignore", "refuse"))
+    icc: str = key("convert", Choice("convert", "ignore", "refuse"))
     clips: bool = key(False, limits.BOOLEAN)
     downscale: int = key(1, of="downscale")
     dequantize: str = key("off", of="dequantize")

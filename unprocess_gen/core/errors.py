@@ -33,7 +33,8 @@ REASONS = {
     "cmyk": "the pixels are printing inks",
     "alpha": "pixels are transparent, or could be",
     "animated": "the file contains several pictures",
-    "icc": "with `source.icc=refuse`: the colours are not those of sRGB",
+    "icc": "the colours cannot be converted to sRGB (PQ, HLG, linear light, a profile of tables, or a damaged one); "
+    "with `source.icc=refuse`, they are not those of sRGB",
     "worker_died": "four workers died at this source, usually out of memory; the next run tries it again",
 }
 """Reasons for which a source fails, the values of the manifest column ``reason``, with their explanations."""

@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import Any
 
 from unprocess_gen.config.schema import Config
@@ -281,7 +282,8 @@ def _finish(folder: OutFolder, run: RunFile, process: dict[str, Any]) -> dict[st
             raise _missing_error(folder, run, missing)
         (folder / "manifest.csv").commit(manifest)
         decoders = decoder_versions(run.source.kind)
-        versions = {package: version(package) for package in PACKAGES} | decoders
+        heic = ["pillow-heif"] if find_spec("pillow_heif") else []
+        versions = {package: version(package) for package in (*PACKAGES, *heic)} | decoders
         machine = {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
         facts = count_facts(counts) | run.facts() | {"run": process | machine, "versions": versions}
         dataset = dataset_facts(run.config, digest, entries, facts)

@@ -274,7 +274,8 @@ class LivePairs(PairTable):
         if self._redraw == "all":
             facts = self._facts.get(number)
             if facts is None:
-                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan), stated_source(plan))
+                stated = stated_source(plan), plan.source.profile
+                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan), *stated)
                 self._facts.keep(number, facts)
             plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
         if plan.dark and settings.dark_frames is not None:
@@ -349,10 +350,8 @@ class LiveImage:
     def cache_name(self) -> str:
         """Name of the decoded image in a `PixelCache`."""
         prepared = self.plan.source
-        if prepared.is_linear:
-            return f"{prepared.pixels_xxh3}-{prepared.downscale}"
         if not prepared.is_raw:
-            return f"{self.sha256}-{prepared.downscale}"
+            return f"{prepared.pixels_xxh3 or self.sha256}-{prepared.downscale}"
         means = prepared.raw_pattern, *prepared.raw_black_dn, *prepared.raw_white_dn
         return "-".join(map(str, (prepared.mosaic_xxh3, prepared.shrink, *(means if prepared.shrink > 1 else ()))))
 
@@ -386,7 +385,8 @@ class RecordedPairs(DatasetRows):
             numbers, noise_dn = (int(row["orientation"] or 1), int(row["shard"] or 0)), row["source_noise_dn"]
             identity = source_of(row), str(row["source_sha256"]), *numbers, str(row["key"])
             assert not isinstance(noise_dn, str)
-            parts = plan_from_row(row), patch_from_row(row), noise_dn
+            plan = self._photographs.with_profile(plan_from_row(row), *identity[:2])
+            parts = plan, patch_from_row(row), noise_dn
             recorded = partial(self.row, number) if row["clean_xxh3"] else None
             image = self._kept.keep(number, LiveImage(*identity, *parts, recorded))
         return image

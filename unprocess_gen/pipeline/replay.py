@@ -113,7 +113,7 @@ class PairRegenerator:
         plan, names = plan_from_row(row), [LINEAR_RGB] if row["targets"] else []
         self_test.check([plan], names)
         photograph = self._photographs.load(source_of(row), str(row["source_sha256"]), plan.source)
-        patch = patch_from_row(row)
+        plan, patch = plan.decoded(photograph.profile, photograph.pixels_xxh3), patch_from_row(row)
         height, width = photograph.srgb.shape[:2]
         if patch.patch_y + patch.height > height or patch.patch_x + patch.width > width:
             raise DamageError(

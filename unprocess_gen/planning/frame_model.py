@@ -16,8 +16,8 @@ from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contrib
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.plan import MOST_LIGHT, CameraPlan, IspPlan, Physics, SensorPlan, SourcePlan
-from unprocess_gen.simulation.reference.colour import Matrix
-from unprocess_gen.simulation.tone_curves import linear_table
+from unprocess_gen.simulation.profiles import light_tables
+from unprocess_gen.simulation.reference.colour import Matrix, from_primaries
 
 MASKING = tuple(effect for effect in EFFECTS if effect.masks)
 """Random effects of single pixels, which mask others."""
@@ -42,13 +42,15 @@ def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float
 
     Every treatment of highlights maps light i to at least k·i and at most i·max(1, k), where k is the inverse gain.
     """
-    curve = linear_table(isp.tone, isp.gamma, facts.codes)
-    low, high = (float(curve[int(code)]) for code in (facts.dark_code, facts.bright_code))
+    tables = light_tables(facts.profile, isp.tone, isp.gamma, facts.codes)
+    ends = int(facts.dark_code), int(facts.bright_code)
+    (r0, g0, b0), (r1, g1, b1) = ([float(table[code]) for table in tables] for code in ends)
+    rgb2cam = from_primaries(camera.rgb2cam, facts.profile.to_srgb)
     lowest, highest = math.inf, -math.inf
     for channel, k in enumerate(camera.inverse_gains):
-        r, g, b = camera.rgb2cam[3 * channel : 3 * channel + 3]
-        least = r * (low if r > 0 else high) + g * (low if g > 0 else high) + b * (low if b > 0 else high)
-        most = r * (high if r > 0 else low) + g * (high if g > 0 else low) + b * (high if b > 0 else low)
+        r, g, b = rgb2cam[3 * channel : 3 * channel + 3]
+        least = r * (r0 if r > 0 else r1) + g * (g0 if g > 0 else g1) + b * (b0 if b > 0 else b1)
+        most = r * (r1 if r > 0 else r0) + g * (g1 if g > 0 else g0) + b * (b1 if b > 0 else b0)
         lowest, highest = min(lowest, least * k), max(highest, most * max(k, 1.0))
     return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
 

@@ -97,7 +97,8 @@ def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: Da
     """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay."""
     planner = _planner(with_raw_sensor(config, parts_of(plan)))
     image = planner.image(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
-    return planner.plan(image, plan.place, plan.dark)[0]
+    redrawn = planner.plan(image, plan.place, plan.dark)[0]
+    return redrawn.decoded(plan.source.profile, plan.source.pixels_xxh3)
 
 
 def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:

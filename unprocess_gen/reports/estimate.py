@@ -44,7 +44,7 @@ class SourceEstimate:
     """The pairs of a source, or why it has none; ``levels`` has a plan with its predictions for each noise level.
 
     ``bytes`` is their size in a shard, ``seconds`` the time it took to make them, ``noise_ratio`` the noise of the
-    source over the simulated noise, if it is known. ``note`` is about the source.
+    source over the simulated noise, if it is known. ``profile`` has its colours, ``note`` is about the source.
     """
 
     source: Source
@@ -55,6 +55,7 @@ class SourceEstimate:
     patches: int = 0
     pairs: int = 0
     noise_ratio: float | None = None
+    profile: str = ""
     note: str = ""
 
 
@@ -141,6 +142,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         patches=len(image.patches),
         pairs=len(image.patches) * len(image.plans),
         noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, image.plans[0]),
+        profile=photograph.profile.name,
         note="; ".join(filter(None, (photograph.note, warning))),
     )
 

@@ -6,6 +6,7 @@ import math
 import operator
 import re
 import textwrap
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 from unprocess_gen.config import interpretation
@@ -41,6 +42,7 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False, with_tabl
     return "\n".join(
         [
             *_labelled("sources", [listed, unmatched_sentence(run.listing.unmatched), *run.listing.warnings]),
+            *_labelled("profiles", [_profile_sentence(read)]),
             *_labelled("pairs", [f"{about}{estimate.pairs}, in {per_shard}"]),
             *_labelled("splits", [_split_sentence(config, len(run.sources))]),
             *_labelled("patches", [_patch_sentence(config, read)]),
@@ -125,6 +127,13 @@ def _split_sentence(config: Config, sources: int) -> str:
     """State the share of each split, and the number of sources that it leads to expect; empty without splits."""
     expected = (f"{name} {share:.4g} (about {share * sources:.0f})" for name, share in (config.split or {}).items())
     return f"{', '.join(expected)} of {sources} sources" if config.split else ""
+
+
+def _profile_sentence(estimates: Estimates) -> str:
+    """Count the photographs of each colour profile, and those whose colours are refused."""
+    names = Counter(source.profile for source in estimates if source.profile)
+    names["refused"] += sum(source.failure is not None and source.failure.reason == "icc" for source in estimates)
+    return ", ".join(f"{count} {name}" for name, count in names.most_common() if count)
 
 
 def _patch_sentence(config: Config, estimates: Estimates) -> str:

@@ -34,6 +34,7 @@ from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
+from unprocess_gen.simulation.profiles import light_tables
 from unprocess_gen.simulation.reference import isp as display
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.primaries import light_colours
@@ -82,6 +83,7 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
         try:
             photograph = sources.load(source_of(row), str(row["source_sha256"]), plan.source)
             part = crop_patch(photograph.srgb, patch_from_row(row))
+            plan = plan.decoded(photograph.profile, photograph.pixels_xxh3)
         except (SourceChangedError, DamageError, ConfigError) as error:  # the sheet is drawn without this photograph
             missing = str(error)
         yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan, part, missing)
@@ -191,6 +193,7 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
         yield "levels", "black 0, white 1", (values * CODE_RANGE - black) / (white - black)
         return
     matrix, inverse_gains = light_colours(plan.source, camera)
+    profile = plan.source.profile
     if plan.source.is_linear:
         values = values * plan.scene.exposure
         yield "exposed", f"ev {plan.scene.ev:g}, exposure ratio {plan.scene.exposure_ratio:g}", values
@@ -198,10 +201,15 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
         yield "colour matrix inverted", f"camera {camera.camera}, primaries {plan.source.primaries}", values
         yield "gains inverted", f"times {_gain_text(inverse_gains)}", values * inverse_gains
         return
-    values = unprocess.INVERSE_TONES[isp.tone](values, 1 - values)
-    yield "tone curve inverted", isp.tone, values
-    values = unprocess.expand_gamma(values, isp.gamma)
-    yield "gamma inverted", f"gamma {isp.gamma}", values
+    if profile.is_srgb:
+        values = unprocess.INVERSE_TONES[isp.tone](values, 1 - values)
+        yield "tone curve inverted", isp.tone, values
+        values = unprocess.expand_gamma(values, isp.gamma)
+        yield "gamma inverted", f"gamma {isp.gamma}", values
+    else:
+        tables, levels = light_tables(profile, isp.tone, isp.gamma, 256), np.linspace(0, 1, 256)
+        values = np.stack([np.interp(values[..., n], levels, table) for n, table in enumerate(tables)], axis=-1)
+        yield "curves inverted", f"{profile.name}, {isp.tone}, gamma {isp.gamma}", values
     values = unprocess.apply_ccm(values, matrix)
     yield "colour matrix inverted", f"camera {camera.camera}", values
     values = unprocess.invert_gains(values, camera.inverse_gains, isp.highlight, isp.highlight_threshold)

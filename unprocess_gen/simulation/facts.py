@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 from unprocess_gen.core.arrays import Raw
 from unprocess_gen.simulation.plan import CameraPlan, IspPlan, SensorPlan, SourcePlan
+from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 
 
 class DarkPixels(Protocol):
@@ -46,7 +47,8 @@ class Facts:
 
     ``dark_code`` and ``bright_code`` are the lowest and highest code in any channel, of ``codes`` possible codes; of a
     linear source they are light, and ``codes`` is 0. ``frames`` is the number of frames in the clip, 1 for a
-    photograph. ``raw`` is what the file of a raw source states, ``source`` what that of a linear source does.
+    photograph. ``raw`` is what the file of a raw source states, ``source`` what that of a linear source does, and
+    ``profile`` has the colours of a photograph.
     """
 
     width: int
@@ -57,6 +59,7 @@ class Facts:
     frames: int = 1
     raw: RawParts | None = None
     source: SourcePlan | None = None
+    profile: Profile = UNCONVERTED
 
 
 class RawParts(NamedTuple):

@@ -8,6 +8,7 @@ parameter is a new field.
 
 import functools
 import math
+from fnmatch import fnmatch
 from typing import Annotated, Any, Self, get_args, get_type_hints
 
 import msgspec
@@ -30,6 +31,7 @@ from unprocess_gen.core.fields import (
 )
 from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.simulation.numbers import DN, SHAPE, SITES, Number, number_in_dn, rate
+from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 from unprocess_gen.simulation.tone_curves import gamma_text
 
 TIERS = REFERENCE, EXACT, FAST = "reference", "exact", "fast"
@@ -48,13 +50,10 @@ MOST_LIGHT = 65536.0
 
 # ---------------------------------------------------------------------------------------- allowed values and conditions
 
-ANY_TEXT = Text("[^\x00-\x1f\x7f\ud800-\udfff]*", "text without control characters")
-LIST = Text(
-    "[^\x00-\x1f\x7f\ud800-\udfff]*",
-    "text without control characters",
-    write=";".join,
-    read=lambda text: tuple(text.split(";")),
-)
+_PRINTED = "[^\x00-\x1f\x7f\ud800-\udfff]*", "text without control characters"
+ANY_TEXT = Text(*_PRINTED)
+LIST = Text(*_PRINTED, write=";".join, read=lambda text: tuple(text.split(";")))
+PROFILE = Text(*_PRINTED, write=lambda profile: profile.name, read=Profile)
 HEX_KEY = Text("([0-9a-f]{16})?|none", "16 hexadecimal digits", write="{:016x}".format, read=lambda text: int(text, 16))
 HEX_128, HEX_256 = (Text(f"([0-9a-f]{{{n}}})?", f"{n} hexadecimal digits") for n in (32, 64))
 _XY = r"-?\d{1,3}(\.\d{1,17})?(e-\d\d)?"
@@ -87,6 +86,25 @@ BAYER = "RGGB", "BGGR", "GRBG", "GBRG"
 
 RAW = Condition("source.kind is not raw", lambda config: config.source.kind == "raw")
 LINEAR = Condition("source.kind is not linear", lambda config: config.source.kind == "linear")
+PHOTOGRAPHS = Condition(
+    "the sources are no photographs",
+    lambda config: config.source.place is not None and config.source.kind == "srgb",
+)
+PROFILES = Condition(
+    f"source.icc is not convert, or {PHOTOGRAPHS.unless}",
+    lambda config: config.source.icc == "convert" and PHOTOGRAPHS.holds(config),
+)
+HEIF_NAMES = "x.heic", "x.heif", "x.hif", "x.avif"
+DECODED = Condition(
+    "the sources are neither linear nor photographs, or source.include has no pattern of HEIC or AVIF files",
+    lambda config: (
+        LINEAR.holds(config)
+        or (
+            PHOTOGRAPHS.holds(config)
+            and any(fnmatch(name, pattern.lower()) for pattern in config.source.include for name in HEIF_NAMES)
+        )
+    ),
+)
 CLIPS = Condition("source.clips is false", lambda config: config.source.clips)
 SPLITS = Condition("split is null", lambda config: config.split is not None)
 LIGHTS = Condition("gains.light is null", lambda config: config.gains.light is not None)
@@ -266,11 +284,15 @@ class SourcePlan(PlanRecord, frozen=True):
         Numbers(0), "DN", stated=True)] = 0.0
     own_b_dn2: Annotated[float, _of_raw(
         "variance at black of the raw source itself in the clean frame", Numbers(0), "DN²", stated=True)] = 0.0
+    profile: Annotated[Profile, Field(
+        "colour profile from which the photograph was converted; sRGB if it has none, or one with the colours of sRGB",
+        PROFILE, needs=PROFILES, blank=True)] = UNCONVERTED
     primaries: Annotated[str, Field(
         "primaries of a linear source: a name, or x and y of red, green, blue and white as its file states them",
         PRIMARIES, needs=LINEAR)] = ""
     pixels_xxh3: Annotated[str, Field(
-        "XXH3-128 of the pixels that the file was decoded to", HEX_128, needs=LINEAR)] = ""
+        "XXH3-128 of the pixels that the file of a linear source, or a HEIC or AVIF file, was decoded to", HEX_128,
+        needs=DECODED, blank=True, empty_if=f"{FAILED}, or has another format")] = ""
     # fmt: on
 
     @property
@@ -539,6 +561,12 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
     def __repr__(self) -> str:
         key, camera, noise, scene = self.stream_key, self.camera.camera, self.noise.noise, self.scene.scene
         return f"Plan(stream_key={key:016x}, camera={camera}, noise={noise}, scene={scene}, accuracy={self.accuracy})"
+
+    def decoded(self, profile: Profile, pixels_xxh3: str = "") -> Self:
+        """Return the plan with the colours of its photograph, which no draw depends on, and the digest of pixels."""
+        if (profile, pixels_xxh3) == (self.source.profile, self.source.pixels_xxh3):
+            return self
+        return self.replace(profile=profile, pixels_xxh3=pixels_xxh3)
 
     @property
     def numbers(self) -> Physics:

@@ -43,7 +43,7 @@ NAMED_SUFFIXES = 5
 
 ADVICE = {
     "extend source.include to read {}": {glob.removeprefix("*") for glob in SourceConfig.include},
-    "convert {} to JPEG, PNG or TIFF": {".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"},
+    "convert {} to JPEG, PNG or TIFF": {".gif", ".jp2", ".jxl", ".ppm", ".psd"},
     "source.kind=raw reads {}": {".pgm", *RAW_FILES},
 }
 """Advice of `unmatched_sentence` about files, by their suffixes."""

@@ -16,7 +16,7 @@ from unprocess_gen.core.source import Source
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.decode import Photograph, decode
 from unprocess_gen.sources.linear.files import read_linear_source
-from unprocess_gen.sources.linear.pixels import linear_source
+from unprocess_gen.sources.linear.pixels import linear_photograph
 from unprocess_gen.sources.raw.frames import read_raw_source
 from unprocess_gen.sources.reading import ReadFile, read_bytes
 
@@ -32,8 +32,7 @@ def load_source(
     if config.place is None:
         try:
             if config.kind == "linear":
-                light = synthetic.scene(source.path)
-                photograph = Photograph(light, orientation=1, source=linear_source(config, light))
+                photograph = linear_photograph(config, synthetic.scene(source.path))
             else:
                 photograph = Photograph(synthetic.picture(source.path), orientation=1)
         except ValueError as error:  # only the row of an edited manifest can name a picture that does not exist

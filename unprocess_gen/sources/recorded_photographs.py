@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 from pathlib import PurePosixPath
 
 from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import RESTORE, ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.raw_files import RAW_FILES
+from unprocess_gen.core.sequences import Recent
 from unprocess_gen.core.source import Source
-from unprocess_gen.simulation.plan import SourcePlan
-from unprocess_gen.sources.image.decode import Photograph
+from unprocess_gen.simulation.plan import Plan, SourcePlan
+from unprocess_gen.simulation.profiles import SRGB, UNCONVERTED, Profile
+from unprocess_gen.sources.image.decode import Photograph, read_profile
 from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.reading import read_bytes
+
+PROFILES = 4096
+"""Photographs whose colours are kept."""
 
 NO_LIMIT = 2**40
 """Pixels that a replay accepts; ``source.max_pixels`` applied when the row was made."""
@@ -23,6 +30,7 @@ class RecordedPhotographs:
     def __init__(self, root: str | None) -> None:
         self._root = root
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
+        self._profiles: Recent[str, Profile] = Recent(PROFILES)
 
     def load(self, source: Source, recorded: str, prepared: SourcePlan) -> Photograph:
         """Decode the source of a row with this SHA-256.
@@ -50,20 +58,38 @@ class RecordedPhotographs:
         _, _, sha256, photograph = self._kept
         if sha256 != recorded:
             raise SourceChangedError(_changed(sha256, recorded))
-        decoded = photograph.raw.source if photograph.raw is not None else photograph.source
-        for name, decoder in {"mosaic_xxh3": "LibRaw (rawpy)", "pixels_xxh3": "the decoder"}.items():
-            if decoded is not None and (actual := getattr(decoded, name)) != (expected := getattr(prepared, name)):
-                raise SourceChangedError(
-                    f"its file is the same, but is decoded to other pixels: XXH3-128 is {actual}, the row records "
-                    f"{expected}; expected the version of {decoder} that dataset.json records"
-                )
+        if photograph.profile.name != prepared.profile.name:
+            names = photograph.profile.name, prepared.profile.name
+            raise DamageError("its source has the colour profile {!r}, the row records {!r}".format(*names))
+        digest = photograph.pixels_xxh3 if photograph.raw is None else photograph.raw.source.mosaic_xxh3
+        if digest != (expected := prepared.pixels_xxh3 or prepared.mosaic_xxh3):
+            raise SourceChangedError(
+                f"its file is the same, but is decoded to other pixels: XXH3-128 is {digest}, the row records "
+                f"{expected}; expected the versions of the decoders that dataset.json records"
+            )
         return photograph
+
+    def with_profile(self, plan: Plan, source: Source, recorded: str) -> Plan:
+        """Add the colours of its source to the plan of a row; SourceChangedError if its bytes are others.
+
+        Only headers are read: with a cache of pixels, each worker would otherwise decode each photograph once.
+        """
+        if self._root is None or plan.source.profile.name in (UNCONVERTED.name, SRGB):
+            return plan
+        profile = self._profiles.get(recorded)
+        if profile is None:
+            content = read_bytes(self._root, source)
+            if (sha256 := hashlib.sha256(content).hexdigest()) != recorded:
+                raise SourceChangedError(_changed(sha256, recorded))
+            profile = self._profiles.keep(recorded, read_profile(content))
+        return plan.decoded(profile, plan.source.pixels_xxh3)
 
 
 def _settings_of(root: str | None, source: Source, prepared: SourcePlan) -> SourceConfig:
     """Settings with which the source of a row is decoded."""
     place = None if source.size_bytes == 0 else root  # synthetic pictures have no bytes
-    config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale)
+    icc = "convert" if prepared.profile.name else "ignore"
+    config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale, icc=icc)
     if prepared.is_linear:
         return replace(config, kind="linear", primaries=prepared.primaries)
     if not prepared.is_raw:

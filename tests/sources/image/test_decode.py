@@ -22,7 +22,7 @@ from helpers.promise_report import Figure
 from PIL import Image, ImageCms
 
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.sources.image.decode import ICC_CHOICES, decode
 from unprocess_gen.sources.image.headers import probe
 
 SIZES = [(1, 1), (1, 9), (7, 13), (40, 61)]
@@ -294,8 +294,6 @@ def test_gray_with_alpha_is_accepted_where_opencv_keeps_it() -> None:
 
 
 OTHER_FORMATS = {
-    "AVIF": [b"\0\0\0\x1cftypavif"],
-    "HEIC": [b"\0\0\0\x1cftypheic", b"\0\0\0\x18ftypmif1"],
     "JPEG XL": [b"\xff\x0a", b"\0\0\0\x0cJXL \r\n\x87\n"],
     "JPEG 2000": [b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP  \r\n\x87\n"],
     "GIF": [b"GIF89a"],
@@ -400,8 +398,9 @@ def with_cicp(primaries: int, transfer: int, matrix: int = 0, full_range: int = 
 
 
 @pytest.mark.parametrize("codes", [(9, 16), (9, 18), (1, 8), (1, 13, 9, 1), (1, 13, 0, 0)])
-def test_png_whose_codes_are_not_display_referred_rgb_is_unsupported(codes: tuple[int, ...]) -> None:
-    assert reason_of(with_cicp(*codes)) == "unsupported"
+@pytest.mark.parametrize("choice", ICC_CHOICES)
+def test_png_whose_codes_are_not_display_referred_rgb_is_refused(codes: tuple[int, ...], choice: str) -> None:
+    assert reason_of(with_cicp(*codes), icc=choice) == ("icc" if len(codes) == 2 else "unsupported")
 
 
 def test_broken_profiles_and_other_primaries_are_refused_when_asked() -> None:

@@ -28,10 +28,10 @@ from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 from unprocess_gen.simulation.kernels.site_patterns import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.strips import Buffers, SiteMap, Strip, count_outside, strip_values
 from unprocess_gen.simulation.plan import MOST_LIGHT, Plan
+from unprocess_gen.simulation.profiles import light_tables
 from unprocess_gen.simulation.reference.cfa import tile
 from unprocess_gen.simulation.reference.colour import Matrix
 from unprocess_gen.simulation.reference.primaries import light_colours
-from unprocess_gen.simulation.tone_curves import linear_table
 
 _0, _8 = np.uint64(0), np.uint64(8)
 _ROW_SITES = VECTOR_WIDTH + 2
@@ -196,7 +196,8 @@ def _products(
         largest = 2 * MOST_LIGHT / (np.array(gains) * plan.scene.exposure)
         return np.asarray(np.column_stack([np.reshape(matrix, (3, 3)), largest]) * np.array(scale)[:, None])
     products = np.empty((3, 3, codes), dtype)
-    _fill_products(matrix, linear_table(plan.isp.tone, plan.isp.gamma, codes), scale, products)
+    curves = light_tables(plan.source.profile, plan.isp.tone, plan.isp.gamma, codes)
+    _fill_products(matrix, curves, scale, products)
     return products
 
 
@@ -205,10 +206,11 @@ def _products(
 
 @kernel
 def _fill_products(
-    matrix: Matrix, curve: NDArray[np.float64], scale: tuple[float, ...], products: NDArray[Any]
+    matrix: Matrix, curves: tuple[NDArray[np.float64], ...], scale: tuple[float, ...], products: NDArray[Any]
 ) -> None:
     for channel in range(3):
         for entry in range(3):
+            curve = curves[entry]
             for code in range(curve.size):
                 products[channel, entry, code] = matrix[3 * channel + entry] * curve[code] * scale[channel]
 

@@ -126,6 +126,27 @@ def rgb2cam(xyz2cam: Matrix) -> Matrix:
     return normalise_rows(multiply(xyz2cam, RGB2XYZ))
 
 
+def from_primaries(rgb2cam: Matrix, to_srgb: Sequence[float] | None) -> Matrix:
+    """Compute the matrix from linear RGB of a photograph to the camera.
+
+    Parameters
+    ----------
+    rgb2cam : Matrix
+        Matrix from linear sRGB to the camera, whose rows sum to 1.
+    to_srgb : sequence of float, optional
+        Matrix from the primaries of the photograph to linear sRGB, whose rows sum to nearly 1; None for sRGB.
+
+    Returns
+    -------
+    Matrix
+        The product, whose rows sum to exactly 1.
+    """
+    if to_srgb is None:
+        return rgb2cam
+    a, b, c, d, e, f, g, h, i = multiply(rgb2cam, matrix(to_srgb))
+    return *unit_row(a, b, c), *unit_row(d, e, f), *unit_row(g, h, i)
+
+
 def normalise_rows(entries: Matrix) -> Matrix:
     """Divide each row by its sum, and round it to a grid on which its entries sum to exactly 1 in any order.
 

@@ -15,10 +15,10 @@ from unprocess_gen.simulation.reference.colour import (
     RGB2XYZ,
     Matrix,
     exact_inverse,
+    from_primaries,
     invert,
     matrix,
     multiply,
-    normalise_rows,
 )
 
 Exact = list[Fraction]
@@ -42,12 +42,12 @@ BRADFORD = [Fraction(n, 10000) for n in (8951, 2664, -1614, -7502, 17135, 367, 3
 """Matrix from XYZ to the cone responses that are scaled to adapt colours to another white (ISO 15076-1, annex E)."""
 
 
-def primaries2xyz(chromaticities: Sequence[float]) -> Exact:
+def primaries2xyz(chromaticities: Sequence[float | Fraction]) -> Exact:
     """Compute the matrix from linear RGB to XYZ with the white `D50`; its columns are the colorants of ICC profiles.
 
     Parameters
     ----------
-    chromaticities : sequence of float
+    chromaticities : sequence of float or Fraction
         x, y of red, green, blue and white.
 
     Returns
@@ -60,7 +60,7 @@ def primaries2xyz(chromaticities: Sequence[float]) -> Exact:
     ValueError
         If the primaries lie on a line, or white is no light.
     """
-    x, y = [*map(Fraction, chromaticities[::2])], [*map(Fraction, chromaticities[1::2])]
+    x, y = ([Fraction(number) for number in chromaticities[start::2]] for start in (0, 1))
     red_x, green_x, blue_x, white_x = x
     red_y, green_y, blue_y, white_y = y
     if white_y <= 0:
@@ -83,11 +83,22 @@ def _xyz2srgb() -> Exact:
 
 
 def xyz2srgb(colorants: Sequence[float | Fraction]) -> Matrix:
-    """Compute the matrix to linear sRGB from one to XYZ with the white `D50`, nine numbers row by row."""
+    """Compute the matrix to linear sRGB from that to XYZ with the white `D50`.
+
+    Parameters
+    ----------
+    colorants : sequence of float or Fraction
+        Matrix to XYZ, nine numbers row by row.
+
+    Returns
+    -------
+    Matrix
+        The matrix to linear sRGB, each entry rounded once.
+    """
     return matrix([float(entry) for entry in _product(_xyz2srgb(), [Fraction(entry) for entry in colorants])])
 
 
-def primaries2srgb(chromaticities: Sequence[float]) -> Matrix:
+def primaries2srgb(chromaticities: Sequence[float | Fraction]) -> Matrix:
     """Compute the matrix from linear RGB to linear sRGB; arguments and errors are those of `primaries2xyz`."""
     return xyz2srgb(primaries2xyz(chromaticities))
 
@@ -98,7 +109,7 @@ CAMERA, XYZ = "camera", "xyz"
 
 @functools.lru_cache(maxsize=1024)
 def to_camera(rgb2cam: Matrix, primaries: str) -> Matrix:
-    """Compute the matrix from the linear RGB of a source to the camera.
+    """Compute the matrix from the linear RGB of a linear source to the camera.
 
     Parameters
     ----------
@@ -112,11 +123,9 @@ def to_camera(rgb2cam: Matrix, primaries: str) -> Matrix:
     Matrix
         The product; its rows sum to 1, so that white stays white, except from XYZ.
     """
-    if primaries == "srgb":
-        return rgb2cam
     if primaries == XYZ:
         return multiply(rgb2cam, invert(RGB2XYZ))
-    return normalise_rows(multiply(rgb2cam, _to_srgb(primaries)))
+    return from_primaries(rgb2cam, None if primaries == "srgb" else _to_srgb(primaries))
 
 
 @functools.lru_cache(maxsize=64)
@@ -130,7 +139,8 @@ def light_colours(source: SourcePlan, camera: CameraPlan) -> tuple[Matrix, tuple
     Parameters
     ----------
     source : SourcePlan
-        Its ``primaries``, if it is a linear source; sensor RGB (`CAMERA`) needs neither matrix nor gains.
+        Its ``primaries``, if it is a linear source; sensor RGB (`CAMERA`) needs neither matrix nor gains. The
+        ``profile`` of a photograph.
     camera : CameraPlan
         Matrix from linear sRGB, and gains.
 
@@ -141,8 +151,9 @@ def light_colours(source: SourcePlan, camera: CameraPlan) -> tuple[Matrix, tuple
     """
     if source.primaries == CAMERA:
         return IDENTITY, (1.0, 1.0, 1.0)
-    matrix = to_camera(camera.rgb2cam, source.primaries) if source.is_linear else camera.rgb2cam
-    return matrix, camera.inverse_gains
+    if source.is_linear:
+        return to_camera(camera.rgb2cam, source.primaries), camera.inverse_gains
+    return from_primaries(camera.rgb2cam, source.profile.to_srgb), camera.inverse_gains
 
 
 def _product(left: Exact, right: Exact) -> Exact:

@@ -15,9 +15,9 @@ import numpy as np
 from unprocess_gen.core.arrays import Float, Srgb, last_code
 from unprocess_gen.core.random_streams import declare_stream, words
 from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.profiles import UNCONVERTED, Profile, light_tables
 from unprocess_gen.simulation.reference.cfa import mosaic, plane_sites
 from unprocess_gen.simulation.reference.primaries import light_colours
-from unprocess_gen.simulation.tone_curves import linear_table
 
 
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
@@ -70,7 +70,7 @@ def dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Srgb
         steps = np.where(srgb == 254, np.uint64(385), np.uint64(257))  # 254 · 257 + 256 is one less than white
     else:
         steps = np.broadcast_to(np.uint64(257), srgb.shape)
-        kept |= linear_light(srgb, plan.isp.tone, plan.isp.gamma) > plan.isp.highlight_threshold
+        kept |= linear_light(srgb, plan.isp.tone, plan.isp.gamma, plan.source.profile) > plan.isp.highlight_threshold
     offsets = (np.stack(channels, axis=-1).astype(np.uint64) * steps >> np.uint64(32)).astype(np.int32) - 128
     return (srgb.astype(np.int32) * 257 + np.where(kept, 0, offsets)).astype(np.uint16)
 
@@ -91,13 +91,17 @@ def camera_light(srgb: Srgb, plan: Plan) -> Float:
         Camera RGB, 0 at black and 1 at white.
     """
     matrix, gains = light_colours(plan.source, plan.camera)
-    image = srgb.astype(np.float64) if plan.source.is_linear else linear_light(srgb, plan.isp.tone, plan.isp.gamma)
-    return invert_gains(apply_ccm(image, matrix), gains, plan.isp.highlight, plan.isp.highlight_threshold)
+    isp, profile = plan.isp, plan.source.profile
+    image = srgb.astype(np.float64) if plan.source.is_linear else linear_light(srgb, isp.tone, isp.gamma, profile)
+    return invert_gains(apply_ccm(image, matrix), gains, isp.highlight, isp.highlight_threshold)
 
 
-def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:
-    """Invert the tone curve (key of `INVERSE_TONES`) and the gamma (exponent, or ``srgb``), by the exact table."""
-    return linear_table(tone, gamma, last_code(srgb) + 1)[srgb]
+def linear_light(srgb: Srgb, tone: str, gamma: float | str, profile: Profile = UNCONVERTED) -> Float:
+    """Invert the tone curve (key of `INVERSE_TONES`) and the gamma (exponent, or ``srgb``), by the exact tables."""
+    red, green, blue = light_tables(profile, tone, gamma, last_code(srgb) + 1)
+    if red is green is blue:
+        return red[srgb]
+    return np.stack([red[srgb[..., 0]], green[srgb[..., 1]], blue[srgb[..., 2]]], axis=-1)
 
 
 def inverse_smoothstep(x: Float, rest: Float) -> Float:

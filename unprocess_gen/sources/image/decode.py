@@ -1,7 +1,7 @@
 """Decode image files to pixels, and refuse those that are not opaque, still photographs in RGB or gray.
 
-The header decides where it can (`headers`); no file that was cut is decoded in part. Pillow evaluates colour profiles,
-and only if ``source.icc=refuse`` asks for it.
+The header decides where it can (`headers`); no file that was cut is decoded in part. Codes stay as they are in the
+file; their colours are those of the profile (`profiles`).
 
 What OpenCV does (4.13 and 5.0 agree), and what this module does about it:
 
@@ -22,12 +22,10 @@ Measured memory and decisions: ``docs/design/decoding.md``.
 
 from __future__ import annotations
 
-import io
 import logging
 import re
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import cast
 
 import cv2
@@ -35,20 +33,21 @@ import numpy as np
 
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import SourceError
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.simulation.facts import RawParts
 from unprocess_gen.simulation.plan import SourcePlan
+from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
+from unprocess_gen.sources.image.heif import open_heic, widened
+from unprocess_gen.sources.image.profiles import profile_of
 
 _LOGGER = logging.getLogger(__name__)
 
 # libtiff's messages go through OpenCV's log, which OPENCV_LOG_LEVEL could silence.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_WARNING)
 
-ICC_CHOICES = ("ignore", "refuse")
-
-SRGB_TOLERANCE = 2
-"""Largest difference, in 8-bit codes, between a profile and sRGB that still counts as sRGB; real ones differ by 1."""
+ICC_CHOICES = ("convert", "ignore", "refuse")
 
 DECODE_PEAK = 8
 """Samples per pixel that must fit into memory before a failed decode is attributed to the file; the peak is 6."""
@@ -56,9 +55,7 @@ DECODE_PEAK = 8
 CV2_MAX_PIXELS = 2**30
 """OpenCV refuses more, unless an environment variable changes its limit."""
 
-CICP_SRGB = (1, 13, 0, 1)
-"""Primaries, transfer function, matrix coefficients and full-range flag of sRGB (ITU-T H.273)."""
-CICP_HDR_TRANSFERS = {8: "linear", 16: "PQ", 18: "HLG"}
+CICP_HDR_TRANSFERS = {8: "linear light; source.kind=linear reads it from EXR, TIFF or NPY", 16: "PQ", 18: "HLG"}
 """Transfer functions whose codes are not display-referred (ITU-T H.273, table 3)."""
 
 # What libjpeg and libtiff write when they fill in missing or broken data and continue. One libjpeg warning is harmless:
@@ -72,6 +69,9 @@ _DAMAGE = re.compile(
 _LOG_PREFIX = re.compile(r"\[ *[A-Z]+:\d+@[\d.]+\] global \S+ \S+ ")
 """Severity, seconds since the start, file and function of an OpenCV message; they would make manifests differ."""
 
+_BY_VERSION = "heic", "avif"
+"""Formats whose pixels depend on the version of the decoder."""
+
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _COLOUR_16 = _COLOUR | cv2.IMREAD_ANYDEPTH
 
@@ -81,13 +81,16 @@ class Photograph:
     """Decoded pixels ``srgb``, uint8 or uint16 [H, W, 3], R, G, B, after applying the EXIF ``orientation``.
 
     Of a raw source, they are codes of its camera RGB, and ``raw`` is what the file states. Of a linear source, they are
-    light, float32, and ``source`` is what the file states. ``note`` is a warning.
+    light, float32, and ``source`` is what the file states. Codes are not converted from ``profile``: plans do.
+    ``pixels_xxh3`` is the digest of pixels that depend on the version of their decoder. ``note`` is a warning.
     """
 
     srgb: Srgb
     orientation: int
     raw: RawParts | None = None
     note: str = ""
+    profile: Profile = UNCONVERTED
+    pixels_xxh3: str = ""
     source: SourcePlan | None = None
 
 
@@ -100,10 +103,35 @@ def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Ph
     give ``alpha`` or ``corrupt`` before the others are checked.
     """
     header = probe(data)
-    _refuse(header, max_pixels, icc)
-    flags = _COLOUR_16 if header.bits == 16 else _COLOUR
-    if header.has_alpha or (header.format == "tiff" and header.bits == 16):
-        flags = cv2.IMREAD_UNCHANGED
+    _refuse(header, max_pixels)
+    profile = _profile(header, icc)
+    is_stored = header.has_alpha or (header.format == "tiff" and header.bits == 16)  # B, G, R, alpha by OpenCV
+    if header.format == "heic":
+        decoded: Srgb = open_heic(data, is_decoded=True)
+    else:
+        flags = cv2.IMREAD_UNCHANGED if is_stored else _COLOUR_16 if header.bits > 8 else _COLOUR
+        decoded = _decode_by_opencv(data, header, flags, name)
+    if header.bits not in (8, 16):
+        decoded, header = widened(decoded, header.bits), replace(header, bits=16)
+    _check(decoded, header)
+    if header.mode == "white_is_zero" and header.bits == 16:
+        np.subtract(65535, decoded, out=decoded)
+    if decoded.ndim == 2:
+        decoded = cast(Srgb, np.repeat(decoded[..., None], 3, axis=2))
+    elif is_stored:
+        decoded = decoded[..., :3] if header.format == "heic" else decoded[..., 2::-1]
+    srgb = _upright(decoded, header.orientation)
+    digest = array_xxh3(srgb) if header.format in _BY_VERSION else ""
+    return Photograph(srgb, header.orientation, None, header.note, profile, digest)
+
+
+def read_profile(data: bytes) -> Profile:
+    """Profile of a photograph, from which its colours are converted, without decoding pixels; raise as `decode`."""
+    return _profile(probe(data), "convert")
+
+
+def _decode_by_opencv(data: bytes, header: Header, flags: int, name: str) -> Srgb:
+    """Decode pixels as they are stored; SourceError for every damage that a codec reports."""
     content = np.frombuffer(tiff_without_orientation(data) if header.format == "tiff" else data, np.uint8)
     decoded: Srgb | None = None
     with captured() as written, suppress(cv2.error):
@@ -120,14 +148,7 @@ def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Ph
         raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {words}")
     if text:
         _LOGGER.warning("%s: %s", name, text)
-    _check(decoded, header)
-    if header.mode == "white_is_zero" and header.bits == 16:
-        np.subtract(65535, decoded, out=decoded)
-    if decoded.ndim == 2:
-        decoded = cast(Srgb, np.repeat(decoded[..., None], 3, axis=2))
-    elif flags == cv2.IMREAD_UNCHANGED:
-        decoded = decoded[..., 2::-1]
-    return Photograph(_upright(decoded, header.orientation), header.orientation)
+    return decoded
 
 
 # Pixels ---------------------------------------------------------------------------------------------------------------
@@ -158,7 +179,7 @@ def _upright(srgb: Srgb, orientation: int) -> Srgb:
 # Policy ---------------------------------------------------------------------------------------------------------------
 
 
-def _refuse(header: Header, max_pixels: int, icc: str) -> None:
+def _refuse(header: Header, max_pixels: int) -> None:
     pixels = header.width * header.height
     limit = min(max_pixels, CV2_MAX_PIXELS)
     size = f"{header.width} x {header.height} pixels"
@@ -170,46 +191,20 @@ def _refuse(header: Header, max_pixels: int, icc: str) -> None:
         raise SourceError("animated", f"the file holds {header.frames} pictures, expected 1")
     if header.mode == "cmyk":
         raise SourceError("cmyk", "the pixels are printing inks (CMYK); convert the picture to sRGB")
+
+
+def _profile(header: Header, icc: str) -> Profile:
+    """Profile from which colours are converted; SourceError if they are not display-referred RGB, or are refused."""
     if header.cicp is not None:
-        _refuse_cicp(header.cicp, icc)
-    elif icc == "refuse" and header.icc and (objection := _profile_objection(header.icc)):
-        raise SourceError("icc", f"{objection}; convert the picture to sRGB, or set source.icc=ignore")
-
-
-def _refuse_cicp(cicp: bytes, icc: str) -> None:
-    """Raise SourceError for colours declared by code points (H.273) that sRGB code would misread.
-
-    Under ``ignore``, other primaries and curves of standard dynamic range count as sRGB, as ICC profiles do.
-    """
-    primaries, transfer, matrix, full_range = cicp
-    declared = f"the colours are declared as primaries {primaries}, transfer {transfer}, matrix {matrix} (cICP)"
-    if transfer in CICP_HDR_TRANSFERS:
-        raise SourceError("unsupported", f"{declared}: {CICP_HDR_TRANSFERS[transfer]}, not display-referred")
-    if matrix != 0 or full_range != 1:
-        raise SourceError("unsupported", f"{declared}, full range {full_range}: not full-range RGB")
-    if icc == "refuse" and tuple(cicp) != CICP_SRGB:
-        raise SourceError("icc", f"{declared}; convert the picture to sRGB, or set source.icc=ignore")
-
-
-@lru_cache(maxsize=32)
-def _profile_objection(icc: bytes) -> str:
-    """Reason why an embedded profile is not sRGB, or an empty text: judged by its effect, since names prove little.
-
-    The effect is the largest difference from sRGB, in 8-bit codes, over a grid of colours or over all grays.
-    """
-    from PIL import Image, ImageCms
-
-    try:
-        profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
-        mode = {"RGB ": "RGB", "GRAY": "L"}[profile.profile.xcolor_space]
-        grid = np.stack(np.meshgrid(*[np.arange(0, 256, 51, dtype=np.uint8)] * 3), -1).reshape(1, -1, 3)
-        colours = Image.fromarray(grid if mode == "RGB" else np.arange(256, dtype=np.uint8)[None])
-        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-        transform = ImageCms.buildTransform(
-            profile, ImageCms.createProfile("sRGB"), mode, "RGB", renderingIntent=intent
-        )
-        converted = np.asarray(ImageCms.applyTransform(colours, transform)).astype(int)
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError, KeyError) as error:
-        return f"the embedded colour profile cannot be used ({type(error).__name__})"
-    moved = int(np.abs(converted - np.asarray(colours.convert("RGB"))).max())
-    return f"the embedded colour profile moves colours by up to {moved} codes" if moved > SRGB_TOLERANCE else ""
+        primaries, transfer, matrix, full_range = header.cicp
+        declared = f"the colours are declared as primaries {primaries}, transfer {transfer}, matrix {matrix} (cICP)"
+        if transfer in CICP_HDR_TRANSFERS:
+            raise SourceError("icc", f"{declared}: {CICP_HDR_TRANSFERS[transfer]}, not display-referred")
+        if matrix != 0 or full_range != 1:
+            raise SourceError("unsupported", f"{declared}, full range {full_range}: not full-range RGB")
+    if icc == "ignore":
+        return UNCONVERTED
+    profile = profile_of(header)
+    if icc == "refuse" and not profile.is_srgb:
+        raise SourceError("icc", f"the colour profile {profile.name} is not sRGB; set source.icc=convert or ignore")
+    return profile if icc == "convert" else UNCONVERTED

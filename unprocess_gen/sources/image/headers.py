@@ -1,4 +1,4 @@
-"""Read the headers of JPEG, PNG, TIFF, WebP and BMP files without decoding pixels.
+"""Read the headers of photographs without decoding pixels.
 
 A header takes 5 to 200 µs, whatever size it declares, plus the search for a JPEG's last marker at about 1 GB/s. The
 shape of the decoded array is compared with the header later (`decode`). Why no library reads them:
@@ -16,11 +16,12 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from unprocess_gen.core.errors import SourceError
+from unprocess_gen.sources.image.heif import SEQUENCES, avif_facts, open_heic
 
 _MOST_PIECES = 2**18
 """Largest number of segments or chunks: 2^26 pixels of 16-bit RGBA in pieces of 2 KiB. Walking them takes 0.5 s."""
@@ -34,10 +35,12 @@ _EXIF_PREFIX, _TIFF_MAGIC = b"Exif\0\0", (b"II*\0", b"MM\0*")
 class Header:
     """Header of a picture: its size as stored, in pixels, before the EXIF ``orientation`` is applied, and its kind.
 
-    ``bits`` are those of the decoded array, 8 or 16. ``mode`` is ``cmyk``, ``white_is_zero``, or empty. ``has_alpha``
-    is also true for a transparent colour. ``frames`` counts full pages of a TIFF, and is 2 for an animation. ``cicp``
-    (primaries, transfer, matrix and full-range flag of a PNG, ITU-T H.273) overrides the profile ``icc``. ``missing``
-    says what the file lacks if it was cut.
+    ``bits`` are those of the decoded array, 8 or 16; of HEIC and AVIF, those of the codes, which may be 10 or 12.
+    ``mode`` is ``cmyk``, ``white_is_zero``, or empty. ``has_alpha`` is also true for a transparent colour. ``frames``
+    counts full pages of a TIFF, and is 2 for an animation. ``missing`` says what the file lacks if it was cut.
+
+    ``cicp`` (primaries, transfer, matrix and full-range flag, ITU-T H.273) overrides the profile ``icc``, which
+    overrides the chunks ``gamma`` and ``chromaticities`` of a PNG.
     """
 
     format: str
@@ -49,8 +52,11 @@ class Header:
     orientation: int = 1
     frames: int = 1
     icc: bytes = b""
-    cicp: bytes | None = None
+    cicp: tuple[int, ...] | None = None
+    gamma: bytes = b""
+    chromaticities: bytes = b""
     missing: str = ""
+    note: str = ""
 
 
 def probe(data: bytes) -> Header:
@@ -60,7 +66,7 @@ def probe(data: bytes) -> Header:
     """
     if not data:
         raise SourceError("empty", "the file has 0 bytes")
-    name = next((name for name, (magic, _) in _FORMATS.items() if data.startswith(magic)), None)
+    name = next((name for name, (magic, _) in _FORMATS.items() if re.match(magic, data, re.DOTALL)), None)
     if name is None:
         if other := next((other for other, magic in _OTHER_FORMATS.items() if re.match(magic, data, re.DOTALL)), None):
             raise SourceError("unsupported", f"{other}; convert it to JPEG, PNG or TIFF")
@@ -118,7 +124,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _jpeg(data: bytes) -> Header:
-    frame, exif, profile, marker, scans = None, b"", dict[bytes, bytes](), 0, 0
+    frame, exif, profile, marker, scans, note = None, b"", dict[bytes, bytes](), 0, 0, ""
     for marker, payload in _bounded(_jpeg_segments(data)):
         scans += marker == _JPEG_SCAN
         if marker in _JPEG_FRAMES and frame is None:
@@ -127,6 +133,8 @@ def _jpeg(data: bytes) -> Header:
             exif = exif or payload
         elif marker == _JPEG_ICC and payload.startswith(b"ICC_PROFILE\0"):
             profile[payload[12:13]] = payload[14:]
+        elif marker == _JPEG_ICC and payload.startswith(b"MPF\0"):
+            note = "contains other pictures or a gain map (MPO, Ultra HDR), which are not used"
     if frame is None:
         raise SourceError("corrupt" if marker == _JPEG_END else "truncated", "the JPEG file has no frame header")
     if scans > _JPEG_MOST_SCANS:
@@ -135,8 +143,8 @@ def _jpeg(data: bytes) -> Header:
     if kind > _JPEG_LAST_HUFFMAN or depth != 8 or components not in (1, 3, 4):
         raise _unsupported(f"a JPEG of type SOF{kind - 0xC0} with {components} components of {depth} bits")
     mode, missing = "cmyk" if components == 4 else "", "" if marker == _JPEG_END else "its end-of-image marker"
-    icc = b"".join(profile[number] for number in sorted(profile))
-    return Header("jpeg", width, height, 8, mode, orientation=_orientation(exif), icc=icc, missing=missing)
+    icc, size = b"".join(profile[number] for number in sorted(profile)), (width, height)
+    return Header("jpeg", *size, 8, mode, orientation=_orientation(exif), icc=icc, missing=missing, note=note)
 
 
 # PNG ------------------------------------------------------------------------------------------------------------------
@@ -162,6 +170,7 @@ def _png(data: bytes) -> Header:
     cicp = chunks.get(b"cICP")
     if cicp is not None and len(cicp) != 4:
         raise _corrupt(f"the cICP chunk has {len(cicp)} bytes, expected 4")
+    gamma, chromaticities = (b"" if b"sRGB" in chunks else chunks.get(kind, b"") for kind in (b"gAMA", b"cHRM"))
     icc = chunks.get(b"iCCP", b"")
     with suppress(zlib.error):  # a broken one stays compressed, and never counts as sRGB
         icc = zlib.decompressobj().decompress(icc.partition(b"\0")[2][1:], _MAX_PROFILE_BYTES)  # name, zero, method
@@ -174,7 +183,9 @@ def _png(data: bytes) -> Header:
         orientation=_orientation(chunks.get(b"eXIf", b"")),
         frames=2 if b"acTL" in chunks else 1,
         icc=icc,
-        cicp=cicp,
+        cicp=None if cicp is None else tuple(cicp),
+        gamma=gamma,
+        chromaticities=chromaticities,
         missing="" if b"IEND" in chunks else "its IEND chunk",
     )
 
@@ -346,28 +357,48 @@ def _orientation(block: bytes) -> int:
         return 1
 
 
-# WebP -----------------------------------------------------------------------------------------------------------------
+# WebP, AVIF, HEIC -----------------------------------------------------------------------------------------------------
 
 
 def _webp(data: bytes) -> Header:
     lacking = 8 + struct.unpack_from("<I", data, 4)[0] - len(data)
     if lacking > 0:
         raise SourceError("truncated", f"the file lacks {lacking} bytes of its RIFF block")
-    from PIL import Image, WebPImagePlugin
+    return _by_pillow("webp", data)
 
+
+def _by_pillow(name: str, data: bytes) -> Header:
+    from PIL import AvifImagePlugin, Image, WebPImagePlugin
+
+    readers: dict[str, Any] = {"webp": WebPImagePlugin.WebPImageFile, "avif": AvifImagePlugin.AvifImageFile}
     try:
-        picture = WebPImagePlugin.WebPImageFile(io.BytesIO(data))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise _corrupt(f"the WebP file has no picture ({type(error).__name__})") from error
-    facts = picture.info
+        picture = readers[name](io.BytesIO(data))
+    except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
+        raise _corrupt(f"the {name} file has no picture ({type(error).__name__})") from error
+    facts, (width, height) = picture.info, picture.size
     return Header(
-        "webp",
-        *picture.size,
+        name,
+        width,
+        height,
         has_alpha=picture.mode == "RGBA",
         orientation=_orientation(facts.get("exif", b"")),
         frames=picture.n_frames,
         icc=facts.get("icc_profile", b""),
     )
+
+
+def _avif(data: bytes) -> Header:
+    header, (bits, points) = _by_pillow("avif", data), avif_facts(data)
+    return replace(header, bits=bits, cicp=None if header.icc or points is None else (*points, 0, 1))
+
+
+def _heic(data: bytes) -> Header:
+    facts, (width, height), mode, frames = open_heic(data)
+    icc, points = facts.get("icc_profile") or b"", facts.get("nclx_profile")
+    cicp = None if icc or not points else (points["color_primaries"], points["transfer_characteristics"], 0, 1)
+    frames, has_alpha = frames + (data[8:12] in SEQUENCES), "A" in mode
+    colours: dict[str, Any] = {"icc": icc, "cicp": cicp}
+    return Header("heic", width, height, facts["bit_depth"], has_alpha=has_alpha, frames=frames, **colours)
 
 
 # BMP ------------------------------------------------------------------------------------------------------------------
@@ -389,18 +420,18 @@ def _bmp(data: bytes) -> Header:
 # The formats ----------------------------------------------------------------------------------------------------------
 
 
-_FORMATS: dict[str, tuple[tuple[bytes, ...], Callable[[bytes], Header]]] = {
-    "jpeg": ((b"\xff\xd8\xff",), _jpeg),
-    "png": ((b"\x89PNG\r\n\x1a\n",), _png),
-    "tiff": (_TIFF_MAGIC, _tiff),
-    "webp": ((b"RIFF",), _webp),
-    "bmp": ((b"BM",), _bmp),
+_FORMATS: dict[str, tuple[bytes, Callable[[bytes], Header]]] = {
+    "jpeg": (rb"\xff\xd8\xff", _jpeg),
+    "png": (rb"\x89PNG\r\n\x1a\n", _png),
+    "tiff": (rb"II\*\0|MM\0\*", _tiff),
+    "webp": (rb"RIFF", _webp),
+    "bmp": (rb"BM", _bmp),
+    "avif": (rb"....ftyp(?:avi[fs]|mif1....(?:....){0,9}?avif)", _avif),  # mif1 names the codec among the next brands
+    "heic": (rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1)", _heic),
 }
 """First bytes and reader of each format."""
 
 _OTHER_FORMATS = {
-    "AVIF": rb"....ftypavi[fs]",
-    "HEIC": rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1)",
     "JPEG XL": rb"\xff\x0a|\0\0\0\x0cJXL ",
     "JPEG 2000": rb"\xff\x4f\xff\x51|\0\0\0\x0cjP  ",
     "GIF": rb"GIF8",

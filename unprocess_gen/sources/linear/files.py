@@ -13,7 +13,7 @@ from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.linear.exr import decode_exr
-from unprocess_gen.sources.linear.pixels import Light, linear_pixels, linear_source
+from unprocess_gen.sources.linear.pixels import Light, linear_photograph, linear_pixels
 from unprocess_gen.sources.linear.radiance import decode_radiance
 from unprocess_gen.sources.raw.mosaics import mosaic_pixels
 
@@ -30,7 +30,7 @@ def read_linear_source(config: SourceConfig, content: bytes, name: str) -> Photo
     light = linear_pixels(decoded.pixels)
     if light.shape[0] * light.shape[1] > config.max_pixels:
         raise SourceError("too_large", f"is {list(light.shape)}; expected source.max_pixels={config.max_pixels}")
-    return Photograph(light, 1, note=decoded.note, source=linear_source(config, light, decoded.primaries))
+    return linear_photograph(config, light, decoded.primaries, decoded.note)
 
 
 def _decode_npy(content: bytes, max_pixels: int) -> Light:

@@ -16,6 +16,7 @@ from unprocess_gen.simulation.plan import PRIMARIES, SourcePlan
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.primaries import PRIMARIES as CHROMATICITIES
 from unprocess_gen.simulation.reference.primaries import to_camera
+from unprocess_gen.sources.image.decode import Photograph
 
 SRGB = "srgb"
 """Primaries of files that state none."""
@@ -64,6 +65,7 @@ def linear_pixels(pixels: NDArray[Any]) -> NDArray[np.float32]:
     return light
 
 
-def linear_source(config: SourceConfig, light: Srgb, stated: str = SRGB) -> SourcePlan:
-    """Source of a plan: its downscaling, primaries, which the settings give or the file states, and its digest."""
-    return SourcePlan(config.downscale, "off", primaries=config.primaries or stated, pixels_xxh3=array_xxh3(light))
+def linear_photograph(config: SourceConfig, light: Srgb, stated: str = SRGB, note: str = "") -> Photograph:
+    """Light with its digest and the source of its plan: downscaling, and primaries, given or stated by the file."""
+    source = SourcePlan(config.downscale, "off", primaries=config.primaries or stated)
+    return Photograph(light, 1, note=note, source=source, pixels_xxh3=array_xxh3(light))

@@ -1,0 +1,50 @@
+"""Decode HEIC by libheif (pillow-heif), and read what Pillow does not say of AVIF.
+
+Libheif rotates pixels, and conceals damage of them: only the recorded digest of the pixels shows it.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.errors import SourceError
+
+SEQUENCES = b"hevc", b"hevx", b"msf1"
+"""Brands of sequences of pictures in HEIC."""
+
+
+def open_heic(data: bytes, is_decoded: bool = False) -> Any:
+    """Read facts, size, mode and number of pictures of a HEIC file, or its codes as stored, [H, W] or [H, W, 3 or 4].
+
+    SourceError if libheif cannot, or is not installed.
+    """
+    if find_spec("pillow_heif") is None:
+        problem = "HEIC is read by pillow-heif; in the repository, run: pip install '.[heic]', or convert it to JPEG"
+        raise SourceError("unsupported", problem)
+    import pillow_heif
+
+    try:
+        picture = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, hdr_to_16bit=False)
+        return np.asarray(picture) if is_decoded else (picture.info, picture.size, picture.mode, len(picture))
+    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError, LookupError) as error:
+        raise SourceError("corrupt", f"libheif cannot read the file ({type(error).__name__})") from error
+
+
+def avif_facts(data: bytes) -> tuple[int, tuple[int, int] | None]:
+    """Bits of the codes of an AVIF file, and code points of primaries and transfer if it states them."""
+    config, points = re.search(rb"av1C\x81.(.)", data, re.DOTALL), re.search(rb"colrnclx(..)(..)", data, re.DOTALL)
+    flags = config[1][0] if config else 0
+    bits = 8 if not flags & 0x40 else 12 if flags & 0x20 else 10  # high_bitdepth, twelve_bit
+    return bits, (int.from_bytes(points[1]), int.from_bytes(points[2])) if points else None
+
+
+def widened(codes: Srgb, bits: int) -> Srgb:
+    """Codes of 10 or 12 bits as those of 16, to the nearest."""
+    white, wide = 2**bits - 1, codes.astype(np.uint32)
+    return np.asarray((wide * 65535 + white // 2) // white, np.uint16)
