@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from unprocess_gen.dataset.inputs import flip
     from unprocess_gen.dataset.reader import RawPairs, Sample
     from unprocess_gen.dataset.sampler import EpochSampler
-    from unprocess_gen.dataset.training import noise_std, pack, random_crop, to_light
+    from unprocess_gen.dataset.training import noise_std, pack, to_light
     from unprocess_gen.pipeline.live import LivePairs, LiveSample
     from unprocess_gen.simulation.plan import Plan
 
@@ -66,7 +66,6 @@ __all__ = [
     "noise_std",
     "pack",
     "plan_image",
-    "random_crop",
     "replay",
     "to_light",
     "verify",
@@ -85,7 +84,7 @@ _MODULES = {
     "dataset.inputs": ("flip",),
     "dataset.reader": ("RawPairs", "Sample"),
     "dataset.sampler": ("EpochSampler",),
-    "dataset.training": ("noise_std", "pack", "random_crop", "to_light"),
+    "dataset.training": ("noise_std", "pack", "to_light"),
     "pipeline.live": ("LivePairs", "LiveSample"),
     "simulation.plan": ("Plan",),
 }

@@ -23,7 +23,6 @@ from unprocess_gen.api import array_pixels
 from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.profile import MARK, rounded
 from unprocess_gen.config.composition import load_config
-from unprocess_gen.config.overrides import overrides_of_mapping
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.arrays import Float, Srgb, last_code
 from unprocess_gen.core.errors import ConfigError
@@ -299,17 +298,12 @@ class Problem:
 
 
 def fit_pairs(
-    make: Callable[..., Any],
-    pairs: Iterable[tuple[ArrayLike, ArrayLike]],
-    config: Sequence[str] | Mapping[str, Any],
-    **options: Any,
+    make: Callable[..., Any], pairs: Iterable[tuple[ArrayLike, ArrayLike]], config: Sequence[str], **options: Any
 ) -> CameraFit:
     """Fit the noise that ``make`` makes of a config and keyword arguments; see `CameraNoise.fit`."""
     require("scipy", "CameraNoise.fit needs scipy", "calibrate")
-    if isinstance(config, str | Config):
+    if isinstance(config, str | Config | Mapping):
         raise ConfigError(f"CameraNoise.fit: config is a {type(config).__name__}; expected a list of overrides")
-    if isinstance(config, Mapping):
-        config = overrides_of_mapping(config)
     given = [word for word in config if word.lstrip("+~").startswith("noise")] + [*(FITTED & set(options))]
     if given:
         raise ConfigError(f"CameraNoise.fit: {', '.join(given)}: is fitted; expected other settings; leave it out")

@@ -128,10 +128,7 @@ class CameraNoise:
 
     @classmethod
     def fit(
-        cls,
-        pairs: Iterable[tuple[ArrayLike, ArrayLike]],
-        config: Sequence[str] | Mapping[str, Any] = ("gains=fixed",),
-        **options: Any,
+        cls, pairs: Iterable[tuple[ArrayLike, ArrayLike]], config: Sequence[str] = ("gains=fixed",), **options: Any
     ) -> CameraFit:
         """Fit the noise to real pairs of a noisy and a clean picture.
 
@@ -140,8 +137,8 @@ class CameraNoise:
         pairs : iterable of (array_like, array_like)
             Noisy and clean picture of one scene, in this order, uint8 or uint16 [H, W, 3], of one camera and ISO. All
             pairs together are cut to 2**19 pixels, each to its middle.
-        config : sequence of str, or mapping
-            What `load_config` takes, for everything but noise. ``isp=`` and ``camera=`` fix what is fitted otherwise.
+        config : sequence of str
+            Hydra overrides of everything but noise. ``isp=`` and ``camera=`` fix what is fitted otherwise.
         **options : Any
             Keyword arguments of `CameraNoise` that are known, such as ``jpeg=75``.
 

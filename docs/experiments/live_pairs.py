@@ -147,27 +147,13 @@ def measure_decoding(out: Path, photos: Path, rounds: int) -> dict[str, Any]:
     return {**both, "ratio": round(ratio, 3), "goal": DECODE_GOAL}
 
 
-class Crops:
-    """Serve random crops of stored frames."""
-
-    def __init__(self, folder: Path) -> None:
-        self.pairs, self.rng = ug.RawPairs(folder), np.random.default_rng(0)
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, item: tuple[int, int]) -> list[np.ndarray]:
-        clean, noisy, _ = self.pairs[item[1]]
-        return ug.random_crop([clean, noisy], SIDE, lambda count: int(self.rng.integers(count)))
-
-
 def measure_training(out: Path, photos: Path, cache: Path, rounds: int) -> dict[str, Any]:
     """Compare sources of items, and the time of a training step of the tutorial's network for each item."""
     results: dict[str, Any] = {}
     for name, settings in (("two numbers", TWO), ("physical, night", NIGHT)):
         folder = dataset(out, photos, settings)
         sources = {
-            "files": Crops(folder),
+            "files": ug.RawPairs(folder, patch=SIDE),
             "live, cache": ug.LivePairs(folder, cache=cache, patch=SIDE),
             "live, 16 patches a decode": ug.LivePairs(folder, patch=SIDE, patches=PATCHES),
             "live, a decode each": ug.LivePairs(folder, patch=SIDE),

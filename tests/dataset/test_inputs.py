@@ -141,7 +141,7 @@ def test_flip_of_an_item_flips_all_its_arrays(how: str, tmp_path: Path, make: Ma
         ({"inputs": "planes"}, "inputs='planes': unknown; expected mosaic, packed"),
         ({"noise_map": True}, "noise_map=True: has no effect on samples"),
         ({"rows": True}, "rows=True: has no effect on samples"),
-        ({"flip": True}, "flip=True: a flip leaves out sites; expected patch"),
+        ({"flip": True}, "flip=True: leaves out sites; expected patch"),
         ({"patch": 7}, "patch=7: out of range; expected an even number from 2"),
     ],
 )

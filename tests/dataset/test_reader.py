@@ -146,6 +146,12 @@ def test_slice_is_a_reader_of_its_pairs(dataset: Path) -> None:
     assert digest(pickle.loads(pickle.dumps(part)), 1) == digests(dataset)[5]
 
 
+@pytest.mark.parametrize(("epoch", "error"), [(-1, IndexError), (2**14, IndexError), ("00000001", TypeError)])
+def test_epochs_are_checked_without_a_patch(dataset: Path, epoch: Any, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        RawPairs(dataset)[epoch, 0]
+
+
 @pytest.fixture(scope="module")
 def sweep(make: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two datasets and a job that left none, in another order than their names."""

@@ -44,23 +44,6 @@ def test_noise_map_is_zero_where_a_fitted_variance_is_negative() -> None:
         ug.noise_std([240], {"black_level_dn": 240, "white_level_dn": 4095})
 
 
-def test_crops_begin_at_even_sites_and_reach_both_ends() -> None:
-    frame = np.arange(10 * 14).reshape(10, 14)
-    corners = {
-        int(ug.random_crop([frame], 4, lambda count, pick=pick: min(pick, count - 1))[0][0, 0]) for pick in range(6)
-    }
-
-    rows, columns = zip(*(divmod(corner, 14) for corner in corners), strict=True)
-    assert set(rows) == {0, 2, 4, 6}
-    assert set(columns) == {0, 2, 4, 6, 8, 10}
-
-
-@pytest.mark.parametrize("side", [0, 3, 12])
-def test_impossible_crop_is_refused(side: int) -> None:
-    with pytest.raises(ValueError, match=f"side={side}: expected an even number of at most 10"):
-        ug.random_crop([np.zeros((10, 14))], side, np.random.default_rng(0).integers)
-
-
 def test_batches_have_one_type_in_each_column(dataset: Path) -> None:
     """As PyTorch's ``default_collate`` needs it."""
     pairs = ug.RawPairs(dataset)

@@ -240,35 +240,27 @@ def path_hint(word: str) -> str:
     return f"; {word} is a file or folder: write source.root={word}"
 
 
+SPLIT_LIST = re.compile(r"\S+?=(?:[\[{][^=]*[\]}]|(?:[^\s=]+, )+\S+)")
+"""A setting whose list the shell splits at blanks."""
+
+EXPANDED = re.compile(r"(\S+?=\[*)[\w-]+:[^{}\[\]:\s]+(\]*)(?: \1[\w-]+:[^{}\[\]:\s]+\2(?!\S))+")
+"""Settings to which the shell expands a mapping: ``split={a:1,b:2}`` becomes ``split=a:1 split=b:2``."""
+
+
 def _quotes_hint(words: Sequence[str], word: str) -> str:
     """Remedy for a part of a list that the shell split at blanks; empty for other words."""
-    at = words.index(word)
-    start = next((index for index in range(at, -1, -1) if "=" in words[index]), None)
-    if start is None or not (_is_open(words[start]) or words[start].endswith(",")):
-        return ""
-    end = start + 1
-    while end < len(words) and "=" not in words[end] and (_is_open(" ".join(words[start:end])) or end <= at):
-        end += 1
-    return f"; write {shlex.quote(' '.join(words[start:end]))} in quotes"
-
-
-def _is_open(text: str) -> bool:
-    """True if a bracket of a text is not closed."""
-    return sum(map(text.count, "[{(")) > sum(map(text.count, "]})"))
+    lists = SPLIT_LIST.findall(" ".join(words))
+    setting = next((text for text in lists if word in text.split()), "")
+    return f"; write {shlex.quote(setting)} in quotes" if setting else ""
 
 
 def _refuse_expanded_braces(overrides: Sequence[str]) -> None:
-    """Refuse a mapping that the shell expanded to several overrides: ``split={a:1,b:2}`` without quotes."""
-    parts = [re.fullmatch(r"(\S+?=\[*)([\w-]+:[^{}\[\]:]+)(\]*)", text) for text in overrides]
-    items: dict[tuple[str, str], list[str]] = {}
-    for part in filter(None, parts):
-        items.setdefault((part[1], part[3]), []).append(part[2])
-    for (before, after), pairs in items.items():
-        if len(pairs) > 1:
-            written = shlex.quote(f"{before}{{{','.join(pairs)}}}{after}")
-            raise ConfigError(
-                f"{before}{pairs[0]}{after}: {before.partition('=')[0]} is given twice; write {written} in quotes"
-            )
+    """Refuse a mapping that the shell expanded to several overrides."""
+    if found := EXPANDED.search(" ".join(overrides)):
+        before, after = found.groups()
+        pairs = found[0].removeprefix(before).removesuffix(after).replace(f"{after} {before}", ",")
+        key, written = before.partition("=")[0], shlex.quote(f"{before}{{{pairs}}}{after}")
+        raise ConfigError(f"{found[0].partition(' ')[0]}: {key} is given twice; write {written} in quotes")
 
 
 def _setting_hint(verb: Verb, word: str) -> str:

@@ -171,11 +171,9 @@ def _are_shares(value: Any) -> bool:
 
 
 def _shares_text(value: Any) -> str:
-    """Write shares, with their sum if it is not 1."""
-    text = value_text(value)[:80]
-    if not isinstance(value, dict) or not all(map(is_number, value.values())) or abs(sum(value.values()) - 1) <= 1e-9:
-        return text
-    return f"{text} (sum {sum(value.values()):.6g})"
+    """Write shares with their sum."""
+    text, shares = value_text(value)[:80], value.values() if isinstance(value, dict) else ()
+    return f"{text} (sum {sum(shares):.6g})" if shares and all(map(is_number, shares)) else text
 
 
 SPLIT = Limit(

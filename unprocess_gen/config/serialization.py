@@ -15,14 +15,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import yaml
 
-from unprocess_gen.config.interpretation import (
-    canonical_patch,
-)
+from unprocess_gen.config.interpretation import canonical_patch
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import (
-    GROUPS,
-    Config,
-)
+from unprocess_gen.config.schema import GROUPS, Config
 from unprocess_gen.config.settings import groups_in, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, one_of, refusal

@@ -100,13 +100,6 @@ def frame_word(frame: int, epoch: int = 0) -> int:
     return epoch << 18 | frame
 
 
-def check_epoch(epoch: int) -> int:
-    """Epoch of an item; IndexError out of range."""
-    if not 0 <= epoch < EPOCHS:
-        raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
-    return epoch
-
-
 def philox4x32(counter: tuple[NDArray[np.uint64], ...], key: int) -> tuple[Words, Words, Words, Words]:
     """Compute Philox4x32-10, as in Random123 (known answers: its ``kat_vectors``).
 
@@ -152,12 +145,6 @@ def crop_words(key: int, patch: int, level: int, draw: int, word_3: int, crop: i
     """
     number = _hash64(f"unprocess_gen crop 1\0{key}\0{patch}\0{level}\0{draw}\0{word_3}\0{crop}")
     return number >> 32, number & 0xFFFFFFFF
-
-
-def flip_bits(key: int, patch: int, level: int, draw: int, word_3: int, crop: int = 0) -> tuple[bool, bool, bool]:
-    """Draw whether a crop is flipped in each of three ways; arguments as of `crop_words`."""
-    number = _hash64(f"unprocess_gen flip 1\0{key}\0{patch}\0{level}\0{draw}\0{word_3}\0{crop}")
-    return bool(number & 1), bool(number & 2), bool(number & 4)
 
 
 def even_corner(place: Sequence[int], side: int, height: int, width: int) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import PACKED
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.random_streams import even_corner
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.development import FILTERS, DevelopmentParameters
@@ -24,7 +25,7 @@ FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
     "vertical": lambda sites: sites[..., ::-1, :],
     "transpose": lambda sites: np.swapaxes(sites, -1, -2),
 }
-"""Ways to flip, in the order of `random_streams.flip_bits`."""
+"""Ways to flip, in the order in which an item is flipped."""
 
 PICTURES = ("srgb", LINEAR_RGB)
 """Targets whose last axis is the channel; others have the sites of the frames."""
@@ -52,58 +53,51 @@ class Options:
         if self.patch is not None and (self.patch < 2 or self.patch % 2):
             raise ConfigError(f"{self.reader}: patch={self.patch}: out of range; expected an even number from 2")
         if self.flip and self.patch is None:
-            raise ConfigError(
-                f"{self.reader}: flip=True: a flip leaves out sites; expected patch, which all items have"
-            )
+            raise ConfigError(f"{self.reader}: flip=True: leaves out sites; expected patch, which all items have")
 
     @property
     def side(self) -> int | None:
         """Side of the square to cut: a flip may leave out a site on each side."""
         return self.patch if self.patch is None else self.patch + 2 * self.flip
 
-    def check_side(self, height: int, width: int) -> None:
-        """Raise ConfigError if a pair is smaller than the square."""
-        if self.side is not None and self.side > min(height, width):
-            sites = f" (patch={self.patch}, and 2 more for flip=True)" if self.flip else ""
-            raise ConfigError(
-                f"{self.reader}: patch={self.side}: exceeds a pair of {width} x {height} pixels{sites}; expected at "
-                "most its shorter side"
-            )
+    def place(self, words: tuple[int, int], height: int, width: int) -> tuple[int, int]:
+        """Corner of the square in a pair, which random words choose; ConfigError if the pair is smaller."""
+        side = self.side or 0
+        if side > min(height, width):
+            problem = f"patch={self.patch}: exceeds a pair of {width} x {height} pixels"
+            less = ", less 2 for flip=True" if self.flip else ""
+            raise ConfigError(f"{self.reader}: {problem}; expected at most its shorter side{less}")
+        return even_corner(words, side, height, width)
 
     def item(
-        self, sample: Any, columns: Row, flips: tuple[bool, ...], development: Callable[[], DevelopmentParameters]
+        self, sample: Any, columns: Row, words: tuple[int, int], development: Callable[[], DevelopmentParameters]
     ) -> Any:
         """Sample or dict of a pair that has been cut, where ``columns`` are levels, pattern, layout and noise."""
-        if self.flip:
-            hows = tuple(how for how, is_drawn in zip(FLIPS, flips, strict=True) if is_drawn)
-            sample = _flipped_sample(sample, columns, hows)
-            sample = cut(sample, columns, (0, 0), self.patch or 0)
+        if self.flip:  # by the lowest bits, which do not decide the corner
+            hows = tuple(how for bit, how in enumerate(FLIPS) if words[0] >> bit & 1)
+            sample = cut(_flipped_sample(sample, columns, hows), columns, (0, 0), self.patch or 0)
         if self.inputs is None:
             return sample
+        frames = {"noisy": sample.noisy, "clean": sample.clean}
         arrays = {
-            name: self._light(frame, columns) for name, frame in (("noisy", sample.noisy), ("clean", sample.clean))
+            name: to_light(frame, columns) if frame.dtype == np.uint16 else frame for name, frame in frames.items()
         }
         if self.clip_black:
             arrays = {name: np.maximum(light, 0) for name, light in arrays.items()}
         if self.noise_map:
-            arrays["noise_std"] = self._layout(frame_noise_std(sample.noisy, columns, of_white=True), columns)
-        for name, target in sample.targets.items():
-            picture = _even(target) if self.inputs == PACKED else target
-            arrays[name] = picture if name in PICTURES else self._layout(target, columns)
+            arrays["noise_std"] = frame_noise_std(sample.noisy, columns, of_white=True)
+        arrays = {name: self._layout(name, array, columns) for name, array in (arrays | sample.targets).items()}
         row = {"row": sample.row} if self.rows else {}
         return {**arrays, "development": development(), **row}
 
-    def _light(self, frame: NDArray[Any], columns: Row) -> NDArray[np.float32]:
-        light = to_light(frame, columns) if frame.dtype == np.uint16 else frame
-        return self._layout(light, columns)
-
-    def _layout(self, sites: NDArray[Any], columns: Row) -> NDArray[Any]:
-        """Mosaic or planes, as ``inputs`` says, in an array of its own."""
-        pattern, is_packed = str(columns["pattern"]), columns["layout"] == PACKED
-        if is_packed and self.inputs == PACKED:
+    def _layout(self, name: str, sites: NDArray[Any], columns: Row) -> NDArray[Any]:
+        """Picture, mosaic or planes, as ``inputs`` says, in an array of its own."""
+        pattern, is_picture = str(columns["pattern"]), name in PICTURES
+        if columns["layout"] == PACKED and not is_picture:
+            return np.array(sites) if self.inputs == PACKED else cfa.unpack(sites, pattern)
+        if self.inputs == "mosaic":
             return np.array(sites)
-        mosaic = cfa.unpack(sites, pattern) if is_packed else np.array(sites)
-        return cfa.pack(_even(mosaic), pattern) if self.inputs == PACKED else mosaic
+        return np.array(_even(sites)) if is_picture else cfa.pack(_even(sites), pattern)
 
 
 def cut(sample: Any, columns: Row, corner: tuple[int, int], side: int) -> Any:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from unprocess_gen.core.arrays import Float, Frame
-from unprocess_gen.core.sequences import first_of
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.simulation.reference import cfa, isp
@@ -24,39 +23,34 @@ NOISE = "camera", "noise", "iso", "scene", "exposure_ratio", "a_dn", "dark_varia
 """Columns that are shown of each pair, after its key and source."""
 
 
-def pair_html(clean: Frame | Float, noisy: Frame | Float, row: Row, side: int | None = None) -> str:
+def pair_html(clean: Frame | Float, noisy: Frame | Float, row: Row) -> str:
     """Show two mosaics in DN, their sites white-balanced, the noisy one also developed, and columns of the row."""
-    plan, side = plan_from_row(row), side or SIDE_PX
-    frames = {"clean": _thumbnail(clean, side), "noisy": _thumbnail(noisy, side)}
+    plan = plan_from_row(row)
+    frames = {"clean": _thumbnail(clean), "noisy": _thumbnail(noisy)}
     gains = cfa.mosaic(np.broadcast_to(plan.camera.inverse_gains, (*frames["noisy"].shape, 3)), plan.sensor.pattern)
     light = {name: isp.to_light(raw, plan) / gains for name, raw in frames.items()}
     pictures = {name: np.sqrt(np.clip(sites, 0, 1)) for name, sites in light.items()}
     pictures["developed"] = isp.develop(frames["noisy"], plan)
-    figures = "".join(_figure(name, values, side) for name, values in pictures.items())
+    figures = "".join(_figure(name, values) for name, values in pictures.items())
     table = _table({name: row.get(name) for name in ("key", "source", *NOISE)})
     return f'<div style="display:flex;flex-wrap:wrap;gap:12px;align-items:flex-start">{figures}{table}</div>'
 
 
-def pairs_html(title: str, rows: Sequence[Row], pairs: Sequence[str]) -> str:
-    """Show a reader: its title, the values that columns have in some rows, if they differ, and pairs."""
-    values = {name: {_text(row.get(name)) for row in rows} for name in ("dataset", "split", *NOISE)}
-    differing = {name: first_of(sorted(texts, key=len)) for name, texts in values.items() if len(texts) > 1}
-    return f"<p><code>{html.escape(title)}</code></p>{_table(differing)}{''.join(pairs)}"
-
-
-def _thumbnail(raw: Frame | Float, side: int) -> Any:
+def _thumbnail(raw: Frame | Float) -> Any:
     """Every n-th tile of a mosaic, which keeps the colour and the noise of sites; an odd last line is completed."""
     even = np.pad(raw, [(0, length % 2) for length in raw.shape], mode="reflect")
-    step = -(-max(even.shape) // side)
+    step = -(-max(even.shape) // SIDE_PX)
     rows, columns = (np.flatnonzero(np.arange(length) // 2 % step == 0) for length in even.shape)
     return even[rows][:, columns]
 
 
-def _figure(name: str, values: Float, side: int) -> str:
+def _figure(name: str, values: Float) -> str:
     """Picture of values in [0, 1] as PNG; small ones are enlarged by an integer factor."""
     content, codes = io.BytesIO(), isp.to_codes(values).astype(np.uint8)
     Image.fromarray(codes).save(content, "PNG")
-    style = f"width:{codes.shape[1] * max(1, side // max(codes.shape[:2]))}px;max-width:none;image-rendering:pixelated"
+    style = (
+        f"width:{codes.shape[1] * max(1, SIDE_PX // max(codes.shape[:2]))}px;max-width:none;image-rendering:pixelated"
+    )
     source = f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
     return f'<figure style="margin:0"><img style="{style}" src="{source}"><figcaption>{name}</figcaption></figure>'
 

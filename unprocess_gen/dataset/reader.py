@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-import operator
+from collections import namedtuple
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.fields import number_or_text
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
-from unprocess_gen.core.random_streams import check_epoch, crop_words, even_corner, flip_bits, frame_word
+from unprocess_gen.core.random_streams import crop_words, frame_word
 from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.development import development_parameters
@@ -93,18 +93,13 @@ class Sample(_Frames):
         name, frame = type(self).__name__, self.noisy
         return f"{name}({frame.dtype} {list(frame.shape)}, key={self.row.get('key')}, dataset={self.dataset!r})"
 
-    def _repr_html_(self, side: int | None = None) -> str:
+    def _repr_html_(self) -> str:
         from unprocess_gen.dataset.notebook import pair_html  # imports OpenCV
 
-        return pair_html(mosaic_dn(self.clean, self.row), mosaic_dn(self.noisy, self.row), self.row, side)
+        return pair_html(mosaic_dn(self.clean, self.row), mosaic_dn(self.noisy, self.row), self.row)
 
 
-class _FramesAndTargets(NamedTuple):
-    clean: Frame
-    noisy: Frame
-    row: dict[str, Any]
-    targets: Mapping[str, NDArray[Any]]
-
+_FramesAndTargets = namedtuple("_FramesAndTargets", "clean noisy row targets")
 
 _TEXTS = {column.name for column in COLUMNS if column.type is number_or_text}
 
@@ -224,40 +219,36 @@ class RawPairs(PairTable):
         self._options = Options("RawPairs", patch, flip, inputs, noise_map, rows, clip_black)
         super().__init__(open_datasets("RawPairs", path, split, _Dataset))
         self.path = any_path(path) if isinstance(path, DatasetPath) else tuple(map(any_path, path))
-        if inputs is not None:
-            _check_targets(self._datasets)
-
-    def __len__(self) -> int:
-        return len(self._numbers)
+        targets = sorted(set().union(*(dataset.targets for dataset in self._datasets)))
+        if inputs is not None and len(targets) > 1:
+            problem = f"the datasets differ in targets ({' and '.join(targets)})"
+            raise ConfigError(f"RawPairs: inputs={inputs!r}: {problem}; expected the same in all; use inputs=None")
 
     def __repr__(self) -> str:
         paths = self.path if isinstance(self.path, tuple) else (self.path,)
         names = first_of([repr(str(path)) for path in paths])
         return f"RawPairs({f'[{names}]' if isinstance(self.path, tuple) else names}, length={len(self)})"
 
-    def __iter__(self) -> Iterator[Sample]:
+    def __iter__(self) -> Iterator[Any]:
         return (self[number] for number in range(len(self)))
-
-    @overload
-    def __getitem__(self, number: SupportsIndex | str | tuple[int, int | str]) -> Sample: ...
 
     @overload
     def __getitem__(self, number: slice) -> RawPairs: ...
 
-    def __getitem__(self, number: Any) -> Any:  # a dict instead of a Sample with inputs
+    @overload
+    def __getitem__(self, number: SupportsIndex | str | tuple[int, int | str]) -> Any: ...
+
+    def __getitem__(self, number: Any) -> Any:  # a Sample, or a dict with inputs
         if isinstance(number, slice):
             return self._part(self._numbers[number])
-        epoch, number = number if isinstance(number, tuple) else (0, number)
-        position = self._position(number) if isinstance(number, str) else operator.index(number)
+        epoch, position = self._item(number)
         dataset, place = self._place(self._numbers[position])
-        sample, options, flips = self._datasets[dataset].read(place), self._options, (False,) * 3
+        sample, options, words = self._datasets[dataset].read(place), self._options, (0, 0)
         if options.side is not None:
-            sides = [int(sample.row[name] or 0) for name in ("height", "width")]
-            options.check_side(*sides)
-            drawn = _crop_names(sample.row, check_epoch(operator.index(epoch)))
-            sample = cut(sample, sample.row, even_corner(crop_words(*drawn), options.side, *sides), options.side)
-            flips = flip_bits(*drawn)
-        return options.item(sample, sample.row, flips, partial(development_parameters, sample.row))
+            words = _crop_words(sample.row, epoch)
+            corner = options.place(words, int(sample.row["height"]), int(sample.row["width"]))
+            sample = cut(sample, sample.row, corner, options.side)
+        return options.item(sample, sample.row, words, partial(development_parameters, sample.row))
 
     def __getitems__(self, numbers: Sequence[Any]) -> list[Any]:
         """Read a batch as PyTorch's DataLoader asks for it, in items that its default ``collate_fn`` stacks.
@@ -268,10 +259,10 @@ class RawPairs(PairTable):
         return [stackable(self[number]) for number in numbers]
 
 
-def _crop_names(row: Row, epoch: int) -> tuple[int, int, int, int, int]:
-    """Numbers that name the random crop of a pair in an epoch, as `random_streams.crop_words` takes them."""
+def _crop_words(row: Row, epoch: int) -> tuple[int, int]:
+    """Random words of the crop of a pair in an epoch, as `LivePairs` draws them."""
     patch, level, draw, frame = (int(row[name] or 0) for name in ("patch", "level", "draw", "frame"))
-    return int(str(row["stream_key"]), 16), patch, level, draw, frame_word(frame, epoch)
+    return crop_words(int(str(row["stream_key"]), 16), patch, level, draw, frame_word(frame, epoch))
 
 
 class DatasetRows:
@@ -374,14 +365,6 @@ def check_split(reader: str, split: str | None, splits: set[str]) -> None:
     if split is not None and split not in names:
         expected = f"expected one of {', '.join(names)}" if names else "there are no splits; set split={…}"
         raise ConfigError(f"{reader}: split={split[:40]!r}: no pair is in it; {expected}")
-
-
-def _check_targets(datasets: Sequence[_Dataset]) -> None:
-    """Raise ConfigError if the dicts of several datasets would differ in their keys."""
-    first = {targets: dataset.name for dataset in reversed(datasets) for targets in dataset.targets}
-    if len(first) > 1:
-        kinds = "; ".join(f"{name}: {targets} targets" for targets, name in first.items())
-        raise ConfigError(f"RawPairs: the datasets differ in targets ({kinds}); expected one; use inputs=None")
 
 
 def dataset_folders(path: AnyPath) -> list[AnyPath]:

@@ -66,9 +66,7 @@ class EpochSampler:
         self.state = (epoch, 0)
 
     def __repr__(self) -> str:
-        order = f"length={self._blocks * self._block}, seed={self._seed}, shuffle={self._shuffle}"
-        share = f"rank={self._rank}, world={self._world}, block={self._block}"
-        return f"EpochSampler({order}, {share}, state={self.state})"
+        return f"EpochSampler(length={self._blocks * self._block}, block={self._block}, state={self.state})"
 
     def __len__(self) -> int:
         """Count the items of an epoch, of this process."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import bisect
 import copy
+import html
 import itertools
+import operator
 import re
 from collections.abc import Callable, Sequence
 from typing import Any, Self
@@ -13,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, UnknownKeyError
+from unprocess_gen.core.random_streams import EPOCHS
 from unprocess_gen.core.sequences import evenly_spaced, first_of
 from unprocess_gen.core.suggestions import did_you_mean
 from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.row import COLUMN_NAMES, KEY_TEXT
 
 MANY = 64
-"""Keys of which an error names some; rows that the HTML of a reader is made from."""
+"""Keys of which an error names some."""
 
 
 class PairTable:
@@ -85,37 +88,35 @@ class PairTable:
             name: [value] if isinstance(value, str) or not np.iterable(value) else [*value]
             for name, value in columns.items()
         }
-        positions = [
-            position
-            for position, row in enumerate(self.rows)
-            if all(row[name] in values for name, values in wanted.items()) and (test is None or test(row))
-        ]
+        positions, seen = list[int](), {name: set[str]() for name in columns}
+        for position, row in enumerate(self.rows):
+            for name, texts in seen.items():
+                texts.add(repr(row[name]))
+            if all(row[name] in values for name, values in wanted.items()) and (test is None or test(row)):
+                positions.append(position)
         if not positions:
-            given = [*(["a function"] if test else []), *(f"{name}={value!r:.60}" for name, value in columns.items())]
-            values = {name: {row[name] for row in self.rows} for name in columns}
-            expected = [
-                f"{name}={first_of(sorted(map(repr, seen), key=len))}"
-                for name, seen in values.items()
-                if seen and not any(value in wanted[name] for value in seen)
-            ]
-            problem = f"no pair is selected; expected {'; '.join(expected) or 'conditions that a pair meets'}"
-            raise ConfigError(f"select: {', '.join(given)}: {problem}")
+            given = ", ".join(f"{name}={value!r:.60}" for name, value in columns.items()) or "function"
+            found = "; ".join(
+                f"{name}={first_of(sorted(sorted(texts), key=len))}" for name, texts in seen.items() if texts
+            )
+            raise ConfigError(f"select: {given}: no pair is selected; expected {found or 'what a pair has'}")
         return self._part(self._numbers[positions])
 
     def _repr_html_(self) -> str:
-        from unprocess_gen.dataset.notebook import SIDE_PX, pairs_html  # imports OpenCV
+        pairs = [self[0, number] for number in evenly_spaced(range(len(self)), 3)]  # type: ignore[index]
+        shown = [pair._repr_html_() for pair in pairs if hasattr(pair, "_repr_html_")]
+        return f"<p><code>{html.escape(repr(self))}</code></p>{''.join(shown)}"
 
-        pairs = [self._example(number) for number in range(min(3, len(self._numbers)))]
-        try:
-            rows = evenly_spaced(self.rows, MANY)
-        except ConfigError:  # pairs of overrides have no table
-            rows = []
-        shown = [pair._repr_html_(SIDE_PX // 2) for pair in pairs if hasattr(pair, "_repr_html_")]
-        return pairs_html(repr(self), rows, shown)
+    def __len__(self) -> int:
+        return len(self._numbers)
 
-    def _example(self, number: int) -> Any:
-        """Pair that the HTML shows."""
-        return self[number]  # type: ignore[index]
+    def _item(self, item: Any) -> tuple[int, int]:
+        """Epoch, and number from 0, of an item that a number or key names, with an epoch or without; IndexError."""
+        epoch, number = item if isinstance(item, tuple) else (0, item)
+        number = self._position(number) if isinstance(number, str) else operator.index(number)
+        if not 0 <= operator.index(epoch) < EPOCHS:
+            raise IndexError(f"epoch {epoch} is out of range; expected 0 to {EPOCHS - 1}")
+        return operator.index(epoch), range(len(self))[number]
 
     def _part(self, numbers: NDArray[np.int64]) -> Self:
         """Reader of some of the pairs."""
@@ -138,7 +139,7 @@ class PairTable:
         shown = self._numbers[positions[:MANY]] if len(positions) else [*self._numbers[:1], *self._numbers[-1:]]
         keys = [self._datasets[place].key(number) for place, number in map(self._place, shown)]
         if not len(positions):
-            expected = f"one from {' to '.join(keys)}" if keys else "a reader that has pairs"
+            expected = " to ".join(keys) or "a reader that has pairs"
             raise UnknownKeyError(f"{key!r:.40}: no pair has this key; expected {expected}")
         raise UnknownKeyError(
             f"{key!r}: names {len(positions)} pairs ({first_of(keys)}); expected one; give its complete key, after "

@@ -1,8 +1,7 @@
-"""Prepare frames for training: packed planes, light, noise maps and crops."""
+"""Prepare frames for training: packed planes, light and noise maps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -128,43 +127,6 @@ def frame_noise_std(noisy: Frame, row: Row, *, of_white: bool) -> NDArray[np.flo
     black, span = _levels(row)
     noisy_dn = noisy if noisy.dtype == np.uint16 else noisy * np.float32(span) + np.float32(black)
     return noise_std(noisy_dn, row) / np.float32(span if of_white else 1)
-
-
-def random_crop(frames: Sequence[Frame], side: int, integer: Callable[[int], int]) -> tuple[Frame, ...]:
-    """Cut the same square from each mosaic, at an even row and column, so that the row's CFA pattern holds.
-
-    Parameters
-    ----------
-    frames : sequence of ndarray, [H, W]
-        Mosaics of one size, for example clean and noisy.
-    side : int
-        Side of the square, pixels; even.
-    integer : callable
-        Random integer from 0 to below its argument: ``rng.integers``, or ``lambda n: int(torch.randint(n, ()))``.
-
-    Returns
-    -------
-    tuple of ndarray, [side, side]
-        Views of the frames.
-
-    Raises
-    ------
-    ValueError
-        If the side is odd or does not fit.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import unprocess_gen as ug
-    >>> (crop,) = ug.random_crop([np.zeros((8, 6))], 4, np.random.default_rng(0).integers)
-    >>> crop.shape
-    (4, 4)
-    """
-    height, width = frames[0].shape
-    if side % 2 or not 0 < side <= min(height, width):
-        raise ValueError(f"side={side}: expected an even number of at most {min(height, width)}, the shorter side")
-    y, x = (2 * int(integer((length - side) // 2 + 1)) for length in (height, width))
-    return tuple(frame[y : y + side, x : x + side] for frame in frames)
 
 
 def _levels(row: Row) -> tuple[int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import AnyPath, any_path
-from unprocess_gen.core.random_streams import check_epoch, crop_words, even_corner, flip_bits, frame_word
+from unprocess_gen.core.random_streams import crop_words, frame_word
 from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import TARGETS
@@ -181,15 +180,13 @@ class LivePairs(PairTable):
         return f"LivePairs({names}, length={len(self)}, redraw={self._redraw!r})"
 
     def __getitem__(self, item: Any) -> Any:  # a dict instead of a LiveSample with inputs
-        epoch, number = item if isinstance(item, tuple) else (0, item)
+        number = item[1] if isinstance(item, tuple) else item
         if self._patches > 1 and isinstance(number, str | slice):
-            items = f"an item is one of {self._patches} patches of a pair"
-            raise UnknownKeyError(f"{number!r:.40}: {items}; expected the number of an item, or select(…)")
+            raise UnknownKeyError(f"{number!r:.40}: an item is one patch of a pair; expected its number, or select(…)")
         if isinstance(item, slice):
             return self._part(self._numbers[item])
-        epoch, options = check_epoch(operator.index(epoch)), self._options
-        number = self._position(number) if isinstance(number, str) else operator.index(number)
-        position, crop = divmod(range(len(self))[number], self._patches)
+        epoch, number = self._item(item)
+        position, crop = divmod(number, self._patches)
         if not isinstance(item, tuple | str) and self._redraw != "none":
             self._warn_of_repetition()
         number = int(self._numbers[position])
@@ -200,13 +197,12 @@ class LivePairs(PairTable):
         decode = partial(source.decode, image)
         srgb = decode() if self._cache is None else self._cache.get(image.cache_name, decode)
         plan, patch, make = self._prepared(place, image, srgb, epoch, number)
-        flips = (False,) * 3
+        options, words = self._options, (0, 0)
         if options.side is not None:
-            options.check_side(patch.height, patch.width)
-            words = patch.patch, plan.place.level, plan.place.draw, frame_word(plan.place.frame, epoch), crop
-            y, x = even_corner(crop_words(plan.stream_key, *words), options.side, patch.height, patch.width)
+            drawn = plan.place.level, plan.place.draw, frame_word(plan.place.frame, epoch), crop
+            words = crop_words(plan.stream_key, patch.patch, *drawn)
+            y, x = options.place(words, patch.height, patch.width)
             patch = Patch(options.side, options.side, patch.patch, patch.patch_y + y, patch.patch_x + x)
-            flips = flip_bits(plan.stream_key, *words)
         clean, noisy, counts = make(crop_patch(srgb, patch), patch.origin, epoch)
 
         def pair() -> Pair:
@@ -218,10 +214,7 @@ class LivePairs(PairTable):
         row: Any = LiveRow(partial(image.row, plan, epoch, patch, pair))
         sample = LiveSample(clean, noisy, row, source.name, targets)
         columns = noise_columns(plan) if options.flip or of_white else {}
-        return options.item(sample, columns, flips, partial(development_parameters, plan))
-
-    def _example(self, number: int) -> Any:
-        return self[0, number * self._patches]
+        return options.item(sample, columns, words, partial(development_parameters, plan))
 
     def _part(self, numbers: NDArray[np.int64]) -> Self:
         part = super()._part(numbers)

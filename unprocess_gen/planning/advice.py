@@ -26,36 +26,24 @@ NOUNS = {"camera": "colour matrix", "sensor": "set of raw levels", "noise": "noi
 
 def warnings(config: Config) -> list[str]:
     """Return the sentences about a config that its user should read before a run."""
-    checks = dark_scene_warning, ignored_scene_warning, overridden_warning, sensor_warning, bits_warning
+    checks = scene_warning, overridden_warning, sensor_warning, bits_warning
     return [sentence for check in checks if (sentence := check(config))]
 
 
-def dark_scene_warning(config: Config) -> str:
-    """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text."""
-    if is_physical(config.noise):
-        return ""
-    ratio = EXPOSURE_RATIO.parse("scene.exposure_ratio", config.scene.exposure_ratio)
-    if highest(ratio) <= 1:
-        return ""
-    iso = ISO.parse("scene.iso", config.scene.iso)
-    ratios, isos = (value_range((lowest(drawn), highest(drawn))) for drawn in (ratio, iso))
-    return (
-        f"scene={config.scene.name}: light is divided by {ratios}, but noise={config.noise.name} ignores ISO {isos}; "
-        f"physical profiles follow the scene: {', '.join(physical_profiles())}"
-    )
-
-
-def ignored_scene_warning(config: Config) -> str:
-    """Return a warning if a scene is described that a two-parameter profile ignores; else an empty text."""
+def scene_warning(config: Config) -> str:
+    """Return a warning if a two-parameter profile ignores a scene that is dark or described; else an empty text."""
     default, scene = default_values("scene"), config.scene
     given = {key: getattr(scene, key) for key in ("iso", "exposure_s", "temperature_c")}
     changed = [f"scene.{key}={value_text(value)}" for key, value in given.items() if value != default[key]]
-    if is_physical(config.noise) or not changed or dark_scene_warning(config):
+    ratio = EXPOSURE_RATIO.parse("scene.exposure_ratio", scene.exposure_ratio)
+    if is_physical(config.noise) or not (changed or highest(ratio) > 1):
         return ""
-    return (
-        f"{', '.join(changed)}: no effect on noise={config.noise.name}, which holds for one ISO; "
-        f"physical profiles follow the scene: {', '.join(physical_profiles())}"
-    )
+    problem = f"{', '.join(changed)}: no effect on noise={config.noise.name}, which holds for one ISO"
+    if highest(ratio) > 1:
+        drawn = ratio, ISO.parse("scene.iso", scene.iso)
+        ratios, isos = (value_range((lowest(number), highest(number))) for number in drawn)
+        problem = f"scene={scene.name}: light is divided by {ratios}, but noise={config.noise.name} ignores ISO {isos}"
+    return f"{problem}; physical profiles follow the scene: {', '.join(physical_profiles())}"
 
 
 def overridden_warning(config: Config) -> str:

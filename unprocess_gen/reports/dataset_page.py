@@ -100,7 +100,8 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
         if first["dark_frame"] and dark_frames is None:
             raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
         access = dark_folder(dark_frames) if dark_frames and first["dark_frame"] else None
-        for noise in (measure_noise(*pairs[number], access) for number in numbers):
+        for clean, noisy, row in map(pairs.__getitem__, numbers):
+            noise = measure_noise(clean, noisy, row, access)
             checks.add(noise)
             fits += filter(None, [fit_noise(noise)])
     except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
@@ -119,9 +120,6 @@ def _pair_values(folder: AnyPath, source: AnyPath | None, dark_frames: str | Non
 
 def _figure(panel: SheetPanel) -> tuple[str, str, str]:
     """Title, note and picture of a panel; no picture if it has none."""
-    shown = panel.overview
-    return (
-        panel.title,
-        panel.note,
-        "" if shown is None else data_uri(picture_jpeg(byte_codes(shown), JPEG_QUALITY), "jpeg"),
-    )
+    if panel.overview is None:
+        return panel.title, panel.note, ""
+    return panel.title, panel.note, data_uri(picture_jpeg(byte_codes(panel.overview), JPEG_QUALITY), "jpeg")

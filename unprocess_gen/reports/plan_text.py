@@ -71,22 +71,18 @@ def sweep_lines(jobs: Mapping[str, RunEstimate], with_numbers: bool = False) -> 
     for number, estimate in enumerate(jobs.values(), start=1):
         for block in re.split(r"\n(?=\S)", format_estimate(estimate, with_numbers, with_table=False)):
             owners.setdefault(block, []).append(number)
-    common = [
-        block for block, numbers in owners.items() if len(numbers) == len(jobs) and not block.startswith(UNSHARED)
-    ]
+    everywhere = [text for text, numbers in owners.items() if len(numbers) == len(jobs)]
+    common = [text for text in everywhere if not text.startswith(UNSHARED)]
     others = [
-        f"{block}\n{'':10}in jobs {', '.join(map(str, numbers))}"
-        for block, numbers in owners.items()
-        if block not in common and not block.startswith(IN_TABLE)
+        f"{text}\n{'':10}in jobs {', '.join(map(str, numbers))}"
+        for text, numbers in owners.items()
+        if text not in common and not text.startswith(IN_TABLE)
     ]
-    rows = [
-        _JOB_LINE.format(
-            *(number, f"{job.pairs:,}", byte_size(job.bytes), format_duration(job.seconds), _noise_cell(job), name)
-        )
-        for number, (name, job) in enumerate(jobs.items(), start=1)
-    ]
-    header = _JOB_LINE.format("job", "pairs", "size", "time", "noise", "settings")
-    return [*common, "", header, *rows, "", *others, totals_line(list(jobs.values()))]
+    rows: list[tuple[object, ...]] = [("job", "pairs", "size", "time", "noise", "settings")]
+    for number, (name, job) in enumerate(jobs.items(), start=1):
+        size, time = byte_size(job.bytes), format_duration(job.seconds)
+        rows.append((number, f"{job.pairs:,}", size, time, _noise_cell(job), name))
+    return [*common, "", *(_JOB_LINE.format(*row) for row in rows), "", *others, totals_line(list(jobs.values()))]
 
 
 def _noise_cell(estimate: RunEstimate) -> str:

@@ -51,9 +51,9 @@ def moved(label: str, window: Float, shown: Shown, pointed: tuple[float, float] 
     It is zoomed about the site that was pointed at, or else the finest detail, or its centre if that is not in view.
     """
     shape, (factor, *steps) = np.array(shown.clean.shape, float), MOVES[label]
-    site = np.array(pointed or panels.finest_detail(shown.srgb, (DETAIL_PX, DETAIL_PX)))
+    detail = panels.finest_detail(shown.srgb, (DETAIL_PX, DETAIL_PX))
+    site = np.array(detail if pointed is None or label == "Detail" else pointed)
     if label == "Detail":
-        site = np.array(panels.finest_detail(shown.srgb, (DETAIL_PX, DETAIL_PX)))
         window, factor = np.stack([site - shape / 2, site + shape / 2], axis=1), min(1, DETAIL_PX / shape[1])
     low, high = window.T
     site = site if ((low <= site) & (site <= high)).all() else (low + high) / 2
