@@ -68,7 +68,7 @@ ONLY_IN = {
         *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
         *("reports.explorer.views", "reports.panels", "picture_isp", "picture_mean"),
     },
-    "PIL": {"dataset.notebook", "reports.pictures", "sources.image.headers"},
+    "PIL": {"dataset.notebook", "reports.pictures", "sources.image.headers", "sources.image.heif"},
     "pillow_heif": {"sources.image.heif"},
     "tarfile": {"dataset.shards"},
     "OpenEXR": {"sources.linear.exr"},

@@ -39,7 +39,7 @@ from unprocess_gen.simulation.plan import SourcePlan
 from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
-from unprocess_gen.sources.image.heif import open_heic, widened
+from unprocess_gen.sources.image.heif import avif_pixels, open_heic, widened
 from unprocess_gen.sources.image.profiles import profile_of
 
 _LOGGER = logging.getLogger(__name__)
@@ -106,8 +106,9 @@ def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Ph
     _refuse(header, max_pixels)
     profile = _profile(header, icc)
     is_stored = header.has_alpha or (header.format == "tiff" and header.bits == 16)  # B, G, R, alpha by OpenCV
-    if header.format == "heic":
-        decoded: Srgb = open_heic(data, is_decoded=True)
+    is_rgb = header.format == "heic" or (header.format == "avif" and header.bits == 8)
+    if is_rgb:
+        decoded: Srgb = open_heic(data, is_decoded=True) if header.format == "heic" else avif_pixels(data)
     else:
         flags = cv2.IMREAD_UNCHANGED if is_stored else _COLOUR_16 if header.bits > 8 else _COLOUR
         decoded = _decode_by_opencv(data, header, flags, name)
@@ -119,7 +120,7 @@ def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Ph
     if decoded.ndim == 2:
         decoded = cast(Srgb, np.repeat(decoded[..., None], 3, axis=2))
     elif is_stored:
-        decoded = decoded[..., :3] if header.format == "heic" else decoded[..., 2::-1]
+        decoded = decoded[..., :3] if is_rgb else decoded[..., 2::-1]
     srgb = _upright(decoded, header.orientation)
     digest = array_xxh3(srgb) if header.format in _BY_VERSION else ""
     return Photograph(srgb, header.orientation, None, header.note, profile, digest)

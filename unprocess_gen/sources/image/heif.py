@@ -15,6 +15,9 @@ import numpy as np
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import SourceError
 
+_FAILURES = ValueError, EOFError, SyntaxError, RuntimeError, OSError, LookupError
+"""Exceptions of pillow-heif and Pillow for broken files."""
+
 SEQUENCES = b"hevc", b"hevx", b"msf1"
 """Brands of sequences of pictures in HEIC."""
 
@@ -32,8 +35,18 @@ def open_heic(data: bytes, is_decoded: bool = False) -> Any:
     try:
         picture = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, hdr_to_16bit=False)
         return np.asarray(picture) if is_decoded else (picture.info, picture.size, picture.mode, len(picture))
-    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError, LookupError) as error:
+    except _FAILURES as error:
         raise SourceError("corrupt", f"libheif cannot read the file ({type(error).__name__})") from error
+
+
+def avif_pixels(data: bytes) -> Srgb:
+    """Decode AVIF to codes of 8 bits as they are stored, which OpenCV does of fewer files; SourceError if it fails."""
+    from PIL import AvifImagePlugin
+
+    try:
+        return np.asarray(AvifImagePlugin.AvifImageFile(io.BytesIO(data)))
+    except _FAILURES as error:
+        raise SourceError("corrupt", f"libavif cannot decode the file ({type(error).__name__})") from error
 
 
 def avif_facts(data: bytes) -> tuple[int, tuple[int, int] | None]:
@@ -46,5 +59,9 @@ def avif_facts(data: bytes) -> tuple[int, tuple[int, int] | None]:
 
 def widened(codes: Srgb, bits: int) -> Srgb:
     """Codes of 10 or 12 bits as those of 16, to the nearest."""
-    white, wide = 2**bits - 1, codes.astype(np.uint32)
-    return np.asarray((wide * 65535 + white // 2) // white, np.uint16)
+    white = 2**bits - 1
+    table = ((np.arange(white + 1) * 65535 + white // 2) // white).astype(np.uint16)
+    wide = np.empty(codes.shape, np.uint16)
+    for narrow, row in zip(codes, wide, strict=True):  # indices of all pixels at once would take 8 bytes each
+        table.take(narrow, out=row, mode="clip")
+    return wide

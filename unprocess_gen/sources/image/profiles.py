@@ -39,7 +39,9 @@ def profile_of(header: Header) -> Profile:
             return _of_code_points(*header.cicp[:2])
         return _of_icc(header.icc) if header.icc else _of_png(header.gamma, header.chromaticities)
     except (ValueError, LookupError, ArithmeticError, struct.error) as error:
-        problem = f"it lacks {error}" if isinstance(error, KeyError) else error
+        problem: object = error  # the words of others differ between versions
+        if not isinstance(error, ValueError):
+            problem = "it lacks values that it declares"
         text = f"the colour profile cannot be used: {problem}; convert the picture to sRGB, or set source.icc=ignore"
         raise SourceError("icc", text) from None
 
@@ -144,8 +146,10 @@ def _of_icc(data: bytes) -> Profile:
     places = [struct.unpack_from(">4sII", data, 132 + 12 * n) for n in range(count)]
     tags = {name: memoryview(data)[offset : offset + length] for name, offset, length in reversed(places)}
     spaces, colorants = (data[16:20], data[20:24]), primaries2xyz(PRIMARIES["srgb"])
-    if spaces not in _CHANNELS or any(name[:3] in (b"A2B", b"D2B") for name in tags):
-        raise ValueError(f"it converts {spaces[0]!r} to {spaces[1]!r}, or by tables; expected a matrix and curves")
+    if tables := [name.decode("latin-1") for name in tags if name[:3] in (b"A2B", b"D2B")]:
+        raise ValueError(f"it converts by tables ({tables[0]}), not by a matrix and curves")
+    if spaces not in _CHANNELS:
+        raise ValueError(f"it converts {spaces[0]!r} to {spaces[1]!r}; expected RGB or GRAY to XYZ")
     curves = [_curve(tags[b"%cTRC" % channel]) for channel in _CHANNELS[spaces]]
     if spaces[0] == b"RGB ":
         columns = [struct.unpack_from(">3i", tags[b"%cXYZ" % channel], 8) for channel in b"rgb"]
