@@ -28,12 +28,14 @@ ADDED = {
     "noise=heteroscedastic": ["noise.a=2", "noise.b=9"],
     "sensor=source": ["source=raw"],
     "experiment=brooks2019_training": ["source.patch=[random,4,1]"],  # the pictures have 24 x 32 pixels
+    "experiment=hdr_scenes": ["source.patch=[random,4,1]"],
     "experiment=raw_low_light": ["source.patch=[random,4,1]"],
     "experiment=raw_training": ["source.patch=[random,4,1]"],
 }
 """Values that an option lacks on purpose."""
 
 RAW = ["source=raw", "sensor=source", "experiment=raw_low_light", "experiment=raw_training"]
+LINEAR = ["source=linear", "experiment=hdr_scenes"]
 SWEEPS = [option for option in OPTIONS if option.startswith("sweep=")]
 ARRAYS = ("plan_image", "make_pair", "CameraNoise")
 REFUSED = {
@@ -41,6 +43,9 @@ REFUSED = {
     **{("noise=imx385_rvdd", entry): r"noise.levels=.* 2 pairs of an image" for entry in ARRAYS},
     **{("experiment=rvdd_like", entry): r"noise.levels=.* 2 pairs of an image" for entry in ARRAYS},
     **{("experiment=brooks2019_training", entry): "source.patch=.* complete frames" for entry in ARRAYS[:2]},
+    **{(option, entry): "is uint8" for option in LINEAR[:1] for entry in ARRAYS[:2]},
+    **{(option, "CameraNoise"): "source.kind=linear: CameraNoise works on" for option in LINEAR},
+    **{("experiment=hdr_scenes", entry): "source.patch=.* complete frames|is uint8" for entry in ARRAYS[:2]},
     ("experiment=brooks2019_training", "CameraNoise"): "source.downscale=2: CameraNoise keeps the geometry",
 }
 """Reason of each refusal that is right: arrays are photographs, and have one pair that is the complete frame."""
@@ -54,6 +59,8 @@ def overrides_of(option: str, folder: Path) -> list[str]:
     """Return the overrides that choose an option, with a folder of one source that it can use."""
     root = folder / ("raw" if option in RAW else "photos")
     root.mkdir()
+    if option in LINEAR:
+        np.save(root / "a.npy", pixels(1, 24, 32) / np.float32(64))
     if option in RAW:
         pair = ug.make_pair(pixels(1, 24, 32), ug.load_config(["sensor=generic_14bit"]))
         (root / "a.dng").write_bytes(encode(pair.noisy, pair.row, "noisy"))
@@ -69,7 +76,7 @@ def assert_entries(option: str, entries: dict[str, Callable[[], Any]]) -> None:
         if (reason := REFUSED.get((option, name))) is None:
             call()
         else:
-            with pytest.raises(ug.ConfigError, match=reason):
+            with pytest.raises((ug.ConfigError, ValueError), match=reason):
                 call()
 
 

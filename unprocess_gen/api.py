@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from unprocess_gen.config.interpretation import noise_levels
-from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.source_validation import require_kind
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.values import refusal
 from unprocess_gen.core.arrays import PACKED, Frame, Srgb
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.source import Source
@@ -43,6 +43,7 @@ from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference import isp
 from unprocess_gen.sources.image.decode import Photograph
+from unprocess_gen.sources.linear.pixels import linear_photograph, linear_pixels
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.patches import list_patches
 
@@ -99,7 +100,7 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     Parameters
     ----------
     srgb : array_like of uint8 or uint16, [H, W, 3]
-        Display-referred codes, R, G, B.
+        Display-referred codes, R, G, B; with ``source.kind=linear``, light in float16 or float32.
     config : Config
         From `load_config`. ``source.root`` and ``source.limit`` are ignored.
     seed : int, optional
@@ -134,7 +135,8 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     >>> darker.row["red_gain"] == plan.camera.red_gain
     True
     """
-    return plan_array(array_pixels(srgb), array_settings(config, seed), key)[1].plans[0]
+    settings = array_settings(config, seed)
+    return plan_array(array_pixels(srgb, config.source.kind == "linear"), settings, key)[1].plans[0]
 
 
 def make_pair(
@@ -147,7 +149,8 @@ def make_pair(
     Parameters
     ----------
     srgb : array_like of uint8 or uint16, [H, W, 3]
-        Display-referred codes, R, G, B. Downscaled and dequantized as the config or plan requires.
+        Display-referred codes, R, G, B; with ``source.kind=linear``, light in float16 or float32. Downscaled and
+        dequantized as the config or plan requires.
     config : Config or Plan
         From `load_config` or `plan_image`. ``source.root`` and ``source.limit`` are ignored.
     seed : int, optional
@@ -183,7 +186,8 @@ def make_pair(
     >>> pair.row["black_level_dn"], pair.row["white_level_dn"]
     (240, 4095)
     """
-    pixels = array_pixels(srgb)
+    is_linear = config.source.is_linear if isinstance(config, Plan) else _check_complete(config) == "linear"
+    pixels = array_pixels(srgb, is_linear)
     if not isinstance(config, Plan):
         source, image = plan_array(pixels, array_settings(config, seed), key)
     elif config.dark is not None:
@@ -192,7 +196,8 @@ def make_pair(
         raise ConfigError("make_pair: the plan is of a raw frame; expected that of a photograph; use ug.LivePairs")
     elif seed is None and key is None:
         recorded, patches = _recorded(pixels, config.source.downscale, config.output.layout)
-        source, image = _array_source(pixels, None), PlannedImage(recorded, (config,), patches)
+        plan = config.replace(pixels_xxh3=array_xxh3(pixels)) if is_linear else config
+        source, image = _array_source(pixels, None), PlannedImage(recorded, (plan,), patches)
     else:
         raise ConfigError("make_pair: a plan has its own seed and key; expected them with a config only")
     if isinstance(config, Plan) or config.self_test == "stop":
@@ -391,11 +396,17 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
     return isp.to_codes(isp.develop(mosaic_dn(raw, recorded), plan)).astype(np.uint8)
 
 
-def array_pixels(srgb: ArrayLike) -> Srgb:
+def array_pixels(srgb: ArrayLike, is_linear: bool = False) -> Srgb:
     """Convert an array to pixels in native byte order; ValueError for another dtype or shape, or no pixel."""
     pixels = np.asarray(srgb)
+    if is_linear:
+        try:
+            return linear_pixels(pixels)
+        except SourceError as error:
+            raise ValueError(f"srgb {error.text}") from error
     if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise ValueError(f"srgb is {pixels.dtype} {list(pixels.shape)}, expected uint8 or uint16 [H, W, 3]")
+        advice = ", or source.kind=linear" if pixels.dtype.kind == "f" else ""
+        raise ValueError(f"srgb is {pixels.dtype} {list(pixels.shape)}, expected uint8 or uint16 [H, W, 3]{advice}")
     if not pixels.size:
         raise ValueError(f"srgb is {list(pixels.shape)}, expected at least one pixel")
     return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
@@ -417,7 +428,10 @@ def plan_array(pixels: Srgb, settings: PairSettings, key: str | int | None) -> t
     """Plan the pair of an array; its identity is the digest of ``key``, or of the array itself."""
     config, source = settings.config, _array_source(pixels, key)
     recorded, _ = _recorded(pixels, config.source.downscale, config.output.layout)
-    return source, plan_pixels(settings, Photograph(recorded, 1), source, source.sha256 or "")
+    is_linear = config.source.kind == "linear"
+    photograph = linear_photograph(config.source, pixels) if is_linear else Photograph(pixels, 1)
+    photograph = dataclasses.replace(photograph, srgb=recorded)
+    return source, plan_pixels(settings, photograph, source, source.sha256 or "")
 
 
 def _array_source(pixels: Srgb, key: str | int | None) -> Source:
@@ -436,7 +450,7 @@ def _array_source(pixels: Srgb, key: str | int | None) -> Source:
 def _config_for_arrays(config: Config, seed: int | None) -> Config:
     """Validated copy of a config without the keys that choose files; ConfigError for patches."""
     _check_complete(config)
-    require_photographs(config.source, "make_pair, as plan_image and CameraNoise,")
+    require_kind(config.source, "make_pair, as plan_image,", "srgb", "linear")
     if config.source.patch is not None:
         problem = (
             "make_pair returns complete frames; expected null; cut the arrays of the pair at even rows and columns"
@@ -448,8 +462,11 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
     return config
 
 
-def _check_complete(config: Config) -> None:
-    """Raise TypeError for another type, and ConfigError for ``Config()``, whose noise is in the option files."""
+def _check_complete(config: Config) -> str:
+    """Kind of the sources of a config.
+
+    TypeError for another type, and ConfigError for ``Config()``, whose noise is in the option files.
+    """
     if not isinstance(config, Config):
         raise TypeError(
             f"config={repr(config)[:60]}: is of type {type(config).__name__}; expected a Config; "
@@ -460,6 +477,7 @@ def _check_complete(config: Config) -> None:
             "noise.units=null: Config() lacks the values of a noise profile; expected a complete config; "
             "make it with unprocess_gen.load_config(['camera=sony_a7r', 'noise=imx385_iso3200'])"
         )
+    return config.source.kind
 
 
 def _recorded(pixels: Srgb, downscale: int, layout: str) -> tuple[Srgb, tuple[Patch, ...]]:

@@ -24,7 +24,7 @@ from unprocess_gen.calibration.gain import Estimate
 from unprocess_gen.calibration.profile import MARK, rounded
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.arrays import Float, Srgb
+from unprocess_gen.core.arrays import Float, Srgb, last_code
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.libraries import require
 from unprocess_gen.picture_isp import YCBCR
@@ -214,7 +214,7 @@ def _picture(noisy: Srgb, clean: Srgb, side: int) -> Picture:
     """Cut a pair to the middle, and find the cell of each pixel."""
     y, x = (max(length - side, 0) // 2 for length in clean.shape[:2])
     noisy, clean = (array_pixels(picture[y : y + side, x : x + side]) for picture in (noisy, clean))
-    codes: Any = clean * np.float32(255 / np.iinfo(clean.dtype).max)
+    codes: Any = clean * np.float32(255 / last_code(clean))
     used = ((codes >= DARKEST) & (codes <= BRIGHTEST)).all(axis=2)
     rows, columns = (np.arange(length) // TILE for length in clean.shape[:2])
     tiles = rows[:, None] * (columns[-1] + 1) + columns
@@ -225,7 +225,7 @@ def _picture(noisy: Srgb, clean: Srgb, side: int) -> Picture:
 
 def _noise(noisy: Srgb, clean: Srgb) -> Any:
     """Noise in 8-bit codes, float32."""
-    return (noisy.astype(np.float32) - clean) * np.float32(255 / np.iinfo(clean.dtype).max)
+    return (noisy.astype(np.float32) - clean) * np.float32(255 / last_code(clean))
 
 
 def statistics(sums: Float) -> Float:

@@ -20,8 +20,9 @@ from unprocess_gen.api import array_pixels, array_settings, plan_array
 from unprocess_gen.camera_fit import CameraFit, fit_pairs
 from unprocess_gen.config.composition import load_config
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.source_validation import require_kind
 from unprocess_gen.config.values import refusal
-from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Srgb
+from unprocess_gen.core.arrays import FLOAT32, MOSAIC, Srgb, last_code
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.picture_isp import IspOptions, compressed, light_of, render, with_strength
@@ -120,6 +121,7 @@ class CameraNoise:
         if clean == "mean" and config.gains.highlight == "gray_mean":
             problem = "mixes the channels' noise; expected per_channel or none with clean=mean of CameraNoise"
             raise refusal("gains.highlight", "gray_mean", problem)
+        require_kind(config.source, "CameraNoise", "srgb")
         self._settings = array_settings(_config_of_pictures(config, seed))
         self._clean, self._seed = clean, seed
         self._calls, self._process, self._told = 0, os.getpid(), SharedCount()
@@ -225,7 +227,7 @@ class CameraNoise:
         if self._settings.config.self_test == "stop":
             self_test.check(image.plans[:1])
         _, plan, pair = next(image.pairs())
-        drawn, codes = self._options.drawn(self._seed, index), int(np.iinfo(pixels.dtype).max) + 1
+        drawn, codes = self._options.drawn(self._seed, index), last_code(pixels) + 1
         strength = 0.0 if set(plan.noise.effects) == {"quantise"} else drawn["strength"]
         clean = light_of(pair.clean, plan)
         noisy = render(with_strength(clean, light_of(pair.noisy, plan), strength, plan), plan, self._options, codes)

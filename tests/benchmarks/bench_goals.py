@@ -17,7 +17,7 @@ import itertools
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -39,8 +39,10 @@ from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.kernels.site_patterns import forget_patterns
 from unprocess_gen.simulation.pair import make_pair, make_pairs
 from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.tone_curves import linear_table
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.sources.linear.pixels import linear_photograph
 
 TWO_NUMBERS = "noise=imx385_iso3200"
 PROFILES = ("sony_a7s2", "nikon_d850")
@@ -127,7 +129,8 @@ class Bench:
 
     def plans(self, settings: str) -> tuple[Plan, ...]:
         config = config_of(settings)
-        return plan_pairs(config, f"{self.number:064x}", facts=facts_for(config, self.srgb))
+        source = linear_photograph(config.source, self.srgb).source if config.source.kind == "linear" else None
+        return plan_pairs(config, f"{self.number:064x}", facts=facts_for(config, self.srgb, source=source))
 
     def pair(self, settings: str, is_new_body: bool = True) -> Work:
         """A full frame."""
@@ -159,6 +162,12 @@ class Bench:
 
         return Work(plan, 20 * self.patch_side**2)
 
+    def deep(self) -> tuple[Bench, Bench]:
+        """The light of the image as a linear source, and the image in 16 bits."""
+        codes = self.srgb.astype(np.uint16) * (257 if self.srgb.itemsize == 1 else 1)
+        light = linear_table("smoothstep", 2.2, 65536)[codes].astype(np.float32)
+        return replace(self, srgb=light), replace(self, srgb=codes)
+
     def naive(self) -> Work:
         (plan,) = self.plans(TWO_NUMBERS)
         simulate = yardstick(plan)
@@ -178,6 +187,10 @@ class Bench:
             yield Row(
                 "float32, against uint16", settings, self.pair(f"{settings} output.dtype=float32"), self.pair(settings)
             )
+        light, codes = self.deep()
+        for settings in (TWO_NUMBERS, daylight, night):
+            linear = light.pair(f"source.kind=linear {settings}")
+            yield Row("a linear source, against 16 bits", settings, linear, codes.pair(settings))
         for settings in (daylight, night):
             levels = self.levels(f"{settings} noise.levels={LEVELS}")
             yield Row("five levels, against one", f"{settings} noise.levels=5", levels, self.pair(settings))

@@ -119,7 +119,7 @@ def test_options_that_a_built_in_option_hides_are_refused(own: Path) -> None:
         load_config(["noise=none"], own)
 
 
-@pytest.mark.parametrize("place", ["typed_config", "validate_config", "check_raw_overrides", "_check_own_files"])
+@pytest.mark.parametrize("place", ["typed_config", "validate_config", "check_overrides", "_check_own_files"])
 def test_bugs_are_neither_hidden_nor_tried_twice(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 

@@ -54,6 +54,7 @@ NEEDS = {
     "sensor/source.yaml": ["source.kind=raw", f"source.root={conf_dir()}", "source.include=[x.dng]"],
     "noise/imx385.yaml": ["noise.iso=3200"],  # the ISO of scene=daylight is not calibrated
 }
+KINDS = {"source/raw.yaml": "raw", "sensor/source.yaml": "raw", "source/linear.yaml": "synthetic_linear"}
 SHA256 = "0" * 64
 
 
@@ -80,7 +81,7 @@ scene: daylight indoor long_exposure low_light night video_night
 effects: default
 output: webdataset
 executor: local dask
-experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training
+experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training hdr_scenes
 experiment: many_highlights no_highlights
 sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
 """
@@ -277,7 +278,7 @@ def test_config_yaml_round_trip_keeps_the_text(settings: Settings, tmp_path: Pat
         text = dataset_yaml(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
         (tmp_path / "config.yaml").write_text(text, encoding="utf-8")
         again, kind = read_dataset_yaml(tmp_path / "config.yaml")
-        assert kind == ("raw" if file.stem in ("source", "raw") else "synthetic"), file
+        assert kind == KINDS.get(str(file), "synthetic"), file
         assert dataset_yaml(again) == text, file
 
 
@@ -297,6 +298,7 @@ def test_config_yaml_contains_source_kind_but_no_path(settings: Settings, tmp_pa
 def test_config_yaml_has_the_keys_that_decide_data(settings: Settings) -> None:
     omitted = {"out", "n_jobs", "self_test", "check_disk", "source.root", "source.list", "source.max_failed"}
     omitted |= {"noise.dark_frames", "noise.provenance", "body.name", "body.missing"}
+    omitted |= {"source.primaries", "scene.ev"}  # unless they have a value
     omitted |= {"executor.kind", "executor.address", "executor.no_workers_s"}
     loaded = yaml.safe_load(dataset_yaml(settings()))
     groups = {group: loaded.get(group, {}) for group in GROUPS} | {"source.raw": loaded["source"].pop("raw")}

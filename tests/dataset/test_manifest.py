@@ -41,6 +41,7 @@ from unprocess_gen.simulation.plan import (
     HEX_KEY,
     LEVELS,
     LIST,
+    PRIMARIES,
     PROFILE,
     DarkFramePlan,
     Plan,
@@ -103,6 +104,7 @@ def values_of(field: Field) -> st.SearchStrategy[Any]:
         LEVELS: st.tuples(*[st.integers(0, 65535).map(float)] * 4),
         GAMMA: st.just("srgb") | st.floats(0.1, 10),
         FLAG: st.booleans(),
+        PRIMARIES: st.sampled_from(["acescg", "0.64;0.33;0.3;0.6;-0.15;6e-05;0.3127;0.329"]),
         PROFILE: word.map(Profile),
     }
     if limit in strategies:

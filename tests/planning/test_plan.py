@@ -190,7 +190,7 @@ def test_compiled_and_plain_matrices_of_a_mix_are_equal(settings: Settings, weig
 def test_counters_of_draws_never_change() -> None:
     names = "weight_0 weight_1 weight_2 weight_3 choice red blue inverse_rgb a b iso exposure_s temperature_c"
     assert [draw.name.lower() for draw in sorted(Draw)] == [
-        *names.split(), "exposure_ratio", "sensor_unit", "light", "cct", "light_distance",
+        *names.split(), "exposure_ratio", "sensor_unit", "light", "cct", "light_distance", "ev",
     ]  # fmt: skip
     assert {name: number.counter for name, number in NUMBERS.items() if number.counter >= 0} == {
         "read_std_dn": 1, "row_std_dn": 2, "column_std_dn": 3, "column_temporal_std_dn": 4,

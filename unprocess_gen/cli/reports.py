@@ -62,7 +62,7 @@ def plan(call: Call) -> int:
 @verb(composes=True)
 def accuracy(call: Call) -> int:
     """Measure time and error of each tier; default out: accuracy."""
-    from unprocess_gen.config.raw_validation import require_photographs
+    from unprocess_gen.config.source_validation import require_kind
     from unprocess_gen.core.paths import local_path
     from unprocess_gen.reports.accuracy_page import REPORT_FILES, report_text, write_accuracy
     from unprocess_gen.reports.pages import check_report_folder
@@ -75,7 +75,7 @@ def accuracy(call: Call) -> int:
 
     def measure(job: Job) -> list[str]:
         config = job.config
-        require_photographs(config.source, "accuracy")
+        require_kind(config.source, "accuracy", "srgb")
         out = local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
         check_report_folder(out, "accuracy")
         measured = measure_accuracy(config, command)

@@ -43,10 +43,10 @@ from unprocess_gen.config.option_files import (
     group_options,
 )
 from unprocess_gen.config.overrides import PATH_KEYS, overrides_of_mapping, quoted
-from unprocess_gen.config.raw_validation import check_raw_overrides
 from unprocess_gen.config.schema import CHOSEN, TWO_NUMBERS, Config, NoiseConfig
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.source_validation import check_overrides
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import flat, read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
@@ -63,7 +63,9 @@ VERSION_BASE = "1.3"
 PLAIN_ERRORS = (ValueError, TypeError, AttributeError, AssertionError, OSError, RecursionError)
 """Other exceptions that Hydra and OmegaConf raise for wrong overrides and files."""
 
-SHORTHANDS = {"source.kind=raw": "source=raw", "source.kind=srgb": "source=default"}
+SHORTHANDS = {
+    "source.kind=raw": "source=raw", "source.kind=linear": "source=linear", "source.kind=srgb": "source=default",
+}  # fmt: skip
 """Overrides that choose an option, because patterns and sensor follow from the kind of the source."""
 
 NO_NUMBERS = ("name", "negative_variance", "assumed", "unsourced", "provenance")
@@ -152,7 +154,7 @@ class Composition:
         """Resolve and validate the config; ConfigError if an interpolation or a value is refused."""
         with _naming(self.swept, self._file):
             config = typed_config(self.node, self.overrides)
-            check_raw_overrides(config, self.overrides)
+            check_overrides(config, self.overrides)
             validate_config(config)
         return config
 

@@ -142,6 +142,8 @@ ISO, EXPOSURE_S, TEMPERATURE_C, EXPOSURE_RATIO = (
     for name in ("iso", "exposure_s", "temperature_c", "exposure_ratio")
 )
 
+EV = Drawn(("uniform", "truncated_normal", "choice"), numbers_of("ev"))
+
 PATCH = Limit(
     "null, a side, [grid, side], [grid, side, stride] or [random, side, count]; side and stride are even, "
     f"{MIN_PATCH} to {MAX_PATCH} pixels, count is 1 to {MAX_RANDOM_PATCHES}"

@@ -23,6 +23,7 @@ from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.numbers import SHAPE, SITES, Number
 from unprocess_gen.simulation.plan import EXACT, FIELDS
+from unprocess_gen.simulation.reference.primaries import CAMERA, PRIMARIES, XYZ
 
 GroupType = TypeVar("GroupType")
 
@@ -94,7 +95,8 @@ class SourceConfig(Group):
         folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://
     kind
         srgb: photographs; raw: clean frames of a camera, DNG and other raw files or 16-bit mosaics (extra raw), of
-        which the light is used: camera, gains and isp are not applied
+        which the light is used: camera, gains and isp are not applied; linear: white-balanced scene-linear pictures,
+        OpenEXR (extra exr), Radiance HDR, float TIFF (extra raw) or NPY [H, W, 3]: isp is not applied
     list
         text file with the path of an image in each line, or CSV file with paths in the column file, else in the first
         one; relative paths are below root, without it below the folder of the list; include is not applied
@@ -124,12 +126,15 @@ class SourceConfig(Group):
     own_noise
         noise of raw sources themselves: subtract lowers the variance that a profile with two numbers adds by that of
         the source, down to 0; the column zero_variance counts the sites where the source has as much or more
+    primaries
+        primaries of linear sources; xyz is CIE XYZ with the white D65, camera is sensor RGB, to which neither matrix
+        nor gains are applied
     """
 
     # fmt: off
     root: Optional[str] = key(
         None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic pictures", decides_data=False)
-    kind: str = key("srgb", Choice("srgb", "raw"))
+    kind: str = key("srgb", Choice("srgb", "raw", "linear"))
     list: Optional[str] = key(
         None, Limit("a text file or a CSV file"), null="all images of the folders", decides_data=False)
     include: tuple[str, ...] = key(
@@ -149,6 +154,8 @@ class SourceConfig(Group):
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
     shrink: int = key(1, of="shrink", unit="sites")
     own_noise: str = key("keep", Choice("keep", "subtract"))
+    primaries: Optional[str] = key(
+        None, Choice(*PRIMARIES, XYZ, CAMERA), null="those that the file states, or srgb")
     raw: RawConfig = field(default_factory=RawConfig)
     # fmt: on
 
@@ -483,6 +490,7 @@ class SceneConfig(Group):
     exposure_s: Any = key(0.001, limits.EXPOSURE_S, of="exposure_s")
     temperature_c: Any = key(25, limits.TEMPERATURE_C, of="temperature_c")
     exposure_ratio: Any = key(1, limits.EXPOSURE_RATIO, of="exposure_ratio")
+    ev: Any = key(0, limits.EV, of="ev")
     light: Any = key("daylight", limits.SCENE_LIGHT, null="not stated")
 
 

@@ -40,23 +40,28 @@ def data_keys(group: Any) -> tuple[str, ...]:
 TYPE_NAMES = {"array": "list", "object": "mapping", "Number out of range": "float"}
 """Names of types in messages, by those of msgspec."""
 
-ADDED: dict[str, Any] = {"source.exclude": []}
+ADDED: dict[str, Any] = {"source.exclude": [], "source.primaries": None, "scene.ev": 0.0}
 """Keys that format 1 had not from its start, with the value that is meant where one is missing."""
+WRITTEN_IF_SET = (("source", "primaries"), ("scene", "ev"))
+"""Keys of `ADDED` that ``config.yaml`` has only with another value, so that the bytes of other datasets stay."""
 
-SOURCE_KINDS = ("folder", "synthetic", "raw")
+SOURCE_KINDS = {"folder": "srgb", "synthetic": "srgb", "raw": "raw", "linear": "linear", "synthetic_linear": "linear"}
+"""Kinds of sources that ``config.yaml`` records, with the value of ``source.kind``."""
 
 
 def source_kind(config: Config) -> str:
     """Kind of source that ``config.yaml`` records."""
-    if config.source.kind == "raw":
-        return "raw"
-    return "synthetic" if config.source.place is None else "folder"
+    names = {"raw": ("raw", "raw"), "linear": ("linear", "synthetic_linear"), "srgb": ("folder", "synthetic")}
+    return names[config.source.kind][config.source.place is None]
 
 
 def dataset_yaml(config: Config) -> str:
     """Text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
     settings = recorded(config)
     settings["source"] |= {"kind": source_kind(config), "patch": canonical_patch(config.source)}
+    for group, name in WRITTEN_IF_SET:
+        if settings[group][name] == ADDED[f"{group}.{name}"]:
+            del settings[group][name]
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
 
 
@@ -100,7 +105,7 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
         raise ConfigError("missing key source.kind")
     kind = loaded["source"].pop("kind")
     one_of("source.kind", kind, SOURCE_KINDS)
-    loaded["source"]["kind"] = "raw" if kind == "raw" else "srgb"
+    loaded["source"]["kind"] = SOURCE_KINDS[kind]
     try:
         config = msgspec.convert(loaded, Config)
     except msgspec.ValidationError as error:

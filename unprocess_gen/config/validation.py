@@ -25,7 +25,6 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import CAMERA_LAWS, GAIN_TEXT, ISO, MAX_GAIN, MIN_GAIN, SWITCH
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
-from unprocess_gen.config.raw_validation import check_raw_source
 from unprocess_gen.config.schema import (
     CameraConfig,
     Config,
@@ -33,6 +32,7 @@ from unprocess_gen.config.schema import (
     Group,
 )
 from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.source_validation import check_source
 from unprocess_gen.config.values import one_of, refusal
 from unprocess_gen.core.arrays import UINT16
 from unprocess_gen.core.errors import ConfigError
@@ -83,7 +83,7 @@ def _check_values(config: Config) -> None:
     if not config.source.include:
         raise refusal("source.include", [], "expected at least one pattern such as '*.jpg'")
     patch_rule(config.source)
-    check_raw_source(config)
+    check_source(config)
     _check_camera(config.camera)
     gain_distributions(config.gains)
     _check_lights(config)

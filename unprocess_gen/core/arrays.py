@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Srgb = NDArray[np.uint8] | NDArray[np.uint16]
+Srgb = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+"""Pixels of a source: display-referred codes, codes of camera RGB, or the light of a linear source (float32)."""
 Raw = NDArray[np.uint16]
 Normalised = NDArray[np.float32]
 Frame = Raw | Normalised
@@ -24,3 +25,8 @@ MOSAIC, PACKED = "mosaic", "packed"
 
 DESCRIPTIONS = {UINT8: "|u1", UINT16: "<u2", FLOAT32: "<f4"}
 """NumPy descriptions of the dtypes in files: little-endian."""
+
+
+def last_code(pixels: Srgb) -> int:
+    """Largest code of display-referred pixels."""
+    return int(256**pixels.itemsize) - 1

@@ -6,6 +6,7 @@ arithmetic only. The functions return about 25 correct digits or more; the calle
 
 from __future__ import annotations
 
+import functools
 from decimal import Decimal, localcontext
 from statistics import NormalDist
 
@@ -16,6 +17,13 @@ PI = Decimal("3.14159265358979323846264338327950288419716939937510582")
 
 LOGISTIC = 1e-12
 """A Tukey-lambda shape nearer to 0 than this is treated as 0; float64 cannot represent the difference."""
+
+
+@functools.lru_cache(maxsize=1024)
+def power_of_two(exponent: float) -> float:
+    """2 to a power, correctly rounded."""
+    with localcontext(prec=DIGITS):
+        return float(Decimal(2) ** Decimal(exponent))
 
 
 def normal_quantile(p: Decimal) -> Decimal:

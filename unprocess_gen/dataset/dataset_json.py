@@ -19,7 +19,7 @@ from unprocess_gen.dataset.shards import shard_name
 class SourceFacts(msgspec.Struct, frozen=True, omit_defaults=True):
     """Kind and place of the sources, and the file that lists them."""
 
-    kind: Literal["folder", "synthetic", "raw"]
+    kind: Literal["folder", "synthetic", "raw", "linear", "synthetic_linear"]
     root: str | None
     list: str | None = None
 

@@ -217,7 +217,7 @@ def as_shot_neutral(plan: Plan) -> tuple[float, float, float]:
 
 def baseline_exposure_ev(plan: Plan) -> float:
     """Stops by which a reader brightens the frame to the brightness of the photograph."""
-    return -math.log2(plan.scene.exposure * max(plan.camera.inverse_gains))
+    return -math.log2(1 / plan.scene.exposure_ratio * max(plan.camera.inverse_gains))
 
 
 def noise_profile(plan: Plan) -> tuple[float, float] | None:

@@ -37,6 +37,7 @@ from unprocess_gen.simulation.plan import (
     FINITE,
     HEX_128,
     HEX_256,
+    LINEAR,
     NOISY_FRAMES,
     Plan,
     PlanRecord,
@@ -167,7 +168,12 @@ def pair_row(
     ``sha256`` is that of the source's bytes, ``orientation`` the EXIF orientation that was applied, ``digests`` the
     XXH3-128 of the clean and of the noisy array. A manifest without frames has no pair and empty digests.
     """
-    uses = {NOISY_FRAMES: "-l" in key, PATCHES: "-p" in key or any(patch.origin), CLIPS: bool(source.clip)}
+    uses = {
+        NOISY_FRAMES: "-l" in key,
+        PATCHES: "-p" in key or any(patch.origin),
+        CLIPS: bool(source.clip),
+        LINEAR: plan.source.is_linear,
+    }
     origin = Origin(
         key=key,
         source=source.name,

@@ -39,7 +39,7 @@ def recorded_config(folder: AnyPath, root: str | None, changes: Mapping[str, Any
         raise ConfigError(
             f"again: noise.dark_frames={frames}: {folder} was generated without dark frames; leave it out"
         )
-    if kind == "synthetic" and root is not None:
+    if "synthetic" in kind and root is not None:
         raise ConfigError(
             f"again: source.root={root}: {folder} was generated from a source of kind {kind}; expected no root; "
             "leave source.root out"

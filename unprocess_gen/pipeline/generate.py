@@ -281,7 +281,7 @@ def _finish(folder: OutFolder, run: RunFile, process: dict[str, Any]) -> dict[st
         if missing:
             raise _missing_error(folder, run, missing)
         (folder / "manifest.csv").commit(manifest)
-        decoders = decoder_versions() if run.source.kind == "raw" else {}
+        decoders = decoder_versions(run.source.kind)
         heic = ["pillow-heif"] if find_spec("pillow_heif") else []
         versions = {package: version(package) for package in (*PACKAGES, *heic)} | decoders
         machine = {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}

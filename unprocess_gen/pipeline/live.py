@@ -40,7 +40,7 @@ from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import draw_split, next_dark_frame, redraw_plan
-from unprocess_gen.planning.raw_source import parts_of
+from unprocess_gen.planning.raw_source import parts_of, stated_source
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.frames import Pair, Patch
@@ -246,7 +246,7 @@ class LivePairs(PairTable):
         redraws = self._redraw == "all"
         plan_epoch = epoch if redraws or image.plan.dark else 0
         settings, patch, frame = self._datasets[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
-        kept = self._kept[srgb.itemsize > 1 or image.plan.source.dequantize != "off"]
+        kept = self._kept[srgb.itemsize == 2 or image.plan.source.dequantize != "off"]
         side = self._options.side
         shape = (patch.height, patch.width) if side is None else (side, side)
         key = place, image.plan.stream_key, image.plan.place, plan_epoch, shape
@@ -267,7 +267,8 @@ class LivePairs(PairTable):
         if self._redraw == "all":
             facts = self._facts.get(number)
             if facts is None:
-                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan), plan.source.profile)
+                stated = stated_source(plan), plan.source.profile
+                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan), *stated)
                 self._facts.keep(number, facts)
             plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
         if plan.dark and settings.dark_frames is not None:

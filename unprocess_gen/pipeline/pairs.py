@@ -72,7 +72,7 @@ def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, 
     """Plan the pairs of a decoded image; ``sha256`` is the digest of the source's bytes."""
     srgb, raw = photograph.srgb, photograph.raw
     config = with_raw_sensor(settings.config, raw)
-    facts = facts_for(config, srgb, source.frames, raw, photograph.profile)
+    facts = facts_for(config, srgb, source.frames, raw, photograph.source, photograph.profile)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, settings.dark_frames)
     plans = tuple(plan.decoded(photograph.profile, photograph.pixels_xxh3) for plan in plans)
     height, width = srgb.shape[:2]

@@ -55,7 +55,7 @@ class ReplayResult:
 
 def check_root(folder: AnyPath, kind: str, root: str | None, verb: str = "") -> None:
     """Raise ConfigError if sources of this kind are files and their place is unknown; ``verb`` begins the sentence."""
-    if kind != "synthetic" and root is None:
+    if "synthetic" not in kind and root is None:
         raise ConfigError(
             f"{verb}source.root is missing: {folder} does not record the folder of its sources; expected that "
             "folder; give source.root=…"

@@ -63,7 +63,7 @@ def _sides(config: Config, source: Source) -> tuple[int, int]:
     with suppress(SourceError, MachineError):
         if config.source.place is None:
             return synthetic.DEFAULT_SIZE
-        if config.source.kind == "raw":
+        if config.source.kind != "srgb":
             height, width = load_source(config.source, source)[1].srgb.shape[:2]
             return height, width
         header = probe(read_bytes(config.source.place, source))

@@ -19,6 +19,7 @@ class Draw(IntEnum):
     ISO, EXPOSURE_S, TEMPERATURE_C, EXPOSURE_RATIO = range(10, 14)
     SENSOR_UNIT = 18
     LIGHT, CCT, LIGHT_DISTANCE = range(20, 23)
+    EV = 23
 
 
 DRAW_COUNT = max(Draw) + 1

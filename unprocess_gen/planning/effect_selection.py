@@ -19,18 +19,16 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.distributions import lowest
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.arrays import Srgb
+from unprocess_gen.core.arrays import Srgb, last_code
 from unprocess_gen.planning.frame_model import FIXED, RARE, AtLevel, FrameModel, SignalRange, ratio_to_noise
 from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS
 from unprocess_gen.simulation.effects.prediction import STATISTICS
 from unprocess_gen.simulation.facts import Facts, RawParts
-from unprocess_gen.simulation.plan import Physics
+from unprocess_gen.simulation.plan import Physics, SourcePlan
 from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 
 MIN_OUTLIERS = 0.1
@@ -43,19 +41,30 @@ BODY_CLIP = 100
 """Frames of a clip for which they are decided."""
 
 
-def facts_of(srgb: Srgb, frames: int = 1, raw: RawParts | None = None, profile: Profile = UNCONVERTED) -> Facts:
+def facts_of(
+    srgb: Srgb,
+    frames: int = 1,
+    raw: RawParts | None = None,
+    source: SourcePlan | None = None,
+    profile: Profile = UNCONVERTED,
+) -> Facts:
     """Return the facts about decoded pixels that planning may use; ``frames`` is the length of the clip."""
     height, width = srgb.shape[:2]
-    codes = int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(srgb.max())
-    return Facts(width, height, *codes, frames, raw, profile)
+    codes = last_code(srgb) + 1 if srgb.dtype.kind == "u" else 0
+    return Facts(width, height, codes, srgb.min().item(), srgb.max().item(), frames, raw, source, profile)
 
 
 def facts_for(
-    config: Config, srgb: Srgb, frames: int = 1, raw: RawParts | None = None, profile: Profile = UNCONVERTED
+    config: Config,
+    srgb: Srgb,
+    frames: int = 1,
+    raw: RawParts | None = None,
+    source: SourcePlan | None = None,
+    profile: Profile = UNCONVERTED,
 ) -> Facts | None:
-    """Return `facts_of` the pixels for a physical noise profile or a raw source; others need none."""
-    is_needed = interpretation.is_physical(config.noise) or raw is not None
-    return facts_of(srgb, frames, raw, profile) if is_needed else None
+    """Return `facts_of` the pixels for a physical noise profile, a raw or a linear source; others need none."""
+    is_needed = interpretation.is_physical(config.noise) or raw is not None or source is not None
+    return facts_of(srgb, frames, raw, source, profile) if is_needed else None
 
 
 class Prediction(NamedTuple):

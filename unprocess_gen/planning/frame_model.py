@@ -15,9 +15,9 @@ from unprocess_gen.simulation.effects import BY_NAME, EFFECTS
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
 from unprocess_gen.simulation.facts import Facts
-from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Physics, SourcePlan
+from unprocess_gen.simulation.plan import MOST_LIGHT, CameraPlan, IspPlan, Physics, SensorPlan, SourcePlan
 from unprocess_gen.simulation.profiles import light_tables
-from unprocess_gen.simulation.reference.colour import from_primaries
+from unprocess_gen.simulation.reference.colour import Matrix, from_primaries
 
 MASKING = tuple(effect for effect in EFFECTS if effect.masks)
 """Random effects of single pixels, which mask others."""
@@ -43,7 +43,8 @@ def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float
     Every treatment of highlights maps light i to at least k·i and at most i·max(1, k), where k is the inverse gain.
     """
     tables = light_tables(facts.profile, isp.tone, isp.gamma, facts.codes)
-    (r0, g0, b0), (r1, g1, b1) = ([float(t[code]) for t in tables] for code in (facts.dark_code, facts.bright_code))
+    ends = int(facts.dark_code), int(facts.bright_code)
+    (r0, g0, b0), (r1, g1, b1) = ([float(table[code]) for table in tables] for code in ends)
     rgb2cam = from_primaries(camera.rgb2cam, facts.profile.to_srgb)
     lowest, highest = math.inf, -math.inf
     for channel, k in enumerate(camera.inverse_gains):
@@ -52,6 +53,23 @@ def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float
         most = r * (r1 if r > 0 else r0) + g * (g1 if g > 0 else g0) + b * (b1 if b > 0 else b0)
         lowest, highest = min(lowest, least * k), max(highest, most * max(k, 1.0))
     return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
+
+
+def linear_signal_range(
+    facts: Facts, matrix: Matrix, gains: tuple[float, float, float], exposure: float, sensor: SensorPlan
+) -> SignalRange:
+    """Return the signal range of a linear source between its lowest and highest value, DN above black.
+
+    Light above white has noise too; the highest signal is the one at which the converter ends.
+    """
+    low, high = facts.dark_code, facts.bright_code
+    most = min((sensor.limits_dn[1] - sensor.black_level_dn) / sensor.span_dn, MOST_LIGHT)
+    lights = []
+    for channel, gain in enumerate(gains):
+        row = matrix[3 * channel : 3 * channel + 3]
+        ends = (sum(entry * (low if (entry > 0) == is_least else high) for entry in row) for is_least in (True, False))
+        lights += [min(max(light * (gain * exposure), 0.0), most) * sensor.span_dn for light in ends]
+    return SignalRange(min(lights), max(lights))
 
 
 def raw_signal_range(facts: Facts, source: SourcePlan, exposure: float, span_dn: float) -> SignalRange:

@@ -15,14 +15,21 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from unprocess_gen.config import interpretation
-from unprocess_gen.config.limits import EXPOSURE_RATIO
+from unprocess_gen.config.distributions import Distribution
+from unprocess_gen.config.limits import EV, EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.arrays import FLOAT32
 from unprocess_gen.core.random_streams import DARK_FRAME, PARAMETERS, frame_word, purpose, split_uniform, stream_key
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import NOT_ROUNDED, BodySelection, EffectRules, Selection
-from unprocess_gen.planning.frame_model import AtLevel, SignalRange, raw_signal_range, signal_range
+from unprocess_gen.planning.frame_model import (
+    AtLevel,
+    SignalRange,
+    linear_signal_range,
+    raw_signal_range,
+    signal_range,
+)
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.parameters import draw_parameter
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
@@ -44,6 +51,7 @@ from unprocess_gen.simulation.plan import (
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import MONO
 from unprocess_gen.simulation.reference.light import LIGHTS, camera_gains
+from unprocess_gen.simulation.reference.primaries import light_colours
 from unprocess_gen.simulation.reference.sensor import noise_in_dn
 
 
@@ -154,6 +162,10 @@ def _planner_without_seed(config: Config) -> Planner:
     return Planner(config)
 
 
+LINEAR_ISP, UNCHANGED = IspPlan("none", "srgb", "none"), Distribution("constant", (1.0,))
+"""Curve and brightening of linear sources: none is inverted, and pictures are developed with the curve of sRGB."""
+
+
 class Planner:
     """Draw plans for the images of one configuration, which is interpreted once.
 
@@ -165,6 +177,7 @@ class Planner:
         self._camera, self._needs_dark_frames = config.camera, interpretation.uses_dark_frames(config.noise)
         self._red, self._blue, self._inverse_rgb = interpretation.gain_distributions(config.gains)
         self._lights = interpretation.lights(config)
+        self._ev = EV.parse("scene.ev", config.scene.ev)
         self._exposure_ratio = EXPOSURE_RATIO.parse("scene.exposure_ratio", config.scene.exposure_ratio)
         self._is_physical = interpretation.is_physical(config.noise)
         kind, levels = PhysicalLevel if self._is_physical else TwoNumberLevel, interpretation.noise_levels(config.noise)
@@ -174,6 +187,8 @@ class Planner:
         isp, gains, sensor = config.isp, config.gains, config.sensor
         gamma = "srgb" if isp.gamma == "srgb" else float(isp.gamma)
         self._isp = IspPlan(isp.tone, gamma, gains.highlight, gains.threshold)
+        if config.source.kind == "linear":  # there is no curve and no brightening to invert; pictures are developed so
+            self._isp, self._inverse_rgb = LINEAR_ISP, UNCHANGED
         levels_dn, saturated_as = (sensor.black_level_dn, sensor.white_level_dn), interpretation.saturated_as(config)
         self._sensor = SensorPlan(sensor.pattern, sensor.bits, *levels_dn, sensor.clip, saturated_as)
         clean_dtype = FLOAT32 if interpretation.has_float_clean(config) else ""
@@ -188,7 +203,11 @@ class Planner:
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
         uniforms = draws(key, DRAW_COUNT, purpose(PARAMETERS), frame_word(0, epoch))[1].tolist()
-        scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
+        ratio, ev = (
+            draw_parameter(distribution, uniforms[counter])
+            for distribution, counter in ((self._exposure_ratio, Draw.EXPOSURE_RATIO), (self._ev, Draw.EV))
+        )
+        scene = ScenePlan(self._scene_name, ratio, ev)
         raw, light = None if facts is None else facts.raw, (scene.exposure, float(self._sensor.span_dn))
         if raw is None:
             # compiling takes as long as 20,000 matrices, which only redrawn plans may need
@@ -202,12 +221,17 @@ class Planner:
                 inverse_rgb_gain=draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB]),
             )  # fmt: skip
             camera = without_filters(camera) if self._sensor.pattern == MONO else camera
-            source, isp = self._source, self._isp
+            source, isp = (facts and facts.source) or self._source, self._isp
         else:
             source, isp, camera = own_noise(raw, *light), raw.isp, raw.camera
         signals = None
         if self._is_physical and facts is not None:
-            signals = raw_signal_range(facts, source, *light) if raw else signal_range(facts, isp, camera, *light)
+            if raw is not None:
+                signals = raw_signal_range(facts, source, *light)
+            elif source.is_linear:
+                signals = linear_signal_range(facts, *light_colours(source, camera), scene.exposure, self._sensor)
+            else:
+                signals = signal_range(facts, isp, camera, *light)
         return Image(seed, key, split, epoch, uniforms, scene, source, camera, isp, facts, signals, dark_frames)
 
     def plan(self, image: Image, place: Place, dark: DarkFramePlan | None = None) -> tuple[Plan, Selection | None]:

@@ -14,6 +14,11 @@ def parts_of(plan: Plan) -> RawParts | None:
     return RawParts(plan.source, plan.camera, plan.isp, plan.sensor) if plan.source.is_raw else None
 
 
+def stated_source(plan: Plan) -> SourcePlan | None:
+    """Return the source that the file of a linear source gave to a plan; None for others."""
+    return plan.source if plan.source.is_linear else None
+
+
 def with_raw_sensor(config: Config, raw: RawParts | None) -> Config:
     """Return the config of an image of a raw source: its levels with ``sensor=source``, and the pattern of its mosaic.
 

@@ -8,13 +8,13 @@ rows record it, and `plan` compares it with the simulated noise.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import Float, Srgb
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.core.arrays import Float, Srgb, last_code
+from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.reference.cfa import filters
 from unprocess_gen.simulation.reference.unprocess import camera_light
 
@@ -59,17 +59,21 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     little on brightness, and only the quieter half is used. Tiles with a code at either end of the range have less
     noise than the others and are left out.
     """
-    codes = _green_sites(srgb, plan.sensor.pattern)
-    last, plane = int(np.iinfo(srgb.dtype).max), 1 if "R" in plan.sensor.pattern[:2] else 2
+    codes: Any = _green_sites(srgb, plan.sensor.pattern)
+    tiles, last, plane = codes, last_code(srgb), 1 if "R" in plan.sensor.pattern[:2] else 2
+    if plan.source.is_linear:
+        last = int(CODE_RANGE)
+        codes = np.rint(np.clip(tiles * plan.scene.exposure, 0, 1) * last)
     black, white = (levels[plane] for levels in plan.source.code_levels) if plan.source.is_raw else (0, last)
-    codes = codes[((codes > 0) & (codes < white)).all(axis=(1, 2, 3))]
+    is_free = ((codes > 0) & (codes < white)).all(axis=(1, 2, 3))
+    tiles, codes = tiles[is_free], codes[is_free]
     quiet = np.argsort(_laplacian_sums(codes[..., 1].astype(np.int64)), kind="stable")[: (len(codes) + 1) // 2]
     if not quiet.size:
         return TileNoise(np.zeros(0), np.zeros(0))
     if plan.source.is_raw:
-        light = (codes[quiet][..., 1] - black) / (white - black)
+        light = (tiles[quiet][..., 1] - black) / (white - black)
     else:
-        light = camera_light(codes[quiet], plan)[..., 1]
+        light = camera_light(tiles[quiet], plan)[..., 1]
     span = float(plan.sensor.white_level_dn - plan.sensor.black_level_dn)
     steps = np.rint(np.clip(light, plan.darkest, 1) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
     _, height, width = steps.shape

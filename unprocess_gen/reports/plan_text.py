@@ -207,7 +207,8 @@ def _scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
     )
     ignored = f"; {config.noise.name} ignores ISO, time, temperature" if is_ignored else ""
     ratio = _range(plans, "scene.exposure_ratio", 4)
-    return f"{scene.name}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}{ignored}"
+    ev = f", times 2^{_range(plans, 'scene.ev', 4)}" if config.source.kind == "linear" else ""
+    return f"{scene.name}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}{ev}{ignored}"
 
 
 def _sensor_text(plans: Sequence[Plan]) -> str:

@@ -11,13 +11,13 @@ Each PNG file names the digest of its manifest: sheets of two datasets in a fold
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.arrays import Float, Srgb
+from unprocess_gen.core.arrays import Float, Srgb, last_code
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError
 from unprocess_gen.core.files import file_sha256, write_file
 from unprocess_gen.core.output_paths import check_output_folder
@@ -35,8 +35,9 @@ from unprocess_gen.reports.panels import MosaicArray, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.profiles import light_tables
+from unprocess_gen.simulation.reference import isp as display
 from unprocess_gen.simulation.reference import unprocess
-from unprocess_gen.simulation.reference.colour import from_primaries
+from unprocess_gen.simulation.reference.primaries import light_colours
 from unprocess_gen.sources.patches import crop_patch
 from unprocess_gen.sources.recorded_photographs import RecordedPhotographs
 
@@ -140,8 +141,9 @@ def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> 
     reason = re.sub(r"([0-9a-f]{8})[0-9a-f]{56}", r"\1...", pair.missing_source)  # of a SHA-256, the beginning
     plan, drawn = pair.plan, [SheetPanel("source", f"not available: {reason}", None)]
     if pair.source is not None:
-        drawn = [SheetPanel("source", f"{8 * pair.source.itemsize} bits", *_views(pair.source, window, panel_px))]
-    white_dn = plan.sensor.black_level_dn + plan.sensor.span_dn * plan.scene.exposure
+        views = (_shown(view, plan) for view in _views(pair.source, window, panel_px))
+        drawn = [SheetPanel("source", f"{8 * pair.source.itemsize} bits", *views)]
+    white_dn = plan.sensor.black_level_dn + plan.sensor.span_dn / plan.scene.exposure_ratio
     levels = f"{plan.sensor.black_level_dn} to {white_dn:.5g} DN, square root"
     averages = [panels.average_planes(raw, panel_px) for raw in (pair.clean, pair.noisy)]
     for name, raw, planes in zip(("clean", "noisy"), (pair.clean, pair.noisy), averages, strict=True):
@@ -157,9 +159,14 @@ def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> 
 
 
 def _views(source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Float, Float]:
-    """The source scaled to a panel, and its detail, in [0, 1]."""
-    white = float(np.iinfo(source.dtype).max)
-    return panels.fit_image(source, panel_px) / white, source[window] / white
+    """The source scaled to a panel, and its detail, in [0, 1]; light of a linear source may be beyond."""
+    white = 1.0 if source.dtype.kind == "f" else float(last_code(source))
+    return panels.fit_image(source, panel_px) / white, source[window].astype(np.float64) / white
+
+
+def _shown(values: Float, plan: Plan) -> Float:
+    """Display-referred values of a source, in [0, 1]."""
+    return display.compress_gamma(np.clip(values, 0, 1), plan.isp.gamma) if plan.source.is_linear else values
 
 
 # -------------------------------------------------------------------------------------------------------------- stages
@@ -169,7 +176,7 @@ def _stage_panels(pair: SheetPair, source: Srgb, window: Window) -> list[SheetPa
     """Panels of the source after each step, black 0 and white 1, and of the frames in the colours of their filters."""
     plan, pattern, views = pair.plan, pair.plan.sensor.pattern, _views(source, window, panels.PANEL_PX)
     steps = zip(*(processing_steps(view, plan) for view in views), strict=True)
-    drawn = [SheetPanel("source", "", *views)]
+    drawn = [SheetPanel("source", "", *(_shown(view, plan) for view in views))]
     drawn += [SheetPanel(title, note, overview, detail) for (title, note, overview), (*_, detail) in steps]
     for name, raw in (("clean", pair.clean), ("noisy", pair.noisy)):
         averaged = panels.planes_to_rgb(panels.average_planes(raw, panels.PANEL_PX), pattern)
@@ -185,7 +192,15 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
         (black, *_), (white, *_) = plan.source.code_levels
         yield "levels", "black 0, white 1", (values * CODE_RANGE - black) / (white - black)
         return
+    matrix, inverse_gains = light_colours(plan.source, camera)
     profile = plan.source.profile
+    if plan.source.is_linear:
+        values = values * plan.scene.exposure
+        yield "exposed", f"ev {plan.scene.ev:g}, exposure ratio {plan.scene.exposure_ratio:g}", values
+        values = unprocess.apply_ccm(values, matrix)
+        yield "colour matrix inverted", f"camera {camera.camera}, primaries {plan.source.primaries}", values
+        yield "gains inverted", f"times {_gain_text(inverse_gains)}", values * inverse_gains
+        return
     if profile.is_srgb:
         values = unprocess.INVERSE_TONES[isp.tone](values, 1 - values)
         yield "tone curve inverted", isp.tone, values
@@ -195,8 +210,11 @@ def processing_steps(values: Float, plan: Plan) -> Iterator[tuple[str, str, Floa
         tables, levels = light_tables(profile, isp.tone, isp.gamma, 256), np.linspace(0, 1, 256)
         values = np.stack([np.interp(values[..., n], levels, table) for n, table in enumerate(tables)], axis=-1)
         yield "curves inverted", f"{profile.name}, {isp.tone}, gamma {isp.gamma}", values
-    values = unprocess.apply_ccm(values, from_primaries(camera.rgb2cam, profile.to_srgb))
+    values = unprocess.apply_ccm(values, matrix)
     yield "colour matrix inverted", f"camera {camera.camera}", values
-    gains = ", ".join(f"{gain:.3g}" for gain in camera.inverse_gains)
     values = unprocess.invert_gains(values, camera.inverse_gains, isp.highlight, isp.highlight_threshold)
-    yield "gains inverted", f"times {gains}; highlights {isp.highlight}", values
+    yield "gains inverted", f"times {_gain_text(inverse_gains)}; highlights {isp.highlight}", values
+
+
+def _gain_text(gains: Sequence[float]) -> str:
+    return ", ".join(f"{gain:.3g}" for gain in gains)

@@ -43,20 +43,22 @@ class DarkFrames:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Facts about an image's pixels that a plan may depend on: integers, identical on every machine.
+    """Facts about an image's pixels that a plan may depend on, identical on every machine.
 
-    ``dark_code`` and ``bright_code`` are the lowest and highest code in any channel, of ``codes`` possible codes.
-    ``frames`` is the number of frames in the clip, 1 for a photograph. ``raw`` is what the file of a raw source states,
+    ``dark_code`` and ``bright_code`` are the lowest and highest code in any channel, of ``codes`` possible codes; of a
+    linear source they are light, and ``codes`` is 0. ``frames`` is the number of frames in the clip, 1 for a
+    photograph. ``raw`` is what the file of a raw source states, ``source`` what that of a linear source does, and
     ``profile`` has the colours of a photograph.
     """
 
     width: int
     height: int
     codes: int
-    dark_code: int
-    bright_code: int
+    dark_code: float
+    bright_code: float
     frames: int = 1
     raw: RawParts | None = None
+    source: SourcePlan | None = None
     profile: Profile = UNCONVERTED
 
 

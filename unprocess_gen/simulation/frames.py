@@ -5,13 +5,16 @@ from typing import Annotated, Any
 
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.fields import FAILED, Condition, Field, Integers
-from unprocess_gen.simulation.plan import COORDINATE, COUNT, PlanRecord
+from unprocess_gen.simulation.plan import COORDINATE, COUNT, LINEAR, PlanRecord
 
 PATCHES = Condition("source.patch is null", lambda config: config.source.patch is not None)
 SIDE = Integers(1, 2**32)
-DIVIDED_LIGHT = Condition(
-    "scene.exposure_ratio is 1 or output.frames is false",
-    lambda config: config.output.frames and config.scene.exposure_ratio != 1,
+LIMITED_LIGHT = Condition(
+    "scene.exposure_ratio is 1 and source.kind is not linear, or output.frames is false",
+    lambda config: config.output.frames and (config.scene.exposure_ratio != 1 or LINEAR.holds(config)),
+)
+LINEAR_LIGHT = Condition(
+    "source.kind is not linear, or output.frames is false", lambda config: config.output.frames and LINEAR.holds(config)
 )
 
 
@@ -41,8 +44,8 @@ def _sites(meaning: str, **details: Any) -> Field:
 class Counts(PlanRecord, frozen=True):
     """Numbers of sites at a limit; for float32 frames, clipped noisy values are counted without rounding.
 
-    Variance is zero where a fitted b is negative, or if no noise is simulated. ``light_clipped_high`` is None without
-    an exposure ratio.
+    Variance is zero where a fitted b is negative, or if no noise is simulated. ``light_clipped_high`` is None for
+    photographs without an exposure ratio, ``light_clipped_low`` for all but linear sources.
     """
 
     # fmt: off
@@ -54,8 +57,11 @@ class Counts(PlanRecord, frozen=True):
     saturated: Annotated[int, _sites("clean sites at the white level")]
     zero_variance: Annotated[int, _sites("sites at which the noise has no variance")]
     light_clipped_high: Annotated[int | None, _sites(
-        "sites whose light is above white before the exposure ratio divides it", needs=DIVIDED_LIGHT,
-        empty_if=f"{FAILED}, or exposure_ratio is 1")] = None
+        "sites whose light is clipped: of photographs, above white before the exposure ratio divides it; of linear "
+        "sources, above 2^16 times white", needs=LIMITED_LIGHT,
+        empty_if=f"{FAILED}, or exposure_ratio is 1 and the source is not linear")] = None
+    light_clipped_low: Annotated[int | None, _sites(
+        "sites of a linear source whose light is negative, and clipped to 0", needs=LINEAR_LIGHT)] = None
     # fmt: on
 
 

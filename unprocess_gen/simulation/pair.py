@@ -22,7 +22,7 @@ from unprocess_gen.core.random_streams import frame_word
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.frames import Counts, Pair
 from unprocess_gen.simulation.kernels.render import CODES, Renderer, render_clean, renderer_of
-from unprocess_gen.simulation.plan import EXACT, REFERENCE, Plan
+from unprocess_gen.simulation.plan import EXACT, MOST_LIGHT, REFERENCE, Plan
 from unprocess_gen.simulation.plan_slots import slots_of
 from unprocess_gen.simulation.reference import electrons
 from unprocess_gen.simulation.reference.cfa import ONE_COLOUR, pack
@@ -107,9 +107,10 @@ def _pairs(
 def _counts_of(numbers: NDArray[np.int64], plan: Plan) -> list[Counts]:
     """Counts of frames that share the clean frame."""
     clean_low, clean_high, _, _, saturated, _, light_high = numbers[0].tolist()
-    light = None if plan.scene.exposure == 1 else light_high
+    is_linear = plan.source.is_linear
+    light = light_high if is_linear or plan.scene.exposure != 1 else None, clean_low if is_linear else None
     return [
-        Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, light)
+        Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance, *light)
         for _, _, noisy_low, noisy_high, _, zero_variance, _ in numbers.tolist()
     ]
 
@@ -185,18 +186,18 @@ def reference_pair(
     """
     _check_image(srgb, plan, origin)
     sensor, output = plan.sensor, plan.output
-    light = photograph = unprocess(dequantise(srgb, plan, origin), plan, origin)
-    if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
-        light = np.minimum(light, 1) * plan.scene.exposure
+    light, lost = expose(unprocess(dequantise(srgb, plan, origin), plan, origin), plan)
     factor = electrons.light_factor(plan, (light.shape[0], light.shape[1]), origin)
     light = light if factor is None else light * factor
-    clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest, plan.darkest)
-    noisy_dn = electrons.noisy(clean_dn, plan, origin, dark_pixels)
+    levels = sensor.black_level_dn, sensor.white_level_dn
+    clean_dn = to_dn(light, *levels, plan.brightest, plan.darkest)
+    light_dn = to_dn(light, *levels, plan.most_light, plan.darkest)
+    noisy_dn = electrons.noisy(light_dn, plan, origin, dark_pixels)
     if plan.pins_saturated:
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
 
     limits_dn, levels_dn = sensor.limits_dn, (sensor.black_level_dn, sensor.white_level_dn)
-    averaged_dn = electrons.average(clean_dn, plan, origin) if plan.averaged else clean_dn
+    averaged_dn = electrons.average(light_dn, plan, origin) if plan.averaged else clean_dn
     clean_limits_dn = limits_dn[0], limits_dn[1] if plan.averaged else sensor.white_level_dn
     clean = _frame_of(averaged_dn, clean_limits_dn, output.clean_normalised, levels_dn)
     noisy = _frame_of(noisy_dn, limits_dn, output.normalised, levels_dn)
@@ -207,12 +208,26 @@ def reference_pair(
         noisy_clipped_low=int((read_dn < limits_dn[0]).sum()),
         noisy_clipped_high=int((read_dn > limits_dn[1]).sum()),
         saturated=int((clean == plan.saturated_value).sum()),
-        zero_variance=int((electrons.noise_variance(clean_dn, plan) == 0).sum()),
-        light_clipped_high=None if plan.scene.exposure == 1 else int((photograph > 1).sum()),
+        zero_variance=int((electrons.noise_variance(light_dn, plan) == 0).sum()),
+        light_clipped_high=lost,
+        light_clipped_low=int((light < 0).sum()) if plan.source.is_linear else None,
     )
     if output.layout == PACKED:
         clean, noisy = pack(clean, sensor.pattern, origin), pack(noisy, sensor.pattern, origin)
     return Pair(clean, noisy, counts)
+
+
+def expose(light: Float, plan: Plan) -> tuple[Float, int | None]:
+    """Multiply light by the exposure of the scene, and count the sites that are clipped; None if no site can be.
+
+    Light of a photograph is clipped at white first: once darkened, light above white would reappear. That of a linear
+    source is light of the scene, and limited to `MOST_LIGHT` afterwards.
+    """
+    exposure = plan.scene.exposure
+    if plan.source.is_linear:
+        light = light * exposure
+        return np.minimum(light, MOST_LIGHT), int((light > MOST_LIGHT).sum())
+    return (light, None) if exposure == 1 else (np.minimum(light, 1) * exposure, int((light > 1).sum()))
 
 
 def _frame_of(dn: Float, limits_dn: tuple[float, float], normalised: bool, levels_dn: tuple[int, int]) -> Frame:
@@ -222,12 +237,16 @@ def _frame_of(dn: Float, limits_dn: tuple[float, float], normalised: bool, level
 
 _DTYPES = np.dtype(np.uint8), np.dtype(np.uint16)
 """Dtypes of images; comparing with a class takes six times as long as with a dtype."""
+_LINEAR_DTYPES = (np.dtype(np.float32),)
+"""Dtypes of linear sources."""
 
 
 def _check_image(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> None:
     """Raise ValueError if an image has an unusable dtype or shape, or is not inside the frame of the lens shading."""
-    if srgb.dtype not in _DTYPES or srgb.ndim != 3 or srgb.shape[2] != 3:
-        raise ValueError(f"srgb={srgb.dtype} {list(srgb.shape)}: unusable array; expected uint8 or uint16 [H, W, 3]")
+    dtypes = _LINEAR_DTYPES if plan.source.is_linear else _DTYPES
+    if srgb.dtype not in dtypes or srgb.ndim != 3 or srgb.shape[2] != 3:
+        expected = " or ".join(map(str, dtypes))
+        raise ValueError(f"srgb={srgb.dtype} {list(srgb.shape)}: unusable array; expected {expected} [H, W, 3]")
     if plan.output.layout == PACKED and (srgb.shape[0] % 2 or srgb.shape[1] % 2):
         raise ValueError(f"srgb={list(srgb.shape)}: odd side; expected even height and width for layout={PACKED}")
     if plan.physics is not None and "lens_shading" in plan.noise.effects:

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from unprocess_gen.core.arrays import FLOAT32, MOSAIC, PACKED, UINT16
+from unprocess_gen.core.exact_distributions import power_of_two
 from unprocess_gen.core.fields import (
     FAILED,
     LARGEST,
@@ -43,6 +44,9 @@ _FILE_LEVELS = "{} levels of the raw file: R, G of the red rows, G of the blue r
 CODE_RANGE = 65535.0
 """Largest code of a raw source."""
 
+MOST_LIGHT = 65536.0
+"""Light of linear sources above it, in units of white, is limited to it, so that float32 kernels stay finite."""
+
 
 # ---------------------------------------------------------------------------------------- allowed values and conditions
 
@@ -52,6 +56,7 @@ LIST = Text(*_PRINTED, write=";".join, read=lambda text: tuple(text.split(";")))
 PROFILE = Text(*_PRINTED, write=lambda profile: profile.name, read=Profile)
 HEX_KEY = Text("([0-9a-f]{16})?|none", "16 hexadecimal digits", write="{:016x}".format, read=lambda text: int(text, 16))
 HEX_128, HEX_256 = (Text(f"([0-9a-f]{{{n}}})?", f"{n} hexadecimal digits") for n in (32, 64))
+_XY = r"-?\d{1,3}(\.\d{1,17})?(e-\d\d)?"
 _LEVEL = r"\d{1,5}(\.\d{1,17})?(e-\d\d)?"
 LEVELS = Text(
     rf"({_LEVEL}(;{_LEVEL}){{3}})?",
@@ -71,11 +76,16 @@ COUNT = Integers(0, 2**63 - 1)
 SHARE = Numbers(0, 1)
 GAIN = Numbers(1e-4, 1e4)
 FINITE = Numbers(-LARGEST, LARGEST)
+PRIMARIES = Text(
+    rf"srgb|p3|rec2020|xyz|acescg|camera|{_XY}(;{_XY}){{7}}",
+    "srgb, p3, rec2020, xyz, acescg, camera, or eight numbers, separated by ;",
+)
 COORDINATE = Integers(0, 2**32 - 1)
 """Pixel coordinates and frame numbers are 32-bit counters of the random streams."""
 BAYER = "RGGB", "BGGR", "GRBG", "GBRG"
 
 RAW = Condition("source.kind is not raw", lambda config: config.source.kind == "raw")
+LINEAR = Condition("source.kind is not linear", lambda config: config.source.kind == "linear")
 PHOTOGRAPHS = Condition(
     "the sources are no photographs",
     lambda config: config.source.place is not None and config.source.kind == "srgb",
@@ -85,11 +95,14 @@ PROFILES = Condition(
     lambda config: config.source.icc == "convert" and PHOTOGRAPHS.holds(config),
 )
 HEIF_NAMES = "x.heic", "x.heif", "x.hif", "x.avif"
-HEIF = Condition(
-    f"source.include has no pattern of HEIC or AVIF files, or {PHOTOGRAPHS.unless}",
+DECODED = Condition(
+    "the sources are neither linear nor photographs, or source.include has no pattern of HEIC or AVIF files",
     lambda config: (
-        PHOTOGRAPHS.holds(config)
-        and any(fnmatch(name, pattern.lower()) for pattern in config.source.include for name in HEIF_NAMES)
+        LINEAR.holds(config)
+        or (
+            PHOTOGRAPHS.holds(config)
+            and any(fnmatch(name, pattern.lower()) for pattern in config.source.include for name in HEIF_NAMES)
+        )
     ),
 )
 CLIPS = Condition("source.clips is false", lambda config: config.source.clips)
@@ -246,7 +259,7 @@ def _of_raw(meaning: str, limit: Limit, unit: str = "", stated: bool = False) ->
 
 
 class SourcePlan(PlanRecord, frozen=True):
-    """Preparation of the source's pixels; the fields of raw sources have their defaults for photographs."""
+    """Preparation of the source's pixels; fields of other kinds of sources have their defaults."""
 
     # fmt: off
     downscale: Annotated[int, Field(
@@ -274,10 +287,18 @@ class SourcePlan(PlanRecord, frozen=True):
     profile: Annotated[Profile, Field(
         "colour profile from which the photograph was converted; sRGB if it has none, or one with the colours of sRGB",
         PROFILE, needs=PROFILES, blank=True)] = UNCONVERTED
+    primaries: Annotated[str, Field(
+        "primaries of a linear source: a name, or x and y of red, green, blue and white as its file states them",
+        PRIMARIES, needs=LINEAR)] = ""
     pixels_xxh3: Annotated[str, Field(
-        "XXH3-128 of the pixels that a HEIC or AVIF file was decoded to", HEX_128, needs=HEIF, blank=True,
-        empty_if=f"{FAILED}, or has another format")] = ""
+        "XXH3-128 of the pixels that the file of a linear source, or a HEIC or AVIF file, was decoded to", HEX_128,
+        needs=DECODED, blank=True, empty_if=f"{FAILED}, or has another format")] = ""
     # fmt: on
+
+    @property
+    def is_linear(self) -> bool:
+        """True for scene-linear pictures."""
+        return self.primaries != ""
 
     @property
     def is_raw(self) -> bool:
@@ -343,12 +364,15 @@ class ScenePlan(PlanRecord, frozen=True):
     exposure_ratio: Annotated[float, Field(
         "divisor of the light in the photograph: 100 leaves a hundredth; frames are not brightened afterwards",
         Numbers(1e-3, 1e6))]
+    ev: Annotated[float, Field(
+        "exposure of a linear source, whose light is multiplied by 2^ev", Numbers(-64, 64), "stops",
+        needs=LINEAR)] = 0.0
     # fmt: on
 
     @property
     def exposure(self) -> float:
         """Factor applied to the light of the scene."""
-        return 1 / self.exposure_ratio
+        return power_of_two(self.ev) / self.exposure_ratio
 
 
 class NoisePlan(PlanRecord, frozen=True):
@@ -607,6 +631,11 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         if not self.source.is_raw:
             return 0.0
         return (self.sensor.limits_dn[0] - self.sensor.black_level_dn) / self.sensor.span_dn
+
+    @property
+    def most_light(self) -> float:
+        """Light up to which the noise follows it: `brightest`, where light is clipped; more for linear sources."""
+        return MOST_LIGHT if self.source.is_linear else self.brightest
 
     @property
     def brightest_dn(self) -> float:

@@ -95,6 +95,11 @@ GOLDEN_PLANS = {
     "float_clean": GOLDEN_PLAN.replace(clean_dtype=FLOAT32),
     "float_clean_counts": _PHYSICAL.replace(clean_dtype=FLOAT32),
 }
+_LINEAR = "per_channel", "float32", "physical", "normalised", "normalised_counts", "float_clean", "float_clean_counts"
+GOLDEN_PLANS |= {
+    f"linear_{name}": GOLDEN_PLANS[name].replace(primaries="rec2020", ev=0.5, isp=IspPlan("none", "srgb", "none"))
+    for name in _LINEAR
+}
 GOLDEN = {
     # XXH3-128 of the clean and of the noisy frame
     "per_channel": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
@@ -109,6 +114,13 @@ GOLDEN = {
     "float_clean": ("aa19fde7d361bcc67ca6c9e52c8d8634", "249b904acb59298a603502c2424e4712"),
     "float_clean_counts": ("db1e51d036e01d5eaca3d0ebedbab809", "034a49f0e3f78996ab8d340da875038e"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
+    "linear_per_channel": ("4da6ba240a32069b27a35be13644db76", "88d88fb2b7e08e2491c57b64b36cebc7"),
+    "linear_float32": ("4774c6e816a14285feb8590098dfe45e", "ba4667260224bd6d8aae1e5d2955a3a8"),
+    "linear_physical": ("34bb79872340b344993a8b22c85d2219", "dacd4243ba515f2d45fc46988ae2c838"),
+    "linear_normalised": ("d266df2af19e2f10774416a0010e5ab5", "09cb06a86f7737d0502041e7b56984fd"),
+    "linear_normalised_counts": ("1188c137a775ce4ec5d5541836dfd13e", "94d49d51c9967779877508be847f9ff8"),
+    "linear_float_clean": ("d266df2af19e2f10774416a0010e5ab5", "88d88fb2b7e08e2491c57b64b36cebc7"),
+    "linear_float_clean_counts": ("1188c137a775ce4ec5d5541836dfd13e", "dacd4243ba515f2d45fc46988ae2c838"),
 }
 
 
@@ -126,7 +138,7 @@ def kernels(plans: Sequence[Plan], targets: Sequence[str] = ()) -> list[str]:
             noise = f"{'normalised' if plan.output.normalised else 'float_clean'}_{noise}"
         elif uses_float32(plan):
             noise = "float32"
-        sets[noise] = None
+        sets[f"linear_{noise}" if plan.source.is_linear and noise != "reference" else noise] = None
     return [*sets]
 
 
@@ -172,7 +184,7 @@ def _failures(kernel_set: str) -> Iterator[str]:
     if difference.any():
         yield "a kernel uses a fused multiply-add"
     for name in (name for name, plan in GOLDEN_PLANS.items() if kernels([plan]) == [kernel_set]):
-        pair = make_pair(golden_image(), GOLDEN_PLANS[name], (1, 57))
+        pair = make_pair(golden_image(GOLDEN_PLANS[name]), GOLDEN_PLANS[name], (1, 57))
         for member, digest in zip(("clean", "noisy"), GOLDEN[name], strict=True):
             if (actual := array_xxh3(getattr(pair, member))) != digest:
                 yield f"the golden {member} frame ({name}) is {actual}, expected {digest}"
@@ -189,11 +201,16 @@ def _product_and_sum(x: Float, y: Float, out: Float) -> None:
         out[n] = x[n] * x[n] + y[n]
 
 
-def golden_image() -> Srgb:
-    """Return an image of 19 x 83 pixels made with integer arithmetic: ramps, every code, black and white stripes."""
+def golden_image(plan: Plan = GOLDEN_PLAN) -> Srgb:
+    """Return an image of 19 x 83 pixels made with integer arithmetic: ramps, every code, black and white stripes.
+
+    As light of a linear source it is between -1/8 and nearly 4.
+    """
     y, x = np.mgrid[0:19, 0:83]
     ramp = (x * 255 // 82, (x * 31 + y * 83) % 256, 255 - y * 255 // 18)
     image = np.stack(ramp, axis=-1).astype(np.uint8)
     image[:, 20:40] = 255
     image[:, 50:70] = 0
+    if plan.source.is_linear:
+        return image.astype(np.float32) / np.float32(64) - np.float32(0.125)
     return image

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from dataclasses import replace
 
 import numpy as np
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
-from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb
+from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb, last_code
 from unprocess_gen.core.errors import FilteredError, MachineError, SourceError
 from unprocess_gen.core.source import Source
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.decode import Photograph, decode
+from unprocess_gen.sources.linear.files import read_linear_source
+from unprocess_gen.sources.linear.pixels import linear_photograph
 from unprocess_gen.sources.raw.frames import read_raw_source
 from unprocess_gen.sources.reading import ReadFile, read_bytes
 
@@ -28,7 +31,10 @@ def load_source(
     """
     if config.place is None:
         try:
-            photograph = Photograph(synthetic.picture(source.path), orientation=1)
+            if config.kind == "linear":
+                photograph = linear_photograph(config, synthetic.scene(source.path))
+            else:
+                photograph = Photograph(synthetic.picture(source.path), orientation=1)
         except ValueError as error:  # only the row of an edited manifest can name a picture that does not exist
             raise SourceError("unreadable", str(error)) from error
         digest = hashlib.sha256(photograph.srgb.data).hexdigest()
@@ -43,6 +49,8 @@ def load_source(
         try:
             if config.kind == "raw":
                 photograph = read_raw_source(config, content, source.name)
+            elif config.kind == "linear":
+                photograph = read_linear_source(config, content, source.name)
             else:
                 photograph = decode(content, max_pixels=config.max_pixels, icc=config.icc, name=source.name)
         except SourceError as error:
@@ -85,10 +93,16 @@ def _check_size(config: SourceConfig, srgb: Srgb, layout: str, digest: str) -> N
 def downscaled(srgb: Srgb, side: int) -> Srgb:
     """Average squares of pixels in integer arithmetic: uint16, the code nearest to each mean.
 
-    8-bit code k counts as 257 k. Rows and columns that fill no square are omitted.
+    8-bit code k counts as 257 k. Rows and columns that fill no square are omitted. Light is added in float64, row by
+    row, and rounded to float32.
     """
     height, width = (length // side for length in srgb.shape[:2])
     squares = srgb[: height * side, : width * side].reshape(height, side, width, side, 3)
-    sums = squares.sum(axis=(1, 3), dtype=np.uint64) * np.uint64(2 * 65535 // int(np.iinfo(srgb.dtype).max))
+    if srgb.dtype == np.float32:
+        total = np.zeros((height, width, 3))
+        for y, x in itertools.product(range(side), range(side)):
+            total += squares[:, y, :, x]
+        return np.asarray(total / (side * side), dtype=np.float32)
+    sums = squares.sum(axis=(1, 3), dtype=np.uint64) * np.uint64(2 * 65535 // last_code(srgb))
     count = np.uint64(side * side)
     return np.asarray((sums + count) // (np.uint64(2) * count), dtype=np.uint16)

@@ -90,6 +90,8 @@ def _settings_of(root: str | None, source: Source, prepared: SourcePlan) -> Sour
     place = None if source.size_bytes == 0 else root  # synthetic pictures have no bytes
     icc = "convert" if prepared.profile.name else "ignore"
     config = SourceConfig(root=place, max_pixels=NO_LIMIT, downscale=prepared.downscale, icc=icc)
+    if prepared.is_linear:
+        return replace(config, kind="linear", primaries=prepared.primaries)
     if not prepared.is_raw:
         return config
     pattern = None if PurePosixPath(source.path).suffix.lower() in RAW_FILES else prepared.raw_pattern

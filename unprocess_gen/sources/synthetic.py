@@ -14,13 +14,15 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
+Pixel = TypeVar("Pixel", bound=np.generic)
 
 KINDS = ("dead_leaves", "colour_chart", "highlights")
 
@@ -58,8 +60,13 @@ def picture(name: str) -> NDArray[np.uint8]:
 
     A frame of a clip (``<kind>-<number>/<frame>``) is a window of the picture, which moves by `PAN`.
     """
+    return _window(name, _drawn)
+
+
+def _window(name: str, draw: Callable[[str], NDArray[Pixel]]) -> NDArray[Pixel]:
+    """Cut the window of a frame from a picture, if it is a clip."""
     clip, slash, frame = name.partition("/")
-    pixels = _drawn(clip)
+    pixels = draw(clip)
     if not slash:
         return pixels.copy()
     if frame not in map("{:04}".format, range(FRAMES_PER_CLIP)):
@@ -69,9 +76,26 @@ def picture(name: str) -> NDArray[np.uint8]:
     return pixels[top : top + height, left : left + width].copy()
 
 
+def scene(name: str) -> NDArray[np.float32]:
+    """Draw the light of a picture: float32 ``[H, W, 3]``, scene-linear sRGB, 1 at display white and more above it."""
+    return _window(name, _light)
+
+
+@lru_cache(maxsize=1)
+def _light(name: str) -> NDArray[np.float32]:
+    """Draw the light of a picture, once for all frames of its clip."""
+    light, _ = _painted(name)
+    return np.ascontiguousarray(np.maximum(light, 0.0).transpose(1, 2, 0), np.float32)
+
+
 @lru_cache(maxsize=1)
 def _drawn(name: str) -> NDArray[np.uint8]:
-    """Draw a picture, once for all frames of its clip; a number has one spelling, so that a picture has one name."""
+    """Draw a picture, once for all frames of its clip."""
+    return _encode(*_painted(name))
+
+
+def _painted(name: str) -> tuple[Float, _Draws]:
+    """Paint the light of a picture; a number has one spelling, so that a picture has one name."""
     match = re.fullmatch(r"(.*)-(?:0|[1-9][0-9]*)", name)
     if match is None or match[1] not in KINDS:
         raise ValueError(
@@ -79,7 +103,7 @@ def _drawn(name: str) -> NDArray[np.uint8]:
             "and the number 0 or more without leading zeros"
         )
     draws, (height, width) = _Draws(name), SIZES.get(name, DEFAULT_SIZE)
-    return _encode(PAINTERS[match[1]](draws, height, width), draws)
+    return PAINTERS[match[1]](draws, height, width), draws
 
 
 class _Draws:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.composition import composed_config
 from unprocess_gen.config.option_files import OptionFolders
-from unprocess_gen.config.raw_validation import require_photographs
 from unprocess_gen.config.schema import Config, SourceConfig
 from unprocess_gen.config.serialization import read_dataset_yaml
+from unprocess_gen.config.source_validation import require_kind
 from unprocess_gen.core.arrays import PACKED, Srgb
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
@@ -112,7 +112,7 @@ class Exploration:
 
     def _composed(self) -> tuple[Config, dict[str, str | None]]:
         config, choices = composed_config(self.overrides, self.folders)
-        require_photographs(config.source, "explore")
+        require_kind(config.source, "explore", "srgb")
         return config, choices
 
     def with_settings(self, settings: dict[str, str]) -> Exploration:

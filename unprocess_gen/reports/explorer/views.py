@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import PACKED, Float
+from unprocess_gen.core.arrays import PACKED, Float, last_code
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.explorer.exploration import Shown
 from unprocess_gen.reports.noise_check.repetition import measure_noise
@@ -85,7 +85,7 @@ def view(shown: Shown, window: panels.Window, common: bool) -> dict[str, Any]:
     height, width = columns["clean"].shape
     srgb, sites = shown.srgb[window], shown.saturated[window].astype(np.float64)
     source = srgb if is_single else cv2.resize(srgb, (width, height), interpolation=cv2.INTER_AREA)
-    columns["source"] = _words(source / np.iinfo(srgb.dtype).max)
+    columns["source"] = _words(source / last_code(srgb))
     columns |= {name: source[..., channel].astype(np.uint16) for channel, name in enumerate("rgb")}
     coloured = (
         panels.colour_sites(sites, pattern)
@@ -146,7 +146,7 @@ def curves(shown: Shown, fit: NoiseFit | None) -> dict[str, list[Curve]]:
 
 def _source_histogram(shown: Shown) -> Iterator[Curve]:
     for channel, name in enumerate(("red", "green", "blue")):
-        counts, edges = np.histogram(shown.srgb[..., channel], BINS, (0.0, np.iinfo(shown.srgb.dtype).max + 1.0))
+        counts, edges = np.histogram(shown.srgb[..., channel], BINS, (0.0, last_code(shown.srgb) + 1.0))
         yield Curve(name, COLOURS[name], edges[:-1], counts / counts.sum())
 
 

@@ -8,7 +8,9 @@ The first pass over a strip treats every site as unclipped. The second recompute
 
 Two forms: `Unprocessing` is equal to `reference.unprocess` and `reference.sensor.to_dn` to the last bit (float64, in
 the reference's order of operations). `Unprocessing32` (float32, of the tier ``fast``) tabulates products that include
-gains, exposure and span, so sums of them are DN above the black level; see `FLOAT32_CLEAN_DN`.
+gains, exposure and span, so sums of them are DN above the black level; see `FLOAT32_CLEAN_DN`. `LinearLight` and
+`LinearLight32` take the light of linear sources in place of codes: products are computed, in float64, and light above
+white stays in the unrounded clean frame, from which noise follows.
 """
 
 from __future__ import annotations
@@ -25,10 +27,11 @@ from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 from unprocess_gen.simulation.kernels.site_patterns import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.strips import Buffers, SiteMap, Strip, count_outside, strip_values
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.plan import MOST_LIGHT, Plan
 from unprocess_gen.simulation.profiles import light_tables
 from unprocess_gen.simulation.reference.cfa import tile
-from unprocess_gen.simulation.reference.colour import Matrix, from_primaries
+from unprocess_gen.simulation.reference.colour import Matrix
+from unprocess_gen.simulation.reference.primaries import light_colours
 
 _0, _8 = np.uint64(0), np.uint64(8)
 _ROW_SITES = VECTOR_WIDTH + 2
@@ -53,12 +56,12 @@ def is_steep(plan: Plan) -> bool:
     camera, isp, exposure = plan.camera, plan.isp, plan.scene.exposure
     if plan.source.is_raw:  # its light has no colours and gains
         return exposure > MAX_ERROR_GAIN
-    rgb2cam = from_primaries(camera.rgb2cam, plan.source.profile.to_srgb)
-    rows = [sum(abs(entry) for entry in rgb2cam[start : start + 3]) * exposure for start in (0, 3, 6)]
+    matrix, inverse_gains = light_colours(plan.source, camera)
+    rows = [sum(abs(entry) for entry in matrix[start : start + 3]) * exposure for start in (0, 3, 6)]
     highlights = 0.0 if isp.highlight == "none" else 1 + 2 / (1 - isp.highlight_threshold)
     return any(
         row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN
-        for row, gain in zip(rows, camera.inverse_gains, strict=True)
+        for row, gain in zip(rows, inverse_gains, strict=True)
     )
 
 
@@ -68,7 +71,8 @@ def is_steep(plan: Plan) -> bool:
 class Unprocessing(NamedTuple):
     """Parameters of a clean frame in float64."""
 
-    products: NDArray[Any]  # [3, 3, codes]: matrix entry (c, j) times the curve at code k; [4, 3, codes] of raw sources
+    # [3, 3, codes]: matrix entry (c, j) times the curve at code k; [4, 3, codes] of raw sources; [3, 4] of linear ones
+    products: NDArray[Any]
     code_count: int
     site_channels: NDArray[np.int64]  # [2, VECTOR_WIDTH + 2]: channel of each CFA site; of raw sources its plane
     inverse_gains: NDArray[Any]  # [3]
@@ -82,7 +86,8 @@ class Unprocessing(NamedTuple):
     darkest: float
     brightest: float
     clipped: float  # light above it counts as clipped
-    white: float  # light above it counts as clipped before the exposure; infinity without an exposure ratio
+    white: float  # light above it counts as clipped before the exposure; infinity if none is
+    clean_dn: float  # highest clean value of linear sources, rounded; in float32 above black
     black_dn: Any  # float, or uint32 in Unprocessing32
     span_dn: float
     dn_per_signal: float  # scale of the signal with gray_mean
@@ -100,16 +105,32 @@ class Unprocessing32(Unprocessing):
     """
 
 
-def unprocessing_of(
-    plan: Plan, codes: int, origin: tuple[int, int], kind: type[Unprocessing] = Unprocessing
-) -> Unprocessing:
-    """Numbers of a clean frame from ``codes`` codes; ``kind`` is `Unprocessing` or `Unprocessing32`."""
-    in_float32, is_raw, camera = kind is Unprocessing32, plan.source.is_raw, plan.camera
+class LinearLight(Unprocessing):
+    """Parameters of a clean frame of a linear source in float64.
+
+    A row of ``products`` has the entries of the matrix and the largest signal: light above `MOST_LIGHT` by far, which
+    keeps the first pass finite. ``white`` is `MOST_LIGHT`.
+    """
+
+
+class LinearLight32(Unprocessing32):
+    """Parameters of a clean frame of a linear source in float32, as `LinearLight`."""
+
+
+KINDS = (Unprocessing, Unprocessing32), (LinearLight, LinearLight32)
+"""Records of codes and of light, each in float64 and in float32."""
+
+
+def unprocessing_of(plan: Plan, codes: int, origin: tuple[int, int], in_float32: bool = False) -> Unprocessing:
+    """Numbers of a clean frame from ``codes`` codes, or from light, in float64 or float32."""
+    is_raw = plan.source.is_raw
+    kind: type[Unprocessing] = KINDS[plan.source.is_linear][in_float32]
     channels = _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2, is_raw)
     f: Any = np.float32 if in_float32 else float
     exposure, brightest, threshold = plan.scene.exposure, plan.brightest, plan.isp.highlight_threshold
     black_dn, span_dn = plan.sensor.black_level_dn, float(plan.sensor.span_dn)
-    gray_mean, inverse_gains = plan.isp.highlight == "gray_mean" and not is_raw, camera.inverse_gains
+    matrix, inverse_gains = light_colours(plan.source, plan.camera)
+    gray_mean = plan.isp.highlight == "gray_mean" and not is_raw
     # of the channels that remain: `_fill_gray_mean_signal` has inverted the gains already
     gains = (1.0, 1.0, 1.0, 1.0) if is_raw else (1.0, 1.0, 1.0) if gray_mean else inverse_gains
     has_term = plan.isp.highlight == "per_channel"
@@ -122,7 +143,7 @@ def unprocessing_of(
     _fill_sites(gains, scale, limit, has_term, channels, sites)
     limits, light_per_signal, site_gains, headroom = sites
     return kind(
-        products=_products(plan, codes, ones if gray_mean else scale, f),
+        products=_products(plan, codes, matrix, gains, ones if gray_mean else scale, f),
         code_count=codes,
         site_channels=channels,
         inverse_gains=np.array(inverse_gains, dtype=f),
@@ -136,7 +157,8 @@ def unprocessing_of(
         darkest=f(plan.darkest * (1 + FLOAT32_MARGIN) if in_float32 else plan.darkest),
         brightest=f(brightest),
         clipped=f(brightest * (1 + FLOAT32_MARGIN) if in_float32 else brightest),
-        white=f(np.inf if exposure == 1 else 1 + FLOAT32_MARGIN if in_float32 else 1),
+        white=f(_white_of(plan, in_float32)),
+        clean_dn=f(brightest * span_dn if in_float32 else round(plan.brightest_dn)),
         black_dn=np.uint32(black_dn) if in_float32 else float(black_dn),
         span_dn=f(span_dn),
         dn_per_signal=f(exposure * span_dn if in_float32 else 1.0),
@@ -148,22 +170,34 @@ def unprocessing_of(
     )
 
 
+def _white_of(plan: Plan, in_float32: bool) -> float:
+    """Return the light that counts as clipped before the exposure, or the most light of a linear source."""
+    if plan.source.is_linear:
+        return MOST_LIGHT
+    return np.inf if plan.scene.exposure == 1 else 1 + FLOAT32_MARGIN if in_float32 else 1.0
+
+
 def _linear_limit(plan: Plan, brightest: float, exposure: float, gain: float) -> float:
     """Return a signal up to which no site is clipped or saturated, with a margin for rounding errors."""
     light = min(brightest * 0.999, brightest - 1 / plan.sensor.span_dn)
     if light < 0:  # black rounds to the DN of the full well, so all sites count as saturated
         return -np.inf
-    return min(1.0, light / exposure) / gain * 0.999
+    most = np.inf if plan.source.is_linear else 1.0
+    return min(most, light / exposure) / gain * 0.999
 
 
-def _products(plan: Plan, codes: int, scale: tuple[float, ...], dtype: Any) -> NDArray[Any]:
+def _products(
+    plan: Plan, codes: int, matrix: Matrix, gains: tuple[float, ...], scale: tuple[float, ...], dtype: Any
+) -> NDArray[Any]:
     """Return each entry of the matrix times the light of each code, in the scale of its channel."""
     if plan.source.is_raw:
         return np.asarray(_raw_products(plan, codes) * np.array(scale)[:, None, None], dtype)
+    if plan.source.is_linear:
+        largest = 2 * MOST_LIGHT / (np.array(gains) * plan.scene.exposure)
+        return np.asarray(np.column_stack([np.reshape(matrix, (3, 3)), largest]) * np.array(scale)[:, None])
     products = np.empty((3, 3, codes), dtype)
-    profile = plan.source.profile
-    curves = light_tables(profile, plan.isp.tone, plan.isp.gamma, codes)
-    _fill_products(from_primaries(plan.camera.rgb2cam, profile.to_srgb), curves, scale, products)
+    curves = light_tables(plan.source.profile, plan.isp.tone, plan.isp.gamma, codes)
+    _fill_products(matrix, curves, scale, products)
     return products
 
 
@@ -233,7 +267,7 @@ def _load_sites(values: Pointer, strip: Strip) -> Vector:
 
 
 @inner
-def _fill_signal(codes: Pointer, strip: Strip, inverse: Any, signal: Pointer) -> None:
+def _fill_signal_of_codes(inverse: Any, codes: Pointer, strip: Strip, signal: Pointer) -> None:
     """Linearise codes and apply the matrix, for the channel of each site: sum three products."""
     channels, code_count = simd.pointer_to(inverse.site_channels, _ROW_SITES * (strip.y & 1)), inverse.code_count
     even = simd.pointer_to(inverse.products, 3 * code_count * channels[0])
@@ -242,6 +276,23 @@ def _fill_signal(codes: Pointer, strip: Strip, inverse: Any, signal: Pointer) ->
         table = odd if x & 1 else even
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
         signal[x] = (table[r] + table[code_count + g]) + table[2 * code_count + b]
+
+
+@inner
+def _fill_signal_of_light(inverse: Any, light: Pointer, strip: Strip, signal: Pointer) -> None:
+    """Apply the matrix to light, for the channel of each site."""
+    channels = simd.pointer_to(inverse.site_channels, _ROW_SITES * (strip.y & 1))
+    even, odd = simd.pointer_to(inverse.products, 4 * channels[0]), simd.pointer_to(inverse.products, 4 * channels[1])
+    for x in range(strip.length):
+        row = odd if x & 1 else even
+        r, g, b = np.float64(light[3 * x]), np.float64(light[3 * x + 1]), np.float64(light[3 * x + 2])
+        value = (row[0] * r + row[1] * g) + row[2] * b
+        signal[x] = simd.maximum(simd.minimum(value, row[3]), -row[3])
+
+
+_fill_signal = by_class({Unprocessing: _fill_signal_of_codes, LinearLight: _fill_signal_of_light,
+                         LinearLight32: _fill_signal_of_light})  # fmt: skip
+"""Fill the signal of a strip; arguments: numbers of the clean frame, pixels, strip, signal."""
 
 
 @inner
@@ -285,7 +336,33 @@ def _store_clean32(inverse: Unprocessing32, above_black: Vector, x: np.uint64, b
     simd.store(buffers.clean, x, simd.to_bits(above_black + ROUND32) + inverse.black_dn)
 
 
-_store_clean = by_class({Unprocessing: _store_clean64, Unprocessing32: _store_clean32})
+@inner
+def _store_linear64(inverse: LinearLight, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
+    """Store eight values of light as `_store_clean64` does; only the clean frame is clipped."""
+    dn = above_black + inverse.black_dn
+    rounded = (dn + ROUND) - ROUND
+    simd.store(buffers.unrounded_dn, x, dn)
+    simd.store(buffers.rounded_dn, x, simd.to_float32(rounded))
+    simd.store(buffers.residual_dn, x, simd.to_float32(dn - rounded))
+    simd.store(buffers.clean, x, simd.to_uint32(simd.to_float32(simd.minimum(rounded, inverse.clean_dn))))
+
+
+@inner
+def _store_linear32(inverse: LinearLight32, above_black: Vector, x: np.uint64, buffers: Buffers) -> None:
+    """Store eight values of light as `_store_clean32` does; only the clean frame is clipped."""
+    simd.store(buffers.unrounded_dn, x, above_black)
+    clipped = simd.minimum(above_black, inverse.clean_dn)
+    simd.store(buffers.clean, x, simd.to_bits(clipped + ROUND32) + inverse.black_dn)
+
+
+_store_clean = by_class(
+    {
+        Unprocessing: _store_clean64,
+        Unprocessing32: _store_clean32,
+        LinearLight: _store_linear64,
+        LinearLight32: _store_linear32,
+    }
+)
 """Store eight clean values, given as DN above black."""
 _linear_dn = by_class(
     {
@@ -320,7 +397,7 @@ def fill_clean(inverse: Any, codes: Pointer, strip: Strip, buffers: Buffers, cou
     if inverse.gray_mean:
         _fill_gray_mean_signal(codes, strip, inverse, signal)
     else:
-        _fill_signal(codes, strip, inverse, signal)
+        _fill_signal(inverse, codes, strip, signal)
     has_negative, has_bright = _fill_linear(inverse, strip, buffers)
     if has_bright:
         counts[strips.LIGHT_HIGH] += _recompute_bright(inverse, strip, buffers)
@@ -357,7 +434,7 @@ def _fill_linear(inverse: Any, strip: Strip, buffers: Buffers) -> tuple[bool, bo
 
 
 @inner
-def _recompute_bright(inverse: Any, strip: Strip, buffers: Buffers) -> int:
+def _recompute_highlights(inverse: Any, strip: Strip, buffers: Buffers) -> int:
     """Recompute vectors that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
 
     ``bright_light`` receives their light, and 0 elsewhere. Return how many sites are above ``inverse.white``.
@@ -385,3 +462,35 @@ def _recompute_bright(inverse: Any, strip: Strip, buffers: Buffers) -> int:
         clipped = simd.minimum(simd.maximum(light, inverse.darkest), inverse.brightest)
         _store_clean(inverse, clipped * inverse.span_dn, x, buffers)
     return above_white
+
+
+@inner
+def _recompute_light(inverse: Any, strip: Strip, buffers: Buffers) -> int:
+    """Recompute vectors of a linear source that contain a bright signal: limit of the light, and fixed pattern.
+
+    ``bright_light`` receives their light, and 0 elsewhere. Return how many sites are above ``inverse.white``.
+    """
+    above_limit = 0
+    limits, light_per_signal = _load_sites(inverse.limits, strip), _load_sites(inverse.light_per_signal, strip)
+    gains = _load_sites(inverse.gains, strip)
+    for n in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(n) * _8
+        signal = simd.load(buffers.signal, x)
+        if not simd.has_any_bit(simd.less_than(limits, signal)):
+            simd.store(buffers.bright_light, x, signal * 0.0)
+            continue
+        light = signal * light_per_signal * gains * inverse.exposure
+        simd.store(buffers.bright_light, x, light)
+        for site in range(n * VECTOR_WIDTH, (n + 1) * VECTOR_WIDTH):
+            if strip.first <= site < strip.after:
+                above_limit += buffers.bright_light[site] > inverse.white
+        light = _with_response(inverse, simd.minimum(light, inverse.white), x, strip)
+        simd.store(buffers.bright_light, x, light)
+        limited = simd.minimum(simd.maximum(light, inverse.darkest), inverse.white)
+        _store_clean(inverse, limited * inverse.span_dn, x, buffers)
+    return above_limit
+
+
+_recompute_bright = by_class({Unprocessing: _recompute_highlights, LinearLight: _recompute_light,
+                              LinearLight32: _recompute_light})  # fmt: skip
+"""Recompute vectors that contain a bright signal; arguments: numbers of the clean frame, strip, buffers."""

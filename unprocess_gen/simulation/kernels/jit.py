@@ -56,8 +56,8 @@ _INNER_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cpython_wrappe
 def by_class(implementations: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
     """Make a function for kernels that calls one of several, chosen by the class of its first argument, a named tuple.
 
-    Compiled kernels contain only the chosen one, because Numba knows the class when it compiles them. All take the same
-    number of arguments.
+    A class without a function of its own has that of its base. Compiled kernels contain only the chosen one, because
+    Numba knows the class when it compiles them. All take the same number of arguments.
     """
 
     def call(first: Any, *others: Any) -> Any:
@@ -72,9 +72,10 @@ def by_class(implementations: Mapping[type, Callable[..., Any]]) -> Callable[...
 
 
 def _implementation(implementations: Mapping[type, Any], kind: type) -> Any:
-    if kind not in implementations:
+    base = next((base for base in kind.__mro__ if base in implementations), None)
+    if base is None:
         raise TypeError(f"{kind.__name__}: no kernel takes it")
-    return implementations[kind]
+    return implementations[base]
 
 
 @functools.cache

@@ -45,6 +45,9 @@ from unprocess_gen.simulation.kernels.strips import Buffers, Strip, count_outsid
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.cfa import plane_sites
 
+FAR_DN = 2.0**22
+"""Light of linear sources in DN from which float32 does not bound the error of a noisy value."""
+
 _8 = np.uint64(8)
 
 
@@ -57,6 +60,8 @@ class ReadOut(NamedTuple):
     black_dn: Any  # in the unrounded clean frame
     span_dn: float
     white: float  # clean value of saturated sites
+    clean_high_dn: float  # highest clean value
+    far_dn: float  # unrounded clean value from which sites are computed exactly; infinity if they have none
     packed: bool
     planes: NDArray[np.int64]  # [4]: first element of the plane of each site of the tile
 
@@ -98,7 +103,7 @@ def readout_of(
     Redrawn plans of a config share it: to prepare it takes 5 µs, as long as the dispatch of a kernel.
     """
     first, frames = plans[0], [(plan.sensor, plan.noise.variance_line) for plan in plans]
-    key = *frames, first.output, first.brightest, first.averaged, shape, origin, counts_from_black
+    key = *frames, first.output, first.brightest, first.most_light, first.averaged, shape, origin, counts_from_black
     return _kept.get(key) or _kept.keep(key, _readout_of(plans, shape, origin, counts_from_black))
 
 
@@ -122,6 +127,8 @@ def _readout_of(
         black_dn=np.float32(0) if counts_from_black else float(first.sensor.black_level_dn),
         span_dn=float(first.sensor.span_dn),
         white=first.saturated_value,
+        clean_high_dn=first.sensor.limits_dn[1] if first.averaged else first.brightest_dn,
+        far_dn=FAR_DN if first.source.is_linear and not counts_from_black else np.inf,
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
@@ -198,8 +205,15 @@ def _read_integers(readout: Any, noise: Any, n: int, output: Output, strip: Stri
     listed, has_clipped = _round_and_list(noise, base, low, high, strip, buffers)
     for m in range(listed):
         site = np.int64(buffers.uncertain[m])  # as below: Numba compiles a function for each type of index
+        if buffers.unrounded_dn[site] >= limits.pinned_from:  # replaced below
+            continue
         dn = np.float32((_exact_site(noise, n, site, strip, buffers) + ROUND) - ROUND)
         has_clipped = _replace(site, dn, low, high, buffers) or has_clipped
+    if output.may_saturate and readout.far_dn < np.inf:
+        for x in range(strip.first, strip.after):
+            if readout.far_dn <= buffers.unrounded_dn[x] < limits.pinned_from:
+                far_dn = np.float32((_exact_site(noise, n, x, strip, buffers) + ROUND) - ROUND)
+                has_clipped = _replace(x, far_dn, low, high, buffers) or has_clipped
     if output.may_saturate and limits.pinned_from < np.inf:
         dn = np.float32((limits.pinned_dn + ROUND) - ROUND)
         for x in range(strip.first, strip.after):
@@ -302,8 +316,7 @@ def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip:
 @inner
 def _write_normalised(readout: Any, output: Output, strip: Strip, buffers: Buffers) -> None:
     limits = load_limits(readout, np.int64(0))
-    high = limits.high if readout.averaged else readout.black_dn + readout.span_dn
-    _normalise(readout, buffers.unrounded_dn, limits.low, high, strip, buffers.normalised)
+    _normalise(readout, buffers.unrounded_dn, limits.low, readout.clean_high_dn, strip, buffers.normalised)
     if output.may_saturate:
         output.counts[strips.SATURATED] += _count_equal(strip, buffers.normalised, np.float32(readout.white))
     _write(readout, strip, buffers.normalised, output.sites)

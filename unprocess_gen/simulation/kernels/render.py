@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from unprocess_gen.core.arrays import PACKED, Frame, Srgb
 from unprocess_gen.simulation.facts import DarkPixels
 from unprocess_gen.simulation.kernels.clean import (
-    Unprocessing,
     Unprocessing32,
     fill_clean,
     is_steep,
@@ -70,8 +69,7 @@ class Renderer:
             np.float32 if is_normalised else np.uint16
             for is_normalised in (first.output.clean_normalised, first.output.normalised)
         ]
-        kind = Unprocessing32 if in_float32 else Unprocessing  # selects the precision
-        self._inverse = unprocessing_of(first, codes, corner, kind)
+        self._inverse = unprocessing_of(first, codes, corner, in_float32)
         self._noise: Gaussian | Gaussian32 | None = None  # noise in electrons depends on the place
         if not first.counts_electrons:
             lines = tuple(plan.noise.variance_line for plan in plans)
@@ -109,7 +107,7 @@ class Renderer:
         counts = np.zeros((max(len(keys), 1), COUNT_FIELDS), np.int64)
         # a view, a read-only array or a subclass would be another type, compiled again
         codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
-        scratch = scratch_of_thread(np.float32 if type(inverse) is Unprocessing32 else np.float64)
+        scratch = scratch_of_thread(np.float32 if isinstance(inverse, Unprocessing32) else np.float64)
         sites = clean.reshape(-1), noisy.reshape(len(keys), clean.size)
         _render(codes, inverse, noise, keys, origin, self._readout, scratch, *sites, counts)
         return clean, noisy, counts

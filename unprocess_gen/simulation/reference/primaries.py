@@ -9,7 +9,17 @@ import functools
 from collections.abc import Sequence
 from fractions import Fraction
 
-from unprocess_gen.simulation.reference.colour import Matrix, exact_inverse, matrix
+from unprocess_gen.simulation.plan import CameraPlan, SourcePlan
+from unprocess_gen.simulation.reference.colour import (
+    IDENTITY,
+    RGB2XYZ,
+    Matrix,
+    exact_inverse,
+    from_primaries,
+    invert,
+    matrix,
+    multiply,
+)
 
 Exact = list[Fraction]
 """Nine entries of a matrix, row by row, or three of a vector."""
@@ -21,6 +31,7 @@ PRIMARIES: dict[str, tuple[float, ...]] = {
     "srgb": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *D65),  # IEC 61966-2-1
     "p3": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *D65),  # SMPTE EG 432-1
     "rec2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *D65),  # ITU-R BT.2020
+    "acescg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),  # AP1, S-2014-004
 }
 """Chromaticities x, y of red, green, blue and white of colour spaces."""
 
@@ -90,6 +101,59 @@ def xyz2srgb(colorants: Sequence[float | Fraction]) -> Matrix:
 def primaries2srgb(chromaticities: Sequence[float | Fraction]) -> Matrix:
     """Compute the matrix from linear RGB to linear sRGB; arguments and errors are those of `primaries2xyz`."""
     return xyz2srgb(primaries2xyz(chromaticities))
+
+
+CAMERA, XYZ = "camera", "xyz"
+"""Primaries of linear sources that are no RGB space: sensor RGB, and XYZ, whose white is D65 as that of `CAMERAS`."""
+
+
+@functools.lru_cache(maxsize=1024)
+def to_camera(rgb2cam: Matrix, primaries: str) -> Matrix:
+    """Compute the matrix from the linear RGB of a linear source to the camera.
+
+    Parameters
+    ----------
+    rgb2cam : Matrix
+        Matrix from linear sRGB to the camera.
+    primaries : str
+        `XYZ`, a name of `PRIMARIES`, or the eight numbers of `primaries2xyz`, separated by ``;``.
+
+    Returns
+    -------
+    Matrix
+        The product; its rows sum to 1, so that white stays white, except from XYZ.
+    """
+    if primaries == XYZ:
+        return multiply(rgb2cam, invert(RGB2XYZ))
+    return from_primaries(rgb2cam, None if primaries == "srgb" else _to_srgb(primaries))
+
+
+@functools.lru_cache(maxsize=64)
+def _to_srgb(primaries: str) -> Matrix:
+    return primaries2srgb(PRIMARIES.get(primaries) or [*map(float, primaries.split(";"))])
+
+
+def light_colours(source: SourcePlan, camera: CameraPlan) -> tuple[Matrix, tuple[float, float, float]]:
+    """Choose the matrix from the linear RGB of a source to the camera, and the inverse gains of the channels.
+
+    Parameters
+    ----------
+    source : SourcePlan
+        Its ``primaries``, if it is a linear source; sensor RGB (`CAMERA`) needs neither matrix nor gains. The
+        ``profile`` of a photograph.
+    camera : CameraPlan
+        Matrix from linear sRGB, and gains.
+
+    Returns
+    -------
+    Matrix, tuple of three floats
+        The matrix, and factors of red, green and blue.
+    """
+    if source.primaries == CAMERA:
+        return IDENTITY, (1.0, 1.0, 1.0)
+    if source.is_linear:
+        return to_camera(camera.rgb2cam, source.primaries), camera.inverse_gains
+    return from_primaries(camera.rgb2cam, source.profile.to_srgb), camera.inverse_gains
 
 
 def _product(left: Exact, right: Exact) -> Exact:

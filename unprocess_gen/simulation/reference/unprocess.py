@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.arrays import Float, Srgb
+from unprocess_gen.core.arrays import Float, Srgb, last_code
 from unprocess_gen.core.random_streams import declare_stream, words
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.profiles import UNCONVERTED, Profile, light_tables
 from unprocess_gen.simulation.reference.cfa import mosaic, plane_sites
-from unprocess_gen.simulation.reference.colour import from_primaries
+from unprocess_gen.simulation.reference.primaries import light_colours
 
 
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
@@ -25,8 +25,8 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float
 
     Parameters
     ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes, R, G, B.
+    srgb : ndarray of uint8, uint16 or float32, [H, W, 3]
+        Display-referred codes, R, G, B; float32 is the light of a linear source.
     plan : Plan
         Parameters of the pair.
     origin : (int, int)
@@ -80,8 +80,8 @@ def camera_light(srgb: Srgb, plan: Plan) -> Float:
 
     Parameters
     ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Codes k, which mean k / 255 or k / 65535.
+    srgb : ndarray of uint8, uint16 or float32, [H, W, 3]
+        Codes k, which mean k / 255 or k / 65535; float32 is the light of a linear source.
     plan : Plan
         Parameters of the pair.
 
@@ -90,14 +90,15 @@ def camera_light(srgb: Srgb, plan: Plan) -> Float:
     ndarray of float64, [H, W, 3]
         Camera RGB, 0 at black and 1 at white.
     """
-    image = linear_light(srgb, plan.isp.tone, plan.isp.gamma, plan.source.profile)
-    image = apply_ccm(image, from_primaries(plan.camera.rgb2cam, plan.source.profile.to_srgb))
-    return invert_gains(image, plan.camera.inverse_gains, plan.isp.highlight, plan.isp.highlight_threshold)
+    matrix, gains = light_colours(plan.source, plan.camera)
+    isp, profile = plan.isp, plan.source.profile
+    image = srgb.astype(np.float64) if plan.source.is_linear else linear_light(srgb, isp.tone, isp.gamma, profile)
+    return invert_gains(apply_ccm(image, matrix), gains, isp.highlight, isp.highlight_threshold)
 
 
 def linear_light(srgb: Srgb, tone: str, gamma: float | str, profile: Profile = UNCONVERTED) -> Float:
     """Invert the tone curve (key of `INVERSE_TONES`) and the gamma (exponent, or ``srgb``), by the exact tables."""
-    red, green, blue = light_tables(profile, tone, gamma, int(np.iinfo(srgb.dtype).max) + 1)
+    red, green, blue = light_tables(profile, tone, gamma, last_code(srgb) + 1)
     if red is green is blue:
         return red[srgb]
     return np.stack([red[srgb[..., 0]], green[srgb[..., 1]], blue[srgb[..., 2]]], axis=-1)

@@ -35,6 +35,7 @@ from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.simulation.facts import RawParts
+from unprocess_gen.simulation.plan import SourcePlan
 from unprocess_gen.simulation.profiles import UNCONVERTED, Profile
 from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, probe, tiff_without_orientation
@@ -79,9 +80,9 @@ _COLOUR_16 = _COLOUR | cv2.IMREAD_ANYDEPTH
 class Photograph:
     """Decoded pixels ``srgb``, uint8 or uint16 [H, W, 3], R, G, B, after applying the EXIF ``orientation``.
 
-    Of a raw source, they are codes of its camera RGB, and ``raw`` is what the file states. Codes are not converted from
-    ``profile``: plans do. ``pixels_xxh3`` is the digest of pixels that depend on the version of their decoder.
-    ``note`` is a warning.
+    Of a raw source, they are codes of its camera RGB, and ``raw`` is what the file states. Of a linear source, they are
+    light, float32, and ``source`` is what the file states. Codes are not converted from ``profile``: plans do.
+    ``pixels_xxh3`` is the digest of pixels that depend on the version of their decoder. ``note`` is a warning.
     """
 
     srgb: Srgb
@@ -90,6 +91,7 @@ class Photograph:
     note: str = ""
     profile: Profile = UNCONVERTED
     pixels_xxh3: str = ""
+    source: SourcePlan | None = None
 
 
 def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Photograph:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,8 +50,12 @@ class RawFrame(NamedTuple):
     metadata: RawMetadata
 
 
-def decoder_versions() -> dict[str, str]:
-    """Versions that decide how raw files are decoded."""
+def decoder_versions(kind: str) -> dict[str, str]:
+    """Versions that decide how the files of a kind of source are decoded."""
+    if kind == "linear":
+        return {name.lower(): version(name) for name in ("OpenEXR", "tifffile") if find_spec(name)}
+    if kind != "raw":
+        return {}
     import rawpy
 
     return {"rawpy": version("rawpy"), "libraw": ".".join(map(str, rawpy.libraw_version))}

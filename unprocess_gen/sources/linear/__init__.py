@@ -1,0 +1,1 @@
+"""Read scene-linear pictures: OpenEXR, Radiance HDR, float TIFF and NPY."""
