@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -67,7 +69,7 @@ def colours(prefix: str = "", light: np.ndarray = LIGHT) -> dict[str, np.ndarray
 def test_formats_have_the_same_light(exr: Callable[..., bytes]) -> None:
     files = {
         "a.exr": exr({"RGB": LIGHT}), "b.EXR": exr(colours("beauty.")), "c.npy": npy(LIGHT), "d.tif": tiff(LIGHT),
-        "e.tiff": tiff(LIGHT, compression="zlib", predictor=True), "f.npy": npy(LIGHT.astype(">f4")),
+        "e.tiff": tiff(LIGHT, compression="zlib"), "f.npy": npy(LIGHT.astype(">f4")),
     }  # fmt: skip
     found = [read(content, name) for name, content in files.items()]
     assert all((photograph.srgb == LIGHT).all() and photograph.srgb.dtype == np.float32 for photograph in found)
@@ -236,6 +238,13 @@ def test_other_exr_files_are_refused(exr: Callable[..., bytes], tmp_path: Path) 
     deep = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
     OpenEXR.File(deep, dict.fromkeys("RGB", samples)).write(str(tmp_path / "deep.exr"))
     assert refused((tmp_path / "deep.exr").read_bytes(), "a.exr").startswith("unsupported: is deep")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imagecodecs") is not None, reason="imagecodecs decodes LZW")
+def test_compression_without_its_codec_is_named() -> None:
+    content, tag = tiff(LIGHT, compression="zlib"), struct.pack("<HHI", 259, 3, 1)
+    lzw = content.replace(tag + struct.pack("<H", 8), tag + struct.pack("<H", 5))
+    assert refused(lzw, "a.tif") == "unsupported: its compression needs imagecodecs; pip install imagecodecs"
 
 
 def test_every_suffix_of_the_option_has_a_decoder() -> None:

@@ -56,7 +56,9 @@ def _decode_tiff(content: bytes, max_pixels: int) -> Light:
             pixels = page.asarray()
     except SourceError:
         raise
-    except Exception as error:  # a damaged file raises various types, and another codec ValueError
+    except Exception as error:  # a damaged file raises various types
+        if "imagecodecs" in str(error):
+            raise SourceError("unsupported", "its compression needs imagecodecs; pip install imagecodecs") from error
         raise SourceError("corrupt", f"tifffile cannot decode it ({type(error).__name__})") from error
     return Light(pixels[..., :3], note="has alpha, which is left out" if pixels.shape[2] > 3 else "")
 
