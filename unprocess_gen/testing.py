@@ -1,4 +1,4 @@
-"""Test classes to inherit: laws of an effect, and of a camera body or noise profile.
+"""Test classes to inherit, for an effect and for a camera body or noise profile.
 
 A subclass names what it tests, and pytest runs the inherited tests. Statistical tolerances follow from the sample size.
 Random numbers are those of the simulation, so a test always has the same result.
@@ -72,7 +72,7 @@ def assert_equal(found: Pair, expected: Pair, part: Any = np.s_[:]) -> None:
 
 
 class EffectTests:
-    """Laws of an effect of the sensor.
+    """Test an effect of the sensor.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class EffectTests:
     numbers : mapping of str to value
         Fields of `Plan` with which the effect is visible; by default those of `PHYSICS`.
     needs : sequence of str
-        Other effects without which it changes nothing.
+        Other effects without which the effect changes nothing.
     in_clean : bool
         Whether the clean frame has the effect too.
     physics : Physics or None
@@ -129,7 +129,7 @@ class EffectTests:
         return 0.0, BY_NAME[self.effect].contribution(frame, signal_dn, math.inf).variances
 
     def plan(self, on: Sequence[str], **changes: Any) -> Plan:
-        """Return the plan of a frame with these effects, and other values of fields."""
+        """Return the plan of a frame with the effects ``on``; ``changes`` are other fields."""
         effects = tuple(name for name in BY_NAME if name in on)
         return FLAT.replace(**{"physics": self.physics, "effects": effects, **self.numbers, **changes})
 
@@ -143,7 +143,7 @@ class EffectTests:
         return (pair.noisy.astype(np.float64) - pair.clean) * FLAT.sensor.span_dn
 
     def others(self, only: set[str] | None = None) -> list[str]:
-        """List the effects that fill no slot of this one, and ``only`` these slots."""
+        """List the effects that fill no slot of this effect, and no slots except ``only``."""
         filled = {name: {*BY_NAME[name].slots(self.plan([]))} for name in PHYSICAL_EFFECTS if self.physics}
         own = BY_NAME[self.effect].slots(self.plan([])).keys()
         return [name for name, slots in filled.items() if not slots & own and (only is None or slots <= only)]
@@ -158,7 +158,7 @@ class EffectTests:
             yield self.plan([self.effect, *others], dtype=dtype, sensor_clip=clip)
 
     def test_off_changes_nothing(self) -> None:
-        """Without the effect its numbers decide no byte, with it frames differ; the switch leaves it out."""
+        """Numbers of the effect change bytes only if it is on; its switch turns it off."""
         off = self.plan(self.others())
         assert_equal(self.pair(off), self.pair(FLAT.replace(physics=self.physics, effects=off.noise.effects)))
         on = self.pair(self.plan([self.effect, *self.others()]))
@@ -168,7 +168,7 @@ class EffectTests:
             assert self.effect not in api.plan_image(np.zeros((2, 2, 3), np.uint8), config).noise.effects
 
     def test_stream_is_its_own(self) -> None:
-        """The effect has no stream of another, and changes no slot and no value of another."""
+        """The effect shares no random stream with other effects, and changes none of their slots and values."""
         if self.physics:
             own, others = BY_NAME[self.effect].slots(self.plan([])).keys(), self.others()
             frames = (slots_of(self.plan(on)) for on in (others, [self.effect, *others]))
@@ -201,7 +201,7 @@ class EffectTests:
                     assert abs(excess) <= error * float(square.std()) + ROUNDED, text
 
     def test_tiles_have_the_bytes_of_the_frame(self) -> None:
-        """Any tile, and any single pixel, is that part of the frame."""
+        """A tile or a single pixel equals its part of the frame, byte for byte."""
         for plan, (y, x, height, width) in product(self.cases(), ((0, 0, 1, 1), (5, 17, 9, 66), (3, 64, 20, 70))):
             part = np.s_[y : y + height, x : x + width]
             tile = self.pair(plan, np.ascontiguousarray(RAMP[part]), origin=(y, x))
@@ -215,7 +215,7 @@ class EffectTests:
             assert exact.counts == reference.counts
 
     def test_clean_frame_has_shared_effects_only(self) -> None:
-        """Clean frames have what both frames share; with ``clean.includes_fixed_pattern``, fixed patterns too."""
+        """Clean frames have shared effects; with ``clean.includes_fixed_pattern``, fixed patterns too."""
         effect = BY_NAME[self.effect]
         for averaged in (False, True) if self.physics else (False,):
             changes = {"fixed_pattern_in_clean": True} if averaged else {}
@@ -239,18 +239,18 @@ class EffectTests:
 
 LINEAR = ("camera=identity", "gains=unity", "isp=linear", "output.dtype=float32", "sensor.clip=none")
 OFF = [f"effects.{name}=off" for name in PHYSICAL_EFFECTS if name not in ("shot", "dark_current", "read", "quantise")]
-"""Effects off whose variance is in lines, in few pixels, or not linear in the signal."""
+"""Overrides that turn off effects whose variance is in lines, in few pixels, or not linear in the signal."""
 
 
 class BodyTests:
-    """Laws of a camera body, or of a noise profile.
+    """Test a camera body, or a noise profile.
 
     Attributes
     ----------
     body, noise : str
-        Option that is tested: one of them.
+        Option to test; set one of the two.
     config_dir : path-like or None
-        Folder of own options, as with ``--config-dir``.
+        Folder of your own options, as with ``--config-dir``.
     overrides : sequence of str
         Settings that the option needs, such as ``noise.iso=1600``.
 
@@ -287,7 +287,7 @@ class BodyTests:
             yield config
 
     def flat(self, config: Config, code: int) -> api.RawPair:
-        """Make the pair of a flat field of an 8-bit code."""
+        """Simulate the pair of a flat field of an 8-bit code."""
         return api.make_pair(np.full((512, 512, 3), code, dtype=np.uint8), config)
 
     def test_every_scene_can_be_planned(self) -> None:

@@ -69,7 +69,7 @@ SHORTHANDS = {
 """Overrides that choose an option, because patterns and sensor follow from the kind of the source."""
 
 NO_NUMBERS = ("name", "negative_variance", "assumed", "unsourced", "provenance")
-"""Keys of a noise profile that are no numbers; those of the section `CHOSEN` are none either."""
+"""Keys of a noise profile that are no numbers, in addition to the keys of the section `CHOSEN`."""
 
 MAX_JOBS = 100_000
 """Most jobs of one sweep: each takes 0.2 s to compose, so a larger number is a mistake."""

@@ -21,7 +21,7 @@ def text(what: str) -> Limit:
 
 
 def are_texts(values: Any) -> bool:
-    """True if all items of a list are texts that are not empty; OmegaConf accepts lists and mappings as items too."""
+    """True if all items of a list are non-empty texts; OmegaConf also accepts lists and mappings as items."""
     return all(isinstance(value, str) and value for value in values)
 
 
@@ -87,7 +87,7 @@ NAME = Limit(
 """Names that rows of a manifest contain."""
 
 OVERRIDDEN = "*"
-"""End of the name of a noise profile of which a number is overridden."""
+"""Last character of the name of a noise profile with an overridden number."""
 
 PROFILE_NAME = Limit(
     f"{NAME}, and {OVERRIDDEN} at the end if a number of the profile is overridden",

@@ -22,7 +22,7 @@ PATH_KEYS = ("source.root", "source.list", "noise.dark_frames", "out")
 """Keys whose values are paths, which are quoted for Hydra's grammar."""
 
 WORDS_OF_HYDRA = ("null", "true", "false", "nan", "inf")
-"""Words that are no texts in overrides."""
+"""Words that Hydra's grammar does not read as text."""
 
 
 def overrides_of_mapping(settings: Mapping[Any, Any], own: Path | None = None) -> list[str]:
@@ -62,7 +62,7 @@ def _overrides(
 
 
 def _option_of(group: str, node: DictConfig, folders: Sequence[Path]) -> tuple[list[str], Mapping[str, Any]]:
-    """Overrides that choose the option that a group names, and its values.
+    """Overrides that choose the option named in a group, and the values of the option.
 
     A group with another name is an option of the application: its missing keys have the defaults of the schema.
     """
@@ -87,7 +87,7 @@ def _text(key: str, value: Any) -> str:
 
 
 def override_text(value: Any) -> str:
-    """A value in Hydra's grammar of overrides."""
+    """Value in Hydra's grammar of overrides."""
     if isinstance(value, bool) or value is None:
         return {None: "null", True: "true", False: "false"}[value]
     if is_number(value):

@@ -148,7 +148,7 @@ def crop_words(key: int, patch: int, level: int, draw: int, word_3: int, crop: i
 
 
 def even_corner(place: Sequence[int], side: int, height: int, width: int) -> tuple[int, int]:
-    """Even row and column of a square in a rectangle that two random words choose."""
+    """Even row and column, chosen by two random words, of a square in a rectangle."""
     rows, columns = (height - side) // 2 + 1, (width - side) // 2 + 1
     return 2 * (place[0] * rows >> 32), 2 * (place[1] * columns >> 32)
 

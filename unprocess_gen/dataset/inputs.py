@@ -1,4 +1,4 @@
-"""Cut, flip and convert pairs to the arrays that a network takes: the options that `RawPairs` and `LivePairs` share."""
+"""Cut, flip and convert pairs to network inputs: the options that `RawPairs` and `LivePairs` share."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TEXTS = {column.name for column in COLUMNS if column.type is number_or_text}
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Arguments of `RawPairs` and `LivePairs`, which document them, that change an item; ``reader`` is the class."""
+    """Arguments that change an item, documented by `RawPairs` and `LivePairs`; ``reader`` is the name of the class."""
 
     reader: str
     patch: int | None = None
@@ -63,11 +63,11 @@ class Options:
 
     @property
     def side(self) -> int | None:
-        """Side of the square to cut: a flip may leave out a site on each side."""
+        """Side of the square to cut, with the site on each side that a flip may leave out."""
         return self.patch if self.patch is None else self.patch + 2 * self.flip
 
     def place(self, words: tuple[int, int], height: int, width: int) -> tuple[int, int]:
-        """Corner of the square in a pair, which random words choose; ConfigError if the pair is smaller."""
+        """Corner of the square, chosen by random ``words``; ConfigError if the pair is smaller."""
         side = self.side or 0
         if side > min(height, width):
             problem = f"patch={self.patch}: exceeds a pair of {width} x {height} pixels"
@@ -83,9 +83,9 @@ class Options:
         development: Callable[[], DevelopmentParameters],
         **cells: Value,
     ) -> Any:
-        """Sample or dict of a pair that has been cut, where ``columns`` are levels, pattern, layout and noise.
+        """Flip a sample that has been cut, and convert it to a dict if ``inputs`` is set.
 
-        ``cells`` are those of columns that some rows lack.
+        ``columns`` are levels, pattern, layout and noise of the row; ``cells`` are columns that some rows lack.
         """
         if self.flip:  # by the lowest bits, which do not decide the corner
             hows = tuple(how for bit, how in enumerate(FLIPS) if words[0] >> bit & 1)
@@ -105,7 +105,7 @@ class Options:
         return {**arrays, "development": development(), **row}
 
     def _layout(self, name: str, sites: NDArray[Any], columns: Row) -> NDArray[Any]:
-        """Picture, mosaic or planes, as ``inputs`` says, in an array of its own."""
+        """Copy of an array as picture, mosaic or planes, according to ``inputs``."""
         pattern, is_picture = str(columns["pattern"]), name in PICTURES
         if columns["layout"] == PACKED and not is_picture:
             return np.array(sites) if self.inputs == PACKED else cfa.unpack(sites, pattern)
@@ -115,13 +115,13 @@ class Options:
 
 
 def stackable_row(row: Row, cells: Row) -> dict[str, Any]:
-    """Row whose columns have one type in every pair: NaN instead of None, text where some pairs have text."""
+    """Row whose columns have one type in every pair: NaN instead of None, text if some pairs have text."""
     cells = {**cells, **{name: math.nan if value is None else value for name, value in row.items()}}
     return {name: str(value) if name in TEXTS else value for name, value in cells.items()}
 
 
 def cut(sample: Any, columns: Row, corner: tuple[int, int], side: int) -> Any:
-    """Sample of a square at an even row and column: views of its arrays."""
+    """Sample with views of the arrays in a square at an even row and column."""
 
     def part(name: str, array: NDArray[Any]) -> NDArray[Any]:
         scale = 2 if columns["layout"] == PACKED and name not in PICTURES else 1
@@ -134,23 +134,23 @@ def cut(sample: Any, columns: Row, corner: tuple[int, int], side: int) -> Any:
 def flip(x: Any, how: str, pattern: str = "RGGB") -> Any:
     """Flip a mosaic or an item so that it keeps its CFA pattern.
 
-    Sites are moved, none is computed. A mosaic of even width is mirrored without its first and last column, since the
-    phase of the colours would change otherwise; likewise an even height. A transposition that would exchange red and
-    blue leaves out the first and last row and column. Banding along rows becomes banding along columns by it.
+    Sites are moved, not computed. Mirroring an even width changes the phase of the colours, so the first and last
+    column are left out; likewise rows of an even height. A transposition that exchanges red and blue leaves out the
+    first and last row and column. Transposition turns banding along rows into banding along columns.
 
     Parameters
     ----------
     x : ndarray, [..., H, W]; or an item of `RawPairs` or `LivePairs`
-        Mosaics, or a `Sample` or dict, all arrays of which are flipped. Its row stays that of the pair.
+        Mosaics; or a `Sample` or dict, whose arrays are all flipped. The row does not change.
     how : str
         ``"horizontal"`` (columns in reverse order), ``"vertical"`` (rows), or ``"transpose"`` (rows become columns).
     pattern : str
-        CFA pattern of mosaics: RGGB, BGGR, GRBG, GBRG, or MONO, which leaves out nothing. An item has its own.
+        CFA pattern of mosaics: RGGB, BGGR, GRBG, GBRG, or MONO, which leaves out nothing. Items have their own.
 
     Returns
     -------
     ndarray, Sample or dict
-        Of the kind of ``x``; copies.
+        Copies, of the type of ``x``.
 
     Raises
     ------

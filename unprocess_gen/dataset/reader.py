@@ -103,9 +103,9 @@ _FramesAndTargets = namedtuple("_FramesAndTargets", "clean noisy row targets")
 
 
 def stackable(sample: Sample | dict[str, Any], **cells: Value) -> Any:
-    """Item of a pair, so that PyTorch's default ``collate_fn`` stacks it: a named tuple of a sample, or a dict.
+    """Item that PyTorch's default ``collate_fn`` stacks: a named tuple for a sample; a dict is unchanged.
 
-    ``cells`` are those of columns that some rows lack.
+    ``cells`` are columns that some rows lack.
     """
     if isinstance(sample, dict):
         return sample
@@ -114,7 +114,7 @@ def stackable(sample: Sample | dict[str, Any], **cells: Value) -> Any:
 
 
 def row_of_batch(row: Row) -> Row:
-    """Row as it was before `stackable`; others are the same."""
+    """Row as it was before `stackable_row`; other rows do not change."""
     cells = {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
     return cells | {name: number_or_text(str(cells[name])) for name in TEXTS & cells.keys() if cells[name] is not None}
 
@@ -132,7 +132,7 @@ class RawPairs(PairTable):
 
     ``pairs[i]`` is a `Sample`; negative numbers count from the end, and a slice is a `RawPairs` of those pairs.
     ``pairs["00000003"]`` is the pair with this key. Pairs are in the order of the manifest, without failed sources.
-    Arrays are mapped from the shard. They can be written to; the file does not change.
+    Arrays are mapped from the shard; writing to them does not change the file.
 
     No file stays open and only the position of each row is kept (16 bytes), so an instance can be pickled, forked and
     shared between threads. Needs neither Numba nor OpenCV nor Hydra.
@@ -151,10 +151,10 @@ class RawPairs(PairTable):
     split : str, optional
         Only pairs of this split (key ``split`` of the settings), by default all.
     patch : int, optional
-        Side of a square that is cut from each pair at an even row and column, so that pairs of different sizes stack:
-        that of `LivePairs` with the same ``patch``. The row stays that of the pair.
+        Side of a random square that is cut from each pair at an even row and column, so that pairs of different sizes
+        stack. `LivePairs` with the same ``patch`` cuts the same square. The row does not change.
     flip : bool
-        Each square is mirrored or transposed at random, as `flip` does, in eight ways. Needs ``patch``.
+        Mirror and transpose each square at random, in eight ways, with `flip`. Needs ``patch``.
     inputs : str, optional
         Items are dicts of float32 arrays with 0 at black and 1 at white, which PyTorch's default ``collate_fn``
         stacks: ``noisy``, ``clean`` and targets. ``"mosaic"``: [H, W]. ``"packed"``: [4, H / 2, W / 2], without an odd
@@ -179,7 +179,7 @@ class RawPairs(PairTable):
     DamageError
         If a manifest, a shard or ``sweep.csv`` is missing or damaged; for shards when a pair is read.
     IndexError
-        If a number is out of range.
+        If an epoch or a number is out of range.
     KeyError
         If no pair has a key, or several have it; also a ConfigError.
 
@@ -243,10 +243,10 @@ class RawPairs(PairTable):
         return options.item(sample, sample.row, words, partial(development_parameters, sample.row))
 
     def __getitems__(self, numbers: Sequence[Any]) -> list[Any]:
-        """Read a batch as PyTorch's DataLoader asks for it, in items that its default ``collate_fn`` stacks.
+        """Read a batch for PyTorch's DataLoader, in items that its default ``collate_fn`` stacks.
 
-        Items are named tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets
-        if there are any; with ``inputs`` dicts.
+        With ``inputs``, items are dicts. Otherwise they are named tuples of the clean frame, the noisy frame, the row
+        as a dict with NaN for None, and targets if there are any.
         """
         return [stackable(self[number]) for number in numbers]
 
@@ -258,9 +258,9 @@ def _crop_words(row: Row, epoch: int) -> tuple[int, int]:
 
 
 class DatasetRows:
-    """Rows of the pairs of a dataset, or of those in a split, by number; keeps their places in the manifest alone.
+    """Rows of a dataset's pairs, or of the pairs in a split, by number; keeps only their offsets in the manifest.
 
-    ``name`` is that of the dataset for users, ``splits`` are all that the manifest has.
+    ``name`` is the name of the dataset for users; ``splits`` are all splits in the manifest.
     """
 
     def __init__(self, path: AnyPath, split: str | None = None) -> None:
@@ -282,7 +282,7 @@ class DatasetRows:
         return dict(read_row(self._manifest, int(self._offsets[number]), self._columns))
 
     def pair_rows(self, split: str | None) -> Iterator[tuple[int, Row]]:
-        """Read the rows of pairs in order, with their places in the manifest."""
+        """Read the rows of pairs in order, with their offsets in the manifest."""
         for offset, row in rows_with_offsets(self._manifest):
             if row["status"] == "ok":
                 self._note(row)
@@ -290,7 +290,7 @@ class DatasetRows:
                     yield offset, row
 
     def _note(self, row: Row) -> None:
-        """Note what the rows of all pairs have."""
+        """Collect facts from the row of a pair, in any split."""
         self.splits.add(str(row["split"]))
 
 
@@ -336,9 +336,9 @@ def open_datasets(
     split: str | None,
     open_folder: Callable[[AnyPath, str | None], _Rows],
 ) -> list[_Rows]:
-    """Open a dataset, those of a sweep, or those of a list, which are named by their paths if names occur twice.
+    """Open a dataset, the datasets of a sweep, or those of a list, named by their paths if names occur twice.
 
-    ConfigError, which begins with the class that reads, if the list is empty or no pair is in the split.
+    Raises ConfigError, which begins with the name of the reader, if the list is empty or no pair is in the split.
     """
     roots = [places] if isinstance(places, DatasetPath) else places
     if not roots:
@@ -352,7 +352,7 @@ def open_datasets(
 
 
 def check_split(reader: str, split: str | None, splits: set[str]) -> None:
-    """Raise ConfigError if a split is none of those that occur, where ``""`` means no split."""
+    """Raise ConfigError if a split is not in ``splits``, in which ``""`` means no split."""
     names = sorted(splits - {""})
     if split is not None and split not in names:
         expected = f"expected one of {', '.join(names)}" if names else "there are no splits; set split={…}"

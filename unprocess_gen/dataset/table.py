@@ -1,4 +1,4 @@
-"""Find pairs by their keys and columns: what `RawPairs` and `LivePairs` share."""
+"""Find pairs by key and column: the base of `RawPairs` and `LivePairs`."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.dataset.row import COLUMN_NAMES, KEY_TEXT
 
 MANY = 64
-"""Keys of which an error names some."""
+"""Largest number of keys that are read for an error message."""
 
 
 class PairTable:
-    """Pairs of datasets, one dataset after the other, or some of the pairs.
+    """Pairs of datasets, one dataset after the other, or a selection of the pairs.
 
-    A dataset has a name, a length, and ``key`` and ``row`` for the number of a pair; it is in the order of the keys.
+    A dataset has ``name``, a length, and the methods ``key`` and ``row`` of a pair's number. Its pairs are in the order
+    of their keys.
     """
 
     def __init__(self, datasets: Sequence[Any]) -> None:
@@ -43,7 +44,7 @@ class PairTable:
 
     @property
     def rows(self) -> Rows:
-        """Manifest row of each pair, with its ``dataset``: a sequence of dicts, such as ``pandas.DataFrame`` takes.
+        """Manifest row of each pair, with its ``dataset``: a sequence of dicts, for example for ``pandas.DataFrame``.
 
         A row is read when it is used, in 0.1 ms.
         """
@@ -55,14 +56,14 @@ class PairTable:
         Parameters
         ----------
         test : callable, optional
-            Only pairs whose row makes it true.
+            Function of a row that is true for the pairs to select.
         **columns : str, int, float, None, or an iterable of them
-            Only pairs with this value, or one of these, in a column of `rows`.
+            Value of a column of `rows`, or the allowed values.
 
         Returns
         -------
         RawPairs or LivePairs
-            The selected pairs, in their order and with their noise.
+            The selected pairs in their order, with the same noise.
 
         Raises
         ------
@@ -111,7 +112,7 @@ class PairTable:
         return len(self._numbers)
 
     def _item(self, item: Any) -> tuple[int, int]:
-        """Epoch, and number from 0, of an item that a number or key names, with an epoch or without; IndexError."""
+        """Epoch, and number from 0, of an item: a number or key, or a tuple of epoch and number or key; IndexError."""
         epoch, number = item if isinstance(item, tuple) else (0, item)
         number = self._position(number) if isinstance(number, str) else operator.index(number)
         if not 0 <= operator.index(epoch) < EPOCHS:
@@ -119,7 +120,7 @@ class PairTable:
         return operator.index(epoch), range(len(self))[number]
 
     def _part(self, numbers: NDArray[np.int64]) -> Self:
-        """Reader of some of the pairs."""
+        """Reader of a selection of the pairs."""
         part = copy.copy(self)
         part._numbers = numbers
         return part
@@ -148,7 +149,7 @@ class PairTable:
 
 
 class Rows(Sequence[dict[str, Value]]):
-    """Rows of the pairs of a reader, read when they are used."""
+    """Rows of a reader's pairs, read when they are used."""
 
     def __init__(self, pairs: PairTable) -> None:
         self._pairs = pairs
@@ -168,7 +169,7 @@ class Rows(Sequence[dict[str, Value]]):
 
 
 def _numbers_of(dataset: Any, key: str) -> Sequence[int]:
-    """Numbers of the pairs of a dataset that have a key, or whose keys begin with it, by bisection."""
+    """Numbers of a dataset's pairs that have a key, or whose keys begin with it, by bisection."""
     if not KEY_TEXT.allows(key):
         return ()
     wanted, every = _numbers_in(key), range(len(dataset))

@@ -1,4 +1,4 @@
-"""Make the pairs of a training while it runs: new noise in each epoch, and nothing stored but the manifest."""
+"""Generate training pairs when they are read: new noise in each epoch, and no stored frames."""
 
 from __future__ import annotations
 
@@ -70,29 +70,29 @@ class LiveSample(Sample):
 
 
 class LivePairs(PairTable):
-    """Make the pairs of datasets when they are read, with new noise in each epoch: a map-style dataset.
+    """Generate pairs when they are read, with new noise in each epoch: a map-style dataset.
 
-    ``live[epoch, i]`` depends only on the dataset, epoch and i, whatever process, worker or order reads it. ``live[i]``
-    is epoch 0, which equals ``RawPairs(ds)[i]`` byte for byte. Fixed patterns of a camera body are the same in every
-    epoch. Only the patch is simulated. An instance can be pickled and forked. ``live[epoch, "00000003"]`` is the pair
-    with this key, and a slice is a `LivePairs` of those pairs, unless items are several patches of a pair.
+    ``live[epoch, i]`` depends only on the dataset, epoch and i, not on process, worker or order. ``live[i]`` is epoch
+    0, which equals ``RawPairs(ds)[i]`` byte for byte. Fixed patterns of a camera body are the same in every epoch. Only
+    the patch is simulated. An instance can be pickled and forked. ``live[epoch, "00000003"]`` is the pair with this
+    key, and a slice is a `LivePairs` of those pairs. Both need items that are pairs (``patches=1``).
 
     Parameters
     ----------
     dataset : str, Path, Config, mapping, or a list of str or Path
-        Folder of a dataset or sweep, or a list of them, as for `RawPairs`: manifest and sources are read, not the
-        shards. Or a config, or what `load_config` takes, of which no dataset is generated:
-        pairs are planned when they are read, and a source that cannot be used raises its error.
+        Folder of a dataset or sweep, or a list of them, as for `RawPairs`; shards are not read. Or a config, or an
+        argument of `load_config`: no dataset is generated, and pairs are planned when they are read.
     root : str or Path, optional
-        Folder of the sources; by default the one that the dataset records, or ``source.root`` of the config.
+        Folder of the sources; by default the folder in the dataset's record, or ``source.root`` of the config.
     redraw : str
         ``"noise"``: new noise in each epoch, clean frames as in epoch 0. ``"all"``: new cameras, gains, noise levels
         and random patches too. ``"none"``: the pairs of epoch 0 in every epoch.
     cache : str or Path, optional
-        Folder for decoded pixels, 3 bytes a pixel, which worker processes share; ``"memory"`` for a temporary one. On a
-        full disk, other pixels are decoded each time.
+        Folder for decoded pixels, which worker processes share; ``"memory"`` for a temporary folder. A pixel of an
+        8-bit photograph takes 3 bytes. If the disk is full, further pixels are decoded each time.
     split : str, optional
-        Only pairs of this split, by default all. With overrides, photographs are read once to find theirs.
+        Only pairs of this split, by default all. With a config or overrides, each source is read once to find its
+        split.
     cache_bytes : int
         Size up to which pixels are added to the cache.
     patch : int, optional
@@ -102,12 +102,12 @@ class LivePairs(PairTable):
         Number of such squares of each pair, at random places: consecutive items, which share the decoded image. The
         length grows by this factor. `EpochSampler` with this ``block`` keeps them together.
     targets : sequence of str
-        More arrays: ``"variance"`` of the noise at each site, by the row on the clean frame; ``"noise_std"``, the
-        standard deviation that `noise_std` estimates from the noisy frame; ``"srgb"``, the pixels of the photograph;
-        ``"linear_rgb"``, the scene before the mosaic, 0 at black and 1 at white, [H, W, 3]. The first two are float32,
-        in DN² and DN, or in units of white with ``inputs``; the last is float32.
+        Further arrays. ``"variance"``: expected variance of the noise at each site, from row and clean frame.
+        ``"noise_std"``: `noise_std` of the noisy frame. ``"srgb"``: pixels of the source. ``"linear_rgb"``: light
+        before the mosaic, float32 [H, W, 3], 0 at black and 1 at white. The first two are float32, in DN² and DN, or
+        in units of white with ``inputs``.
     flip, inputs, noise_map, rows, clip_black
-        As for `RawPairs`: random flips in each epoch, and dicts of arrays for a network.
+        As for `RawPairs`: random flips in each epoch, and dicts of network inputs.
 
     Raises
     ------
@@ -222,10 +222,10 @@ class LivePairs(PairTable):
         return part
 
     def __getitems__(self, items: Sequence[int | tuple[int, int]]) -> list[Any]:
-        """Make a batch as PyTorch's DataLoader asks for it, with rows that its default ``collate_fn`` stacks.
+        """Generate a batch for PyTorch's DataLoader, in items that its default ``collate_fn`` stacks.
 
-        Items are named tuples of the clean frame, the noisy frame, the row as a dict with NaN for None, and the targets
-        if there are any; with ``inputs`` dicts.
+        With ``inputs``, items are dicts. Otherwise they are named tuples of the clean frame, the noisy frame, the row
+        as a dict with NaN for None, and targets if there are any.
         """
         return [stackable(self[item], epoch=0) for item in items]
 
@@ -242,7 +242,7 @@ class LivePairs(PairTable):
     def _prepared(
         self, place: int, image: LiveImage, srgb: Srgb, epoch: int, number: int
     ) -> tuple[Plan, Patch, CropMaker]:
-        """Find the plan of an epoch, without its number, the patch, and what makes crops of the image."""
+        """Find the plan of an epoch, without the epoch's number; the patch; and the function that makes crops."""
         redraws = self._redraw == "all"
         plan_epoch = epoch if redraws or image.plan.dark else 0
         settings, patch, frame = self._datasets[place].settings, image.patch, (srgb.shape[0], srgb.shape[1])
@@ -262,7 +262,7 @@ class LivePairs(PairTable):
         return prepared[0], patch, prepared[1]
 
     def _redrawn(self, settings: PairSettings, image: LiveImage, srgb: Srgb, epoch: int, number: int) -> Plan:
-        """Draw the plan of an epoch, without its number."""
+        """Draw the plan of an epoch, without the epoch's number."""
         plan = image.plan
         if self._redraw == "all":
             facts = self._facts.get(number)
@@ -324,7 +324,7 @@ def _is_dataset(place: Any) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class LiveImage:
-    """All that decides a pair in epoch 0, as `dataset.row.pair_row` takes it.
+    """Everything that decides a pair in epoch 0: arguments of `dataset.row.pair_row`.
 
     ``recorded`` reads the row of the pair from the manifest of a dataset, if the row has digests.
     """
@@ -360,7 +360,7 @@ class LiveImage:
 
 
 class RecordedPairs(DatasetRows):
-    """Pairs of a dataset, or of those in a split; reads its manifest and its sources, and no shard."""
+    """Pairs of a dataset, or the pairs in a split, from its manifest and sources, without shards."""
 
     def __init__(self, root: str | None, folder: AnyPath, split: str | None = None) -> None:
         super().__init__(folder, split)
@@ -390,7 +390,7 @@ class RecordedPairs(DatasetRows):
 
 
 class PlannedPairs:
-    """Pairs of listed photographs, planned when they are read, as a run would make them."""
+    """Pairs of listed sources, planned when they are read; equal to the pairs of a run."""
 
     name = ""
 

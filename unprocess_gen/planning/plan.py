@@ -139,7 +139,7 @@ def plan_levels(
 
 
 def draw_split(config: Config, source_sha256: str) -> str:
-    """Name the split of an image, empty without splits; the last one takes what the others leave."""
+    """Name the split of an image, empty without splits; the last split takes the remaining images."""
     splits: dict[str, float] = config.split or {"": 1.0}
     names, ends = list(splits), list(itertools.accumulate(splits.values()))
     return names[bisect.bisect_right(ends[:-1], split_uniform(config.seed, source_sha256))]

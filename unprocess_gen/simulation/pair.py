@@ -220,8 +220,8 @@ def reference_pair(
 def expose(light: Float, plan: Plan) -> tuple[Float, int | None]:
     """Multiply light by the exposure of the scene, and count the sites that are clipped; None if no site can be.
 
-    Light of a photograph is clipped at white first: once darkened, light above white would reappear. That of a linear
-    source is light of the scene, and limited to `MOST_LIGHT` afterwards.
+    Light of a photograph is clipped at white first: once darkened, light above white would reappear. Light of a linear
+    source is limited to `MOST_LIGHT` afterwards.
     """
     exposure = plan.scene.exposure
     if plan.source.is_linear:

@@ -45,7 +45,7 @@ CODE_RANGE = 65535.0
 """Largest code of a raw source."""
 
 MOST_LIGHT = 65536.0
-"""Light of linear sources above it, in units of white, is limited to it, so that float32 kernels stay finite."""
+"""Limit of the light of linear sources, in units of white, which keeps float32 kernels finite."""
 
 
 # ---------------------------------------------------------------------------------------- allowed values and conditions

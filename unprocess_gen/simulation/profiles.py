@@ -19,7 +19,7 @@ from unprocess_gen.simulation.lookup_tables import freeze
 from unprocess_gen.simulation.tone_curves import exact_light, gamma_text, linear_table, power, srgb_compress
 
 SRGB = "sRGB"
-"""Name of sRGB in rows: of photographs without a profile, or with one that moves no colour by more than two codes."""
+"""Name in rows of photographs without a profile, or whose profile moves no colour by more than two 8-bit codes."""
 
 Curve = tuple[float, ...] | bytes
 """Curve from value to light: (g, a, b, c, d, e, f) of (a·x + b)^g + e from x = d on, and c·x + f below it (ICC.1,
@@ -38,7 +38,7 @@ PROFILE_DIGITS = 25
 class Profile(NamedTuple):
     """Colours of a photograph: ``to_srgb`` is the matrix to linear sRGB, None for photographs that are read as sRGB.
 
-    Rows have the name only, and the bytes of the source the numbers. Without a name, colours were not converted.
+    Rows record only the name; the file of the source has the numbers. Without a name, colours were not converted.
     """
 
     name: str = ""
@@ -47,7 +47,7 @@ class Profile(NamedTuple):
 
     @property
     def is_srgb(self) -> bool:
-        """True if codes are those of sRGB; ValueError for the profile of a row that has its name only."""
+        """True if codes are in sRGB; ValueError for a profile from a row, of which only the name is known."""
         if self.to_srgb is None and self.name not in ("", SRGB):
             raise ValueError(f"profile={self.name!r}: only its name is known; expected the profile of the source")
         return self.to_srgb is None
@@ -78,7 +78,7 @@ def _table(curve: Curve, tone: str, gamma: str, codes: int) -> Float:
 
 
 def curve_light(curve: Curve, chosen: Iterable[int], codes: int) -> list[Decimal]:
-    """Light of some of the codes by a curve, relative to that of white, which ValueError says is not nearly 1."""
+    """Light of the chosen codes by a curve, divided by the light of white; ValueError if that is not nearly 1."""
     with localcontext(prec=PROFILE_DIGITS):
         white = _light(curve, codes - 1, codes)
         if abs(white - 1) > Decimal("0.02"):

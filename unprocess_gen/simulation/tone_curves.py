@@ -99,10 +99,10 @@ SRGB_TOE = Decimal("0.04045")
 
 
 def power(base: Decimal, exponent: Decimal) -> Decimal:
-    """Power of a number from 0, in a quarter of the time of ``**``.
+    """Power of a number that is not negative, in a quarter of the time of ``**``.
 
-    Its logarithm is that of a float c near it, which is kept, and the series 2·artanh((x - c) / (x + c)), |x/c - 1| <
-    2**-6, whose terms shrink by 2**-14 each.
+    The logarithm of x is the cached logarithm of a nearby float c plus the series 2·artanh((x - c) / (x + c)). With
+    |x/c - 1| < 2**-6, each term is smaller than the last by 2**-14.
     """
     if not base:
         return base

@@ -1,4 +1,4 @@
-"""Keep decoded pixels in files that processes map into memory, 3 bytes a pixel: reading a patch takes microseconds.
+"""Keep decoded pixels, 3 bytes each at 8 bits, in files that processes map: reading a patch takes microseconds.
 
 A file is an NPY array, then the XXH3-128 of its pixels as 32 hex digits. Each process compares them when it first maps
 the file. A damaged file is replaced.

@@ -200,7 +200,7 @@ Choices = dict[str, Callable[[Exploration], Exploration]]
 def open_place(
     place: AnyPath | None, keys: str | None, overrides: Sequence[str], flags: Sequence[str], folders: OptionFolders
 ) -> tuple[Exploration, Choices]:
-    """List what a photograph, a folder, a dataset, or without a place ``source.root`` offers to open, and the start."""
+    """List the choices of a photograph, folder or dataset, by default of ``source.root``, and the start."""
     added = tuple(override for override in overrides if override.startswith(("+", "~")) or "=" not in override)
     given = dict(override.split("=", 1) for override in overrides if override not in added)
     start = Exploration(folders, given, added, tuple(flags))

@@ -83,7 +83,7 @@ def _xyz2srgb() -> Exact:
 
 
 def xyz2srgb(colorants: Sequence[float | Fraction]) -> Matrix:
-    """Compute the matrix to linear sRGB from that to XYZ with the white `D50`.
+    """Compute the matrix from linear RGB to linear sRGB, given its matrix to XYZ with the white `D50`.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def primaries2srgb(chromaticities: Sequence[float | Fraction]) -> Matrix:
 
 
 CAMERA, XYZ = "camera", "xyz"
-"""Primaries of linear sources that are no RGB space: sensor RGB, and XYZ, whose white is D65 as that of `CAMERAS`."""
+"""Primaries of linear sources without an RGB space: sensor RGB; XYZ with white D65, as for `CAMERAS`."""
 
 
 @functools.lru_cache(maxsize=1024)

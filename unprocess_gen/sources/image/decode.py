@@ -80,8 +80,8 @@ _COLOUR_16 = _COLOUR | cv2.IMREAD_ANYDEPTH
 class Photograph:
     """Decoded pixels ``srgb``, uint8 or uint16 [H, W, 3], R, G, B, after applying the EXIF ``orientation``.
 
-    Of a raw source, they are codes of its camera RGB, and ``raw`` is what the file states. Of a linear source, they are
-    light, float32, and ``source`` is what the file states. Codes are not converted from ``profile``: plans do.
+    A raw source has codes of its camera RGB, and ``raw`` is what the file states. A linear source has light, float32,
+    and ``source`` is what the file states. Codes are not converted from ``profile``; the simulation converts them.
     ``pixels_xxh3`` is the digest of pixels that depend on the version of their decoder. ``note`` is a warning.
     """
 

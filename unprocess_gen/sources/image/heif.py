@@ -1,6 +1,6 @@
-"""Decode HEIC by libheif (pillow-heif), and read what Pillow does not say of AVIF.
+"""Decode HEIC by libheif (pillow-heif), and read facts about AVIF that Pillow does not report.
 
-Libheif rotates pixels, and conceals damage of them: only the recorded digest of the pixels shows it.
+Libheif rotates pixels, and conceals damage: only the recorded digest of the pixels shows it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SEQUENCES = b"hevc", b"hevx", b"msf1"
 def open_heic(data: bytes, is_decoded: bool = False) -> Any:
     """Read facts, size, mode and number of pictures of a HEIC file, or its codes as stored, [H, W] or [H, W, 3 or 4].
 
-    SourceError if libheif cannot, or is not installed.
+    Raises SourceError if libheif cannot read the file, or is not installed.
     """
     if find_spec("pillow_heif") is None:
         problem = "HEIC is read by pillow-heif; in the repository, run: pip install '.[heic]', or convert it to JPEG"
@@ -40,7 +40,7 @@ def open_heic(data: bytes, is_decoded: bool = False) -> Any:
 
 
 def avif_pixels(data: bytes) -> Srgb:
-    """Decode AVIF to codes of 8 bits as they are stored, which OpenCV does of fewer files; SourceError if it fails."""
+    """Decode AVIF to stored codes of 8 bits; OpenCV decodes fewer files. SourceError if it fails."""
     from PIL import AvifImagePlugin
 
     try:
@@ -58,7 +58,7 @@ def avif_facts(data: bytes) -> tuple[int, tuple[int, int] | None]:
 
 
 def widened(codes: Srgb, bits: int) -> Srgb:
-    """Codes of 10 or 12 bits as those of 16, to the nearest."""
+    """Codes of 10 or 12 bits, scaled to the nearest 16-bit codes."""
     white = 2**bits - 1
     table = ((np.arange(white + 1) * 65535 + white // 2) // white).astype(np.uint16)
     wide = np.empty(codes.shape, np.uint16)

@@ -1,7 +1,7 @@
 """Read the colours that a photograph declares: ICC profiles of matrix and curves, code points (H.273), gAMA and cHRM.
 
-Numbers of files are exact, and the matrix to linear sRGB follows in fractions. A profile that moves no colour by more
-than two codes is sRGB: those of sRGB differ in their last digits. Refusals: ``docs/design/decoding.md``.
+Numbers of files are exact; the matrix to linear sRGB is computed in fractions. A profile that moves no colour by more
+than two codes counts as sRGB, because profiles of sRGB differ in their last digits. See ``docs/design/decoding.md``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SRGB_TOLERANCE = 2
 """Largest difference, in 8-bit codes, between a profile and sRGB that still counts as sRGB; real ones differ by 1."""
 
 CURVE_TOLERANCE = 6
-"""Largest difference, in 16-bit codes, between a curve and that of sRGB that is a rounding of its parameters."""
+"""Largest difference from the curve of sRGB, in 16-bit codes, that counts as rounding of a curve's parameters."""
 
 WHITE_TOLERANCE = 0.02
 """Largest difference from 1 of each channel of white in linear sRGB: two codes."""
@@ -47,9 +47,9 @@ def profile_of(header: Header) -> Profile:
 
 
 def _profile(name: str, colorants: Sequence[Fraction], curves: Sequence[Curve | None]) -> Profile:
-    """Profile with these columns of XYZ under D50, and curves of R, G and B; without matrix if it hardly moves colours.
+    """Profile from colorants (XYZ under D50) and the curves of R, G and B; that of sRGB if it hardly moves colours.
 
-    Compared are every third gray, and 216 colours.
+    Every third gray and 216 colours are compared.
     """
     to_srgb, grays = xyz2srgb(colorants), np.arange(0, 256, 3)
     lights = [_rising(curve, grays) for curve in curves]

@@ -15,7 +15,7 @@ from unprocess_gen.sources.linear.pixels import SRGB, Light, chromaticity_text
 
 
 def decode_exr(content: bytes, max_pixels: int) -> Light:
-    """Decode the channels R, G, B, or the one set of channels ``*.R``, ``*.G``, ``*.B``.
+    """Decode the channels R, G, B, or the only set of channels ``*.R``, ``*.G``, ``*.B``.
 
     Raises SourceError if the file is damaged or has other pixels, and ConfigError without OpenEXR.
     """
@@ -28,7 +28,7 @@ def decode_exr(content: bytes, max_pixels: int) -> Light:
 
 
 def _opened(content: bytes, header_only: bool) -> Any:
-    """Open a file, whose damage OpenEXR raises, or only prints."""
+    """Open a file; SourceError for damage, which OpenEXR raises or only prints."""
     import OpenEXR
 
     problem = SourceError("corrupt", "OpenEXR cannot decode all of the file")

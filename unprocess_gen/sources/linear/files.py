@@ -21,7 +21,7 @@ from unprocess_gen.sources.raw.mosaics import mosaic_pixels
 def read_linear_source(config: SourceConfig, content: bytes, name: str) -> Photograph:
     """Decode the bytes of a linear source, whose ``name`` gives the format.
 
-    Raises SourceError if they are damaged or no scene-linear picture, and ConfigError if a library is missing.
+    Raises SourceError if the file is damaged or is no scene-linear picture, and ConfigError if a library is missing.
     """
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in DECODERS:
@@ -66,4 +66,4 @@ def _decode_tiff(content: bytes, max_pixels: int) -> Light:
 DECODERS = {
     ".exr": decode_exr, ".hdr": decode_radiance, ".npy": _decode_npy, ".tif": _decode_tiff, ".tiff": _decode_tiff,
 }  # fmt: skip
-"""Functions of the bytes of a file and the most pixels, by suffix."""
+"""Decoders by suffix; their arguments are the bytes of a file and the largest number of pixels."""

@@ -66,6 +66,6 @@ def linear_pixels(pixels: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def linear_photograph(config: SourceConfig, light: Srgb, stated: str = SRGB, note: str = "") -> Photograph:
-    """Light with its digest and the source of its plan: downscaling, and primaries, given or stated by the file."""
+    """Photograph of light, with its digest, and the downscaling and primaries that its plan has as source."""
     source = SourcePlan(config.downscale, "off", primaries=config.primaries or stated)
     return Photograph(light, 1, note=note, source=source, pixels_xxh3=array_xxh3(light))

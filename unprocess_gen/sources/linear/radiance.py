@@ -22,7 +22,7 @@ SHORTEST, LONGEST = 8, 0x7FFF
 
 
 def decode_radiance(content: bytes, max_pixels: int) -> Light:
-    """Decode a picture, and divide it by its exposures; SourceError if it is damaged or stored in another way.
+    """Decode a picture and divide it by its exposures; SourceError if it is damaged or has another layout.
 
     A mantissa m with the exponent e is the light m · 2^(e - 136).
     """
@@ -61,7 +61,7 @@ def decode_radiance(content: bytes, max_pixels: int) -> Light:
 
 @kernel
 def _fill_codes(data: NDArray[np.uint8], codes: NDArray[np.uint8]) -> Any:
-    """Decode rows of mantissas and exponents, and return how many are intact."""
+    """Decode rows of mantissas and exponents, and return the number of intact rows."""
     height, width = codes.shape[:2]
     place, size = np.int64(0), data.size
     for y in range(height):
