@@ -13,10 +13,11 @@ from PIL import Image
 
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.planning.source_noise import noise_ratio, source_noise_dn, tile_noise
 from unprocess_gen.simulation.pair import reference_pair
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.plan import Plan, SourcePlan
 from unprocess_gen.sources.loader import downscaled
 
 
@@ -49,6 +50,15 @@ def test_estimate_is_the_noise_of_the_clean_frame(plan: Plan) -> None:
     srgb = np.rint(np.random.default_rng(2).normal(120, 3, (256, 256, 3))).astype(np.uint8)
     green = reference_pair(srgb, plan).clean[::2, 1::2]
     assert source_noise_dn(srgb, plan) == pytest.approx(green.std(), rel=0.1)
+
+
+def test_noise_of_light_that_the_exposure_brings_below_white_counts(settings: Settings) -> None:
+    config = settings("source.kind=linear", "scene.ev=-3", "camera=sony_a7r", "noise=imx385_iso3200")
+    light = np.random.default_rng(2).normal(3, 0.1, (256, 256, 3)).astype(np.float32)
+    facts = facts_of(light, source=SourcePlan(1, "off", primaries="srgb"))
+    planned = plan_image(config, "a" * 64, facts=facts)
+    green = reference_pair(light, planned).clean[::2, 1::2]
+    assert source_noise_dn(light, planned) == pytest.approx(green.std(), rel=0.1)
 
 
 def test_estimate_is_the_same_on_every_machine(plan: Plan) -> None:

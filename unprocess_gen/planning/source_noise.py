@@ -75,7 +75,8 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     else:
         light = camera_light(tiles[quiet], plan)[..., 1]
     span = float(plan.sensor.white_level_dn - plan.sensor.black_level_dn)
-    steps = np.rint(np.clip(light, plan.darkest, 1) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
+    white = 1 / plan.scene.exposure if plan.source.is_linear else 1.0  # in light before the exposure
+    steps = np.rint(np.clip(light, plan.darkest, white) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
     _, height, width = steps.shape
     sites = (height - 2) * (width - 2)
     std_dn = _laplacian_sums(steps) * (LAPLACIAN_SCALE / (sites * STEPS_PER_DN))

@@ -17,6 +17,7 @@ from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.linear.files import DECODERS, read_linear_source
+from unprocess_gen.sources.linear.pixels import linear_pixels
 
 LIGHT = (np.random.default_rng(1).random((13, 40, 3)) ** 4 * 5 + 0.01).astype(np.float32)
 LIGHT[3:5, 4:30] = 2.5
@@ -42,8 +43,12 @@ def npy(array: np.ndarray) -> bytes:
 
 def tiff(array: np.ndarray, **options: Any) -> bytes:
     tifffile, file = pytest.importorskip("tifffile"), io.BytesIO()
-    tifffile.imwrite(file, array, photometric="rgb", **options)
+    tifffile.imwrite(file, array, **{"photometric": "rgb", **options})
     return file.getvalue()
+
+
+def npy_header(text: str) -> bytes:
+    return b"\x93NUMPY\1\0" + bytes([len(text) + 1, 0]) + text.encode() + b"\n"
 
 
 @pytest.fixture
@@ -69,13 +74,18 @@ def colours(prefix: str = "", light: np.ndarray = LIGHT) -> dict[str, np.ndarray
 def test_formats_have_the_same_light(exr: Callable[..., bytes]) -> None:
     files = {
         "a.exr": exr({"RGB": LIGHT}), "b.EXR": exr(colours("beauty.")), "c.npy": npy(LIGHT), "d.tif": tiff(LIGHT),
-        "e.tiff": tiff(LIGHT, compression="zlib"), "f.npy": npy(LIGHT.astype(">f4")),
+        "e.tiff": tiff(LIGHT, compression="zlib", byteorder=">"), "f.npy": npy(LIGHT.astype(">f4")),
     }  # fmt: skip
     found = [read(content, name) for name, content in files.items()]
     assert all((photograph.srgb == LIGHT).all() and photograph.srgb.dtype == np.float32 for photograph in found)
     assert {(photograph.source, photograph.note) for photograph in found} == {(found[0].source, "")}
     for content, name in ((exr({"RGB": HALVES}), "a.exr"), (npy(HALVES), "a.npy"), (tiff(HALVES), "a.tif")):
         assert (read(content, name).srgb == HALVES).all()
+
+
+def test_arrays_of_the_other_byte_order_are_light() -> None:
+    swapped = linear_pixels(LIGHT.astype(LIGHT.dtype.newbyteorder("S")))
+    assert swapped.dtype == np.dtype("=f4") and (swapped == LIGHT).all()
 
 
 def test_half_floats_keep_their_smallest_numbers(exr: Callable[..., bytes]) -> None:
@@ -88,6 +98,10 @@ def test_alpha_is_left_out_with_a_note(exr: Callable[..., bytes]) -> None:
     for content, name in ((exr({"RGBA": rgba}), "a.exr"), (tiff(rgba), "a.tif")):
         photograph = read(content, name)
         assert (photograph.srgb == LIGHT).all() and photograph.note == "has alpha, which is left out"
+
+
+def test_a_colour_profile_of_tiff_has_a_note() -> None:
+    assert "a colour profile, which is not read" in read(tiff(LIGHT, iccprofile=bytes(128)), "a.tif").note
 
 
 def test_r_g_b_win_over_layers_whose_names_decide_otherwise(exr: Callable[..., bytes]) -> None:
@@ -201,6 +215,9 @@ REFUSED = {
     "nan.npy": (npy(np.where(LIGHT > 4, np.nan, LIGHT).astype(np.float32)), "corrupt: has .* pixels that are NaN"),
     "half.npy": (npy(np.full((2, 2, 3), np.inf, np.float16)), "corrupt: has 4 pixels that are NaN or infinite"),
     "cut.npy": (npy(LIGHT)[:-9], "corrupt: cannot be decoded"),
+    "header.npy": (npy_header("{'shape': (2, 2"), "corrupt: cannot be decoded"),
+    "bomb.npy": (npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (999999999999,)}"), "corrupt: declares"),
+    "lab.tif": (tiff(LIGHT, photometric="cielab"), "unsupported: is float32 .* photometric 8"),
     "codes.tif": (tiff((LIGHT * 50).astype(np.uint8)), "unsupported: is uint8"),
     "pages.tif": (tiff(np.stack([LIGHT, LIGHT])), "unsupported: is .* 2 pages"),
     "cut.tif": (tiff(LIGHT)[:-9], "corrupt: tifffile cannot decode it"),

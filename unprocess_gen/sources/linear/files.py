@@ -47,8 +47,10 @@ def _decode_tiff(content: bytes, max_pixels: int) -> Light:
             pages, page = len(file.pages), cast(Any, file.pages[0])
             orientation, size = page.tags.valueof("Orientation", 1), (page.imagelength, page.imagewidth)
             is_light = page.dtype in (np.float16, np.float32) and page.shape in ((*size, 3), (*size, 4))
-            if pages > 1 or orientation != 1 or not is_light:
+            colours, has_profile = int(page.photometric), "InterColorProfile" in page.tags
+            if pages > 1 or orientation != 1 or not is_light or colours not in RGB:
                 actual = f"{page.dtype} {list(page.shape)}, orientation {orientation}, {pages} page{'s' * (pages > 1)}"
+                actual += f", photometric {colours}" * (colours not in RGB)
                 problem = f"is {actual}; expected one upright page [H, W, 3] of float16 or float32"
                 raise SourceError("unsupported", problem)
             if size[0] * size[1] > max_pixels:
@@ -60,7 +62,13 @@ def _decode_tiff(content: bytes, max_pixels: int) -> Light:
         if "imagecodecs" in str(error):
             raise SourceError("unsupported", "its compression needs imagecodecs; pip install imagecodecs") from error
         raise SourceError("corrupt", f"tifffile cannot decode it ({type(error).__name__})") from error
-    return Light(pixels[..., :3], note="has alpha, which is left out" if pixels.shape[2] > 3 else "")
+    notes = "has alpha, which is left out" if pixels.shape[2] > 3 else "", PROFILE_NOTE if has_profile else ""
+    return Light(pixels[..., :3], note="; ".join(filter(None, notes)))
+
+
+RGB = 1, 2
+"""Photometric interpretations of TIFF: writers that know no better state gray for three samples."""
+PROFILE_NOTE = "has a colour profile, which is not read; values are taken as linear light of source.primaries"
 
 
 DECODERS = {

@@ -56,7 +56,8 @@ NAMES = {_spelled(numbers): name for name, numbers in CHROMATICITIES.items()}
 def linear_pixels(pixels: NDArray[Any]) -> NDArray[np.float32]:
     """Convert decoded light to float32 [H, W, 3] in native byte order; SourceError if it is no finite light."""
     actual = f"{pixels.dtype} {list(pixels.shape)}"
-    if pixels.dtype not in (np.float16, np.float32) or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
+    is_float = pixels.dtype.newbyteorder("=") in (np.float16, np.float32)
+    if not is_float or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise SourceError("unsupported", f"is {actual}; expected light [H, W, 3] of float16 or float32")
     light = np.ascontiguousarray(pixels, np.float32)
     if not np.isfinite(light).all():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,9 +35,12 @@ def mosaic_pixels(content: bytes, suffix: str, max_pixels: int = 2**30) -> NDArr
         try:
             pixels: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
             return np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
-        except (ValueError, EOFError, AttributeError) as error:
+        except (ValueError, EOFError, AttributeError, TokenError) as error:
             text = str(error).splitlines()[0] if str(error) else "no array"
             raise SourceError("corrupt", f"cannot be decoded ({text})") from error
+        except MemoryError as error:
+            np.empty(4 * len(content), np.uint8)  # raises another one if memory is short
+            raise SourceError("corrupt", f"declares an array that its {len(content)} bytes cannot hold") from error
     if suffix == ".pgm":
         return _pgm_pixels(content)
     picture = decode(content, max_pixels=max_pixels, icc="ignore")
