@@ -44,7 +44,14 @@ def as_overrides(data: dict[str, Any]) -> list[str]:
     return [f"{group}.{key}={value}" for group, keys in data.items() for key, value in keys.items()]
 
 
-@pytest.mark.parametrize("path", OF_ONE_GROUP, ids=lambda path: f"{path.parent.name}={path.stem}")
+FIRST = {path.parent: path for path in reversed(OF_ONE_GROUP)}.values()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [path if path in FIRST else pytest.param(path, marks=pytest.mark.slow) for path in OF_ONE_GROUP],
+    ids=lambda path: f"{path.parent.name}={path.stem}",
+)
 def test_an_option_composed_in_an_application_is_the_option(path: Path, tmp_path: Path) -> None:
     group, name = path.parent.name, path.stem
     added = NEEDED.get(f"{group}={name}", {})
