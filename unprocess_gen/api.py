@@ -428,9 +428,9 @@ def plan_array(pixels: Srgb, settings: PairSettings, key: str | int | None) -> t
     """Plan the pair of an array; its identity is the digest of ``key``, or of the array itself."""
     config, source = settings.config, _array_source(pixels, key)
     recorded, _ = _recorded(pixels, config.source.downscale, config.output.layout)
-    is_linear = config.source.kind == "linear"
-    photograph = linear_photograph(config.source, pixels) if is_linear else Photograph(pixels, 1)
-    photograph = dataclasses.replace(photograph, srgb=recorded)
+    photograph = Photograph(recorded, 1)
+    if config.source.kind == "linear":
+        photograph = dataclasses.replace(linear_photograph(config.source, pixels), srgb=recorded)
     return source, plan_pixels(settings, photograph, source, source.sha256 or "")
 
 
