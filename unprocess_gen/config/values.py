@@ -28,7 +28,7 @@ def refusal(key: str, value: Any, problem: str) -> ConfigError:
 
 def one_of(key: str, value: Any, allowed: Collection[str]) -> None:
     """Check that a value is one of a few words."""
-    if value not in allowed:
+    if value not in [*allowed]:  # a list or mapping from YAML has no hash
         raise refusal(key, value, f"expected one of {', '.join(allowed)}")
 
 
