@@ -432,7 +432,6 @@ def check_edited_config(data: st.DataObject, text: str, path: Path) -> None:
 
 
 EDITED = [
-    ("source", "kind", [], "source.kind=[]: expected one of"),
     ("isp", "gamma", None, "isp.gamma=null: expected a number from 0.1 to 10, or srgb"),
     ("gains", "red", math.nan, "gains.red=nan: expected a finite number"),
     ("gains", "red", math.inf, "gains.red=inf: expected a finite number"),
