@@ -421,6 +421,16 @@ def _count_below(strip: Strip, values: Pointer, factor: float, low: float) -> in
 
 
 @inner
+def _count_above(strip: Strip, values: Pointer, n: int, high: float) -> int:
+    """Return the number of values of a strip, in its n-th vector, that are above a limit."""
+    above = 0
+    for site in range(n * VECTOR_WIDTH, (n + 1) * VECTOR_WIDTH):
+        if strip.first <= site < strip.after:
+            above += values[site] > high
+    return above
+
+
+@inner
 def _fill_linear(inverse: Any, strip: Strip, buffers: Buffers) -> tuple[bool, bool]:
     """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
     gains, limits = _load_sites(inverse.gains, strip), _load_sites(inverse.limits, strip)
@@ -454,9 +464,7 @@ def _recompute_highlights(inverse: Any, strip: Strip, buffers: Buffers) -> int:
         light = i * gains + i * (m * m) * headroom
         if inverse.white < np.inf:
             simd.store(buffers.bright_light, x, light)
-            for site in range(n * VECTOR_WIDTH, (n + 1) * VECTOR_WIDTH):
-                if strip.first <= site < strip.after:
-                    above_white += buffers.bright_light[site] > inverse.white
+            above_white += _count_above(strip, buffers.bright_light, n, inverse.white)
         light = _with_response(inverse, simd.minimum(light, most) * inverse.exposure, x, strip)
         simd.store(buffers.bright_light, x, light)
         clipped = simd.minimum(simd.maximum(light, inverse.darkest), inverse.brightest)
@@ -481,9 +489,7 @@ def _recompute_light(inverse: Any, strip: Strip, buffers: Buffers) -> int:
             continue
         light = signal * light_per_signal * gains * inverse.exposure
         simd.store(buffers.bright_light, x, light)
-        for site in range(n * VECTOR_WIDTH, (n + 1) * VECTOR_WIDTH):
-            if strip.first <= site < strip.after:
-                above_limit += buffers.bright_light[site] > inverse.white
+        above_limit += _count_above(strip, buffers.bright_light, n, inverse.white)
         light = _with_response(inverse, simd.minimum(light, inverse.white), x, strip)
         simd.store(buffers.bright_light, x, light)
         limited = simd.minimum(simd.maximum(light, inverse.darkest), inverse.white)
