@@ -162,7 +162,7 @@ class Bench:
 
         return Work(plan, 20 * self.patch_side**2)
 
-    def deep(self) -> tuple[Bench, Bench]:
+    def light_and_16_bits(self) -> tuple[Bench, Bench]:
         """The light of the image as a linear source, and the image in 16 bits."""
         codes = self.srgb.astype(np.uint16) * (257 if self.srgb.itemsize == 1 else 1)
         light = linear_table("smoothstep", 2.2, 65536)[codes].astype(np.float32)
@@ -187,7 +187,7 @@ class Bench:
             yield Row(
                 "float32, against uint16", settings, self.pair(f"{settings} output.dtype=float32"), self.pair(settings)
             )
-        light, codes = self.deep()
+        light, codes = self.light_and_16_bits()
         for settings in (TWO_NUMBERS, daylight, night):
             linear = light.pair(f"source.kind=linear {settings}")
             yield Row("a linear source, against 16 bits", settings, linear, codes.pair(settings))

@@ -304,9 +304,7 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
         raise ConfigError(f"--config-dir {second}: no such folder; expected a folder of option files")
     if second is not None and folders.name is not None and (second / f"{name}.yaml").is_file():
         main, second = second, main  # Hydra looks for the primary config in the first folder only
-    given = [_spelled(normalised(override), overrides) for override in overrides]
-    if second is not None:
-        given.append(f"hydra.searchpath=[{quoted(f'file://{second.absolute()}')}]")
+    given = [_spelled(normalised(override), overrides) for override in overrides] + _also_in(second)
     _check_own_files(overrides, folders)
     with _hydra_in(main.absolute()):
         try:
@@ -315,14 +313,18 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
             raise ConfigError(explain(error, overrides)) from error
 
 
+def _also_in(folder: Path | None) -> list[str]:
+    """Override with which Hydra looks for option files in another folder too."""
+    return [] if folder is None else [f"hydra.searchpath=[{quoted(f'file://{folder.absolute()}')}]"]
+
+
 def _marked(node: DictConfig, overrides: Sequence[str], folders: OptionFolders) -> DictConfig:
     """Append ``*`` to the name of a noise profile if settings replace a number that its option file states."""
     option = node.hydra.runtime.choices.get("noise")
     if option is None or not (folders.name or any(text.startswith(("noise.", "+")) for text in overrides)):
         return node
     with _hydra_in(folders.main.absolute()):
-        search = [] if folders.own is None else [f"hydra.searchpath=[{quoted(f'file://{folders.own.absolute()}')}]"]
-        stated = hydra.compose(None, [f"+noise={option}", *search]).noise
+        stated = hydra.compose(None, [f"+noise={option}", *_also_in(folders.own)]).noise
     profile: Any = OmegaConf.to_container(OmegaConf.merge(writable_node(NoiseConfig), stated))
     used: Any = OmegaConf.to_container(node.noise)
     if used["name"] == profile["name"] and any(used[key] != profile[key] for key in _stated_keys(profile)):

@@ -47,7 +47,8 @@ def check_source(config: Config) -> None:
             problem = "linear_rgb needs all colours at each site; set source.shrink=2, or remove it"
             raise refusal("output.targets", config.output.targets, problem)
     elif config.sensor.levels == "source":
-        raise refusal("sensor.levels", "source", "photographs state no levels; choose a sensor, or set source.kind=raw")
+        problem = f"{KINDS[kind]} state no levels; choose a sensor, or set source.kind=raw"
+        raise refusal("sensor.levels", "source", problem)
 
 
 NOT_APPLIED = {

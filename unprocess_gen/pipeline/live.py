@@ -267,8 +267,8 @@ class LivePairs(PairTable):
         if self._redraw == "all":
             facts = self._facts.get(number)
             if facts is None:
-                stated = stated_source(plan), plan.source.profile
-                facts = facts_for(settings.config, srgb, image.source.frames, parts_of(plan), *stated)
+                parts, stated, profile = parts_of(plan), stated_source(plan), plan.source.profile
+                facts = facts_for(settings.config, srgb, image.source.frames, parts, stated, profile)
                 self._facts.keep(number, facts)
             plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
         if plan.dark and settings.dark_frames is not None:
