@@ -23,22 +23,27 @@ from unprocess_gen.sources.loader import downscaled
 
 RECIPE = "experiment"
 RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml") if not path.stem.startswith("raw_"))
-"""Recipes for photographs; those for raw frames are tested with raw sources."""
+"""Recipes for photographs and light; those for raw frames are tested with raw sources."""
 
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a folder of one image, just large enough for a patch of 256 after downscaling."""
+    """Return a folder with a folder of one image, just large enough for a patch of 256 after downscaling, and light."""
     folder = tmp_path_factory.mktemp("photos")
     (folder / "clip").mkdir()
     Image.fromarray(pixels(1, 512, 512)).save(folder / "clip/0.png")
+    np.save(folder / "clip/0.npy", pixels(1, 300, 300) / np.float32(32))
     return folder
+
+
+PAIRS = {"brooks2019_training": 16, "rvdd_like": 2, "hdr_scenes": 4, "ntire_burst_sr": 4 * 14, "bracket_hdr": 2 * 7}
+"""Pairs of the image, of recipes that make more than one."""
 
 
 @pytest.mark.parametrize("recipe", slow_except(("brooks2019_training", "crvd_like"), RECIPES))
 def test_experiment_runs_unmodified(recipe: str, clip: Path, run_main: RunMain, tmp_path: Path) -> None:
     assert run_main(f"+{RECIPE}={recipe}", f"source.root={clip}", "n_jobs=1", "out=ds").code == 0
-    assert len(RawPairs(tmp_path / "ds")) == {"brooks2019_training": 16, "rvdd_like": 2}.get(recipe, 1)
+    assert len(RawPairs(tmp_path / "ds")) == PAIRS.get(recipe, 1)
 
 
 # Demo of the article --------------------------------------------------------------------------------------------------
