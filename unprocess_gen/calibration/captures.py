@@ -7,9 +7,7 @@ note. Frames are decoded by the functions that use them, one at a time.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,7 +23,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES, list_raw_files
 from unprocess_gen.core.records import check_record
-from unprocess_gen.core.tables import column_names, delimiter_of
+from unprocess_gen.core.tables import read_table
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 from unprocess_gen.sources.raw.decode import read_metadata
 from unprocess_gen.sources.raw.mosaics import even_sides, read_mosaic
@@ -179,32 +177,8 @@ def _check_twins(captures: Iterable[Capture], digests: Iterable[str]) -> None:
 
 def _from_list(folder: Path) -> Iterator[Capture]:
     """Yield the frames that ``captures.csv`` lists."""
-    path = folder / TABLE
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        delimiter = delimiter_of(text.partition("\n")[0], "file") or ","
-        reader = csv.DictReader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True, strict=True)
-        reader.fieldnames = names = column_names(reader.fieldnames or ())
-        wrong = [name for name in REQUIRED if name not in names]
-        wrong += [name for name in names if name not in (*REQUIRED, *OPTIONAL) or names.count(name) > 1]
-        if wrong:
-            expected = (
-                f"expected {','.join(REQUIRED)} and any of {','.join(OPTIONAL)}, or semicolons or tabs for commas"
-            )
-            raise ConfigError(f"{path}: column {wrong[0]!r} is missing, is unknown, or occurs twice; {expected}")
-        rows = [(number, row) for number, row in enumerate(reader, start=2) if any(row.values())]
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not text in UTF-8 ({error.reason}); save it as UTF-8") from error
-    except csv.Error as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); expected a CSV file") from error
-    for number, row in rows:
-        if any(row.get(None, ())):  # the key of cells beyond the header
-            problem = f"has more than {len(names)} cells; expected decimal points, or semicolons between columns"
-            raise ConfigError(f"{path}, line {number}: {problem}")
-        cells = {name: value or "" for name, value in row.items() if name}
-        if delimiter == ";":  # the spreadsheets that write it also write 0,5 for 0.5
-            cells |= {name: text.replace(",", ".") for name, text in cells.items() if name in NUMBERS}
-        yield _listed(folder, f"{path}, line {number}", cells)
+    for place, cells in read_table(folder / TABLE, REQUIRED, OPTIONAL, NUMBERS):
+        yield _listed(folder, place, cells)
 
 
 def _named(folder: Path, file: Path) -> Capture:
