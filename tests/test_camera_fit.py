@@ -216,7 +216,7 @@ def test_pairs_have_three_forms_of_names_or_a_list(tmp_path: Path) -> None:
     values = {(int(noisy[0, 0, 0]), int(clean[0, 0, 0])) for noisy, clean in read_picture_pairs(folder)[0]}
     assert values == {(100, 101), (102, 103), (104, 105)}
     with (folder / "pairs.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([("noisy", "clean"), (names[1], names[4])])
+        csv.writer(file).writerows([("clean", "group", "noisy"), (names[4], "any", names[1])])
     ((noisy, clean),) = read_picture_pairs(folder)[0]
     assert (noisy[0, 0, 0], clean[0, 0, 0]) == (101, 104)
 
@@ -228,8 +228,9 @@ def test_pairs_have_three_forms_of_names_or_a_list(tmp_path: Path) -> None:
         ({"a.png": FLAT}, None, "a.png: has no partner; expected a name with _noisy or _clean, or list"),
         ({"a_noisy.png": FLAT}, None, "a_noisy.png: has no partner; expected"),
         ({"a_mean.png": FLAT}, None, "a_mean.png: has no partner; expected"),
-        ({"a.png": FLAT}, "noisy,clean\na.png,b.png\n", "pairs.csv, line 2: a.png,b.png: expected the columns"),
-        ({"a.png": FLAT}, "file,kind\na.png,noisy\n", "pairs.csv, line 1: file,kind: expected the columns noisy,clean"),
+        ({"a.png": FLAT}, "noisy,clean\na.png,b.png\n", "pairs.csv, line 2: a.png,b.png: expected files that exist"),
+        ({"a.png": FLAT}, "file,kind\na.png,noisy\n", "pairs.csv: column 'noisy' is missing"),
+        ({"a.png": FLAT}, "noisy,clean,sort\n", "pairs.csv: column 'sort' is missing, is unknown"),
         ({"a_noisy.png": NOISY, "a_clean.png": FLAT}, None, "levels of luma"),
     ],
 )

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES, SUFFIXES, list_raw_files
-from unprocess_gen.core.records import check_record
-from unprocess_gen.core.tables import read_table
+from unprocess_gen.core.tables import read_table, record_of_cells
 from unprocess_gen.simulation.reference.cfa import MONO, PATTERNS
 from unprocess_gen.sources.raw.decode import read_metadata
 from unprocess_gen.sources.raw.mosaics import even_sides, read_mosaic
@@ -45,6 +44,7 @@ APART = 0.03
 """Relative difference of signals from which flats without a stated level are of different levels."""
 
 Number = Annotated[float, Meta(ge=0, le=1e9)]
+Pattern = Annotated[str, Meta(pattern=f"^({'|'.join((*PATTERNS, MONO))})$")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Capture:
     level: str = ""
     black_level_dn: Number | None = None
     white_level_dn: Number | None = None
-    pattern: Annotated[str, Meta(pattern=f"^({'|'.join((*PATTERNS, MONO))})$")] | None = None
+    pattern: Pattern | None = None
     bits: Annotated[int, Meta(ge=1, le=16)] | None = None
     temperature_c: Annotated[float, Meta(gt=-273, le=1e9)] | None = None
 
@@ -190,20 +190,16 @@ def _named(folder: Path, file: Path) -> Capture:
 
 def _listed(folder: Path, place: str, row: Mapping[str, str]) -> Capture:
     """The frame of a line of ``captures.csv``; empty cells follow from the metadata of a raw file."""
-    file, kind = folder / row["file"], row["kind"].strip().lower()
+    file, kind = folder / row["file"], row["kind"].lower()
     if not file.is_file() or file.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{place}: file={row['file']}: no such frame; expected a file as {', '.join(SUFFIXES)}")
     if kind not in KIND_NAMES:
         raise ConfigError(f"{place}: kind={kind}: expected dark or flat, in {TABLE} or in the name of the file")
-    cells = {name: text.strip() for name, text in row.items() if name not in ("file", "kind") and text.strip()}
+    cells = {name: text for name, text in row.items() if name not in ("file", "kind") and text}
     stated = _metadata(file) if file.suffix.lower() in RAW_FILES else {}
     if "iso" not in stated | cells:
         raise ConfigError(f"{place}: iso is empty, and {file.name} does not state it; expected an ISO in {TABLE}")
-    try:
-        capture = check_record({"path": file, "kind": kind} | stated | cells, Capture, strict=False)
-    except ValueError as error:
-        name, _, problem = str(error).partition(": ")
-        raise ConfigError(f"{place}: {name}={row.get(name)}: {problem}") from error
+    capture = record_of_cells({"path": file, "kind": kind} | stated | cells, Capture, place)
     for name in ("iso", "exposure_s"):
         own = getattr(capture, name)
         if own and stated.get(name) and not math.isclose(own, stated[name], rel_tol=SAME_EXPOSURE):

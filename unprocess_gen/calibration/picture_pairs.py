@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from pathlib import Path
 
 from unprocess_gen.calibration.captures import joined_sha256
 from unprocess_gen.core.arrays import Srgb
-from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.errors import ConfigError, refused_files
 from unprocess_gen.core.files import file_sha256, machine_errors
-from unprocess_gen.core.tables import column_names, delimiter_of
+from unprocess_gen.core.tables import read_table
 from unprocess_gen.sources.image.decode import decode
 
 TABLE, COLUMNS = "pairs.csv", ("noisy", "clean")
@@ -38,15 +37,11 @@ def read_picture_pairs(folder: Path) -> tuple[Iterator[tuple[Srgb, Srgb]], int, 
 
 def _listed(folder: Path) -> Iterator[tuple[Path, Path]]:
     """Yield the pairs of ``pairs.csv``."""
-    header, *lines = (folder / TABLE).read_text(encoding="utf-8-sig").splitlines() or [""]
-    delimiter = delimiter_of(header, COLUMNS[0]) or ","
-    for number, row in enumerate(csv.reader([header, *lines], delimiter=delimiter), start=1):
-        paths = [folder / cell.strip() for cell in row]
-        if len(row) != 2 or (tuple(column_names(row)) != COLUMNS if number == 1 else not all(map(Path.is_file, paths))):
-            expected = "expected the columns noisy,clean and files that exist"
-            raise ConfigError(f"{folder / TABLE}, line {number}: {','.join(row)}: {expected}")
-        if number > 1:
-            yield paths[0], paths[1]
+    for place, cells in read_table(folder / TABLE, COLUMNS, ("group", "scene")):
+        noisy, clean = (folder / cells[name] for name in COLUMNS)
+        if not (noisy.is_file() and clean.is_file()):
+            raise ConfigError(f"{place}: {cells['noisy']},{cells['clean']}: expected files that exist")
+        yield noisy, clean
 
 
 def _named(folder: Path) -> Iterator[tuple[Path, Path]]:
@@ -63,8 +58,5 @@ def _named(folder: Path) -> Iterator[tuple[Path, Path]]:
 
 def _read(path: Path) -> Srgb:
     """Decode a picture; ConfigError if it cannot be used."""
-    try:
-        with machine_errors(path):
-            return decode(path.read_bytes(), max_pixels=MAX_PIXELS, icc="ignore", name=str(path)).srgb
-    except SourceError as error:
-        raise ConfigError(f"calibrate: {path}: {error.text}; expected a picture of 8 or 16 bits") from error
+    with machine_errors(path), refused_files(f"calibrate: {path}:", "; expected a picture of 8 or 16 bits"):
+        return decode(path.read_bytes(), max_pixels=MAX_PIXELS, icc="ignore", name=str(path)).srgb

@@ -14,6 +14,9 @@ a traceback (exit code 1). Each exception here takes strings only, so that it ca
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 RESUME = "finished shards are kept; run the same command again to resume"
 """What to do after a run ended early, for messages. It is also true of one part of a run."""
 
@@ -104,3 +107,15 @@ class FilteredError(SourceError):
     """Source that the settings leave out (``source.min_side``), which is no failure."""
 
     status = "filtered"
+
+
+@contextmanager
+def refused_files(place: str, advice: str = "") -> Iterator[None]:
+    """Raise each SourceError of the body as ConfigError: ``place``, its text and ``advice``.
+
+    Keys of ``source.raw`` are mentioned without the group, as tables of files have columns of these names.
+    """
+    try:
+        yield
+    except SourceError as error:
+        raise ConfigError(f"{place} {error.text.replace('source.raw.', '')}{advice}") from error

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.records import Record, check_record
 
 
 def column_names(cells: Iterable[str]) -> list[str]:
@@ -24,7 +26,7 @@ def delimiter_of(line: str, column: str) -> str | None:
 def read_table(
     path: Path, required: Collection[str], optional: Collection[str], numbers: Collection[str] = ()
 ) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the place of each line of a CSV file, for messages, and its cells by column, empty ones too.
+    """Yield the place of each line of a CSV file, for messages, and its cells by column, without spaces at their ends.
 
     ``numbers`` are columns that may have decimal commas between semicolons. ConfigError unless the header has the
     required columns and no others than these and the optional ones.
@@ -37,9 +39,7 @@ def read_table(
         wrong = [name for name in required if name not in names]
         wrong += [name for name in names if name not in (*required, *optional) or names.count(name) > 1]
         if wrong:
-            expected = (
-                f"expected {','.join(required)} and any of {','.join(optional)}, or semicolons or tabs for commas"
-            )
+            expected = f"expected {','.join(required)}, any of {','.join(optional)}; or semicolons or tabs for commas"
             raise ConfigError(f"{path}: column {wrong[0]!r} is missing, is unknown, or occurs twice; {expected}")
         rows = [(reader.line_num, row) for row in reader if any(row.values())]
     except UnicodeDecodeError as error:
@@ -50,7 +50,16 @@ def read_table(
         if any(row.get(None, ())):  # the key of cells beyond the header
             problem = f"has more than {len(names)} cells; expected decimal points, or semicolons between columns"
             raise ConfigError(f"{path}, line {number}: {problem}")
-        cells = {name: value or "" for name, value in row.items() if name}
+        cells = {name: (value or "").strip() for name, value in row.items() if name}
         if delimiter == ";":  # the spreadsheets that write it also write 0,5 for 0.5
             cells |= {name: text.replace(",", ".") for name, text in cells.items() if name in numbers}
         yield f"{path}, line {number}", cells
+
+
+def record_of_cells(cells: Mapping[str, Any], kind: type[Record], place: str) -> Record:
+    """Convert the cells of a line to a typed record; empty ones have its defaults. ConfigError names the cell."""
+    try:
+        return check_record({name: cell for name, cell in cells.items() if cell != ""}, kind, strict=False)
+    except ValueError as error:
+        name, _, problem = str(error).partition(": ")
+        raise ConfigError(f"{place}: {name}={cells.get(name)}: {problem}") from error

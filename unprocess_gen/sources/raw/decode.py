@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.errors import SourceError, refused_files
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.libraries import require
 from unprocess_gen.simulation.reference.colour import matrix
@@ -119,14 +119,11 @@ def read_metadata(path: Path, key: str, with_libraw: bool = True) -> RawMetadata
     """
     for library in ("tifffile", *(["rawpy"] if with_libraw else [])):
         require(library, f"{key}: {path} is a raw file, which needs {library}", "raw", ", or convert the frames to NPY")
-    with machine_errors(path):
+    with machine_errors(path), refused_files(f"{key}: {path}"):
         content = path.read_bytes()
-    try:
         if not with_libraw:
             return tags_of(content, check=False)
         return decode_raw(content, path.suffix, white_dn=65535.0).metadata  # captures.csv may state another white level
-    except SourceError as error:
-        raise ConfigError(f"{key}: {path} {error.text}") from error
 
 
 @contextmanager

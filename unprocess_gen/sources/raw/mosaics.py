@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.errors import ConfigError, SourceError, refused_files
 from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.raw_files import RAW_FILES
 from unprocess_gen.sources.image.decode import decode
@@ -73,14 +73,11 @@ def read_mosaic(path: Path, key: str, numbers: bool = False, white_dn: float | N
     Raises ConfigError or MachineError.
     """
     suffix = path.suffix.lower()
-    with machine_errors(path):
+    with machine_errors(path), refused_files(f"{key}: {path}"):
         content = path.read_bytes()
-    try:
         if suffix not in RAW_FILES:
             return Mosaic(checked_mosaic(mosaic_pixels(content, suffix), path, key, numbers))
         frame = decode_raw(content, suffix, white_dn=white_dn)
-    except SourceError as error:
-        raise ConfigError(f"{key}: {path} {error.text}") from error
     blacks = set(frame.metadata.black_dn or ())
     if len(blacks) != 1:
         levels = ", ".join(f"{black:g}" for black in sorted(blacks)) or "none"

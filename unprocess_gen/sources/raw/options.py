@@ -6,7 +6,7 @@ from pathlib import Path
 
 from unprocess_gen.config.limits import CAMERA_LAWS, NAME
 from unprocess_gen.config.schema import RawConfig
-from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.errors import ConfigError, refused_files
 from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.raw_files import RAW_FILES
@@ -39,14 +39,11 @@ def camera_options(file: Path, name: str) -> tuple[dict[str, str], tuple[str, ..
     """
     if file.suffix.lower() not in RAW_FILES:
         raise ConfigError(f"camera {file}: is no raw file; expected a file as {', '.join(RAW_FILES)}")
-    with machine_errors(file):
+    with machine_errors(file), refused_files(f"camera {file}:"):
         content = file.read_bytes()
-    try:
         frame, tags = decode_raw(content, file.suffix), tags_of(content, check=False)
         matrix, gains = camera_colours(frame.metadata)
         sensor, black, _ = file_sensor(frame, RawConfig())
-    except SourceError as error:
-        raise ConfigError(f"camera {file}: {error.text}") from error
     if matrix is None:
         raise ConfigError(f"camera {file}: has no ColorMatrix, and LibRaw knows no matrix of its camera; expected one")
     levels = ", ".join(f"{level:g}" for level in dict.fromkeys(black))
