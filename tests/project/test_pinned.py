@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import builtins
 import json
+import math
+import operator
+from collections.abc import Iterable
+from functools import reduce
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.promise_report import Figure
 
@@ -42,3 +48,18 @@ def test_pinned_dataset_has_the_recorded_bytes(name: str, tmp_path: Path, figure
     recorded = json.loads(RECORDED.read_text())[name]
     assert digests(name, tmp_path / "ds") == recorded
     figure("pinned-datasets", f"{name}: {len(recorded)} of {len(recorded)} files have the recorded SHA-256")
+
+
+@pytest.mark.parametrize("settings", [["body=canon_70d", "noise.iso=[log_uniform,800,3200]"]])
+def test_no_number_depends_on_how_python_adds_floats(settings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """``sum`` compensates rounding errors from Python 3.12 on, and not before."""
+
+    def exact_sum(values: Iterable[float], start: float = 0) -> float:
+        terms = [start, *values]
+        return math.fsum(terms) if any(isinstance(term, float) for term in terms) else reduce(operator.add, terms)
+
+    config, rows = ug.load_config(settings), []
+    for add in (exact_sum, lambda values, start=0: reduce(operator.add, values, start)):
+        monkeypatch.setattr(builtins, "sum", add)
+        rows.append([ug.make_pair(np.full((2, 2, 3), 99, np.uint8), config, key=key).row for key in range(20)])
+    assert rows[0] == rows[1]

@@ -1,8 +1,10 @@
-"""Pick items of a sequence, and keep those that were used last."""
+"""Pick items of a sequence, add them, and keep those that were used last."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import operator
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 _Item = TypeVar("_Item")
@@ -18,6 +20,11 @@ def evenly_spaced(items: Sequence[_Item], count: int) -> list[_Item]:
 def first_of(items: Sequence[str], most: int = 5) -> str:
     """Text that names the first items."""
     return ", ".join(items[:most]) + ", …" * (len(items) > most)
+
+
+def add_in_order(values: Iterable[float]) -> float:
+    """Add numbers one after the other: ``sum`` rounds floats differently from Python 3.12 on."""
+    return functools.reduce(operator.add, values, 0.0)
 
 
 class Recent(dict[_Key, _Item]):

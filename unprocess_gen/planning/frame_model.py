@@ -11,6 +11,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from operator import add, mul
 
+from unprocess_gen.core.sequences import add_in_order
 from unprocess_gen.simulation.effects import BY_NAME, EFFECTS
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts
 from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
@@ -67,8 +68,9 @@ def linear_signal_range(
     lights = []
     for channel, gain in enumerate(gains):
         row = matrix[3 * channel : 3 * channel + 3]
-        ends = (sum(entry * (low if (entry > 0) == is_least else high) for entry in row) for is_least in (True, False))
-        lights += [min(max(light * (gain * exposure), 0.0), most) * sensor.span_dn for light in ends]
+        for is_least in (True, False):
+            light = add_in_order(entry * (low if (entry > 0) == is_least else high) for entry in row)
+            lights.append(min(max(light * (gain * exposure), 0.0), most) * sensor.span_dn)
     return SignalRange(min(lights), max(lights))
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from unprocess_gen.core.sequences import add_in_order
 from unprocess_gen.simulation.effects.black_error import BlackError
 from unprocess_gen.simulation.effects.column import ColumnNoise
 from unprocess_gen.simulation.effects.column_temporal import ColumnTemporal
@@ -85,4 +86,4 @@ def dark_variance_dn2(plan: Plan) -> float:
         for name in ("read" if effect == "dark_frame" else effect for effect in noise.effects)
         if name in in_the_dark and not BY_NAME[name].has_outliers and not (BY_NAME[name].is_fixed and plan.averaged)
     )
-    return sum(variances, 0.0)
+    return add_in_order(variances)

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.sequences import add_in_order
 from unprocess_gen.simulation.kernels import simd, strips
 from unprocess_gen.simulation.kernels.jit import by_class, inner, kernel
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
@@ -57,7 +58,7 @@ def is_steep(plan: Plan) -> bool:
     if plan.source.is_raw:  # its light has no colours and gains
         return exposure > MAX_ERROR_GAIN
     matrix, inverse_gains = light_colours(plan.source, camera)
-    rows = [sum(abs(entry) for entry in matrix[start : start + 3]) * exposure for start in (0, 3, 6)]
+    rows = [add_in_order(map(abs, matrix[start : start + 3])) * exposure for start in (0, 3, 6)]
     highlights = 0.0 if isp.highlight == "none" else 1 + 2 / (1 - isp.highlight_threshold)
     return any(
         row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN

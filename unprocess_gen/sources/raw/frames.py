@@ -18,6 +18,7 @@ from unprocess_gen.config.schema import RawConfig, SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.raw_files import RAW_FILES
+from unprocess_gen.core.sequences import add_in_order
 from unprocess_gen.simulation.facts import RawParts
 from unprocess_gen.simulation.plan import CameraPlan, IspPlan, Levels, SensorPlan, SourcePlan
 from unprocess_gen.simulation.reference import colour
@@ -89,7 +90,7 @@ def file_sensor(frame: RawFrame, raw: RawConfig) -> tuple[SensorPlan, Levels, Le
     if not 0 <= min(black) <= max(black) < white[0] <= 65535:
         text = f"states the black levels {black} and the white level {level:g}; expected black below white"
         raise SourceError("corrupt", f"{text}; give source.raw.black_dn and source.raw.white_dn")
-    return SensorPlan(pattern, round(level).bit_length(), round(sum(black) / 4), round(level)), black, white
+    return SensorPlan(pattern, round(level).bit_length(), round(add_in_order(black) / 4), round(level)), black, white
 
 
 def _cell_means(pixels: NDArray[np.uint16], source: SourcePlan) -> NDArray[np.uint16]:
@@ -112,7 +113,7 @@ def _own_noise(facts: RawMetadata, raw: RawConfig, span_dn: float) -> tuple[floa
     shares = {2: (1.0,), 6: (0.25, 0.5, 0.25), 8: (0.25,) * 4}.get(len(stated))
     if shares is None or not any(stated) or not all(0 <= number < 1 for number in stated):
         return None
-    scale, offset = (sum(map(operator.mul, shares, stated[first::2])) for first in (0, 1))
+    scale, offset = (add_in_order(map(operator.mul, shares, stated[first::2])) for first in (0, 1))
     return scale, offset
 
 
