@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -13,13 +14,15 @@ import pytest
 from helpers.commands import run_process
 
 ROOT = Path(__file__).parents[2]
-CURVES = "unprocess_gen/simulation/data/curves_16bit.npz"
-PROJECT_FILES = (
-    *("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "uv.lock", ".pre-commit-config.yaml"),
-    *(".github/workflows/tests.yml", ".readme/denoiser.jpg", "docs/conf.py"),
-)
-"""Files outside the package that the tests read."""
-OPTIONS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml"))
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+INCLUDED: list[str] = PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+"""Files and folders of the sdist, with a leading slash."""
+
+
+def files_below(folder: str) -> set[str]:
+    """Return the files of a folder of the repository, or the file of this name."""
+    paths = [ROOT / folder, *(ROOT / folder).rglob("*")]
+    return {path.relative_to(ROOT).as_posix() for path in paths if path.is_file() and "__pycache__" not in path.parts}
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +37,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the bin folder of a new environment with the dependencies of this one but without its package."""
+    pytest.importorskip("pip", reason="uv installs no pip")
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False, symlinks=True)
     python = folder / "bin" / "python"
@@ -49,23 +53,23 @@ def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bin"
 
 
-def test_the_sdist_holds_options_tests_and_readme(built: Path) -> None:
+def test_the_sdist_is_what_the_project_includes(built: Path) -> None:
     (archive,) = built.glob("*.tar.gz")
     with tarfile.open(archive) as sdist:
-        names = {name.partition("/")[2] for name in sdist.getnames()}
+        names = {member.name.partition("/")[2] for member in sdist.getmembers() if member.isfile()}
 
-    assert {*OPTIONS, *PROJECT_FILES, "README.md", "pyproject.toml", "tests/project/test_packaging.py", CURVES} <= names
+    added = {"PKG-INFO", "pyproject.toml", ".gitignore"}
+    assert names == added.union(*(files_below(name[1:]) for name in INCLUDED))
 
 
-def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
+def test_the_wheel_is_the_package_with_options_and_manifests(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
-    names = zipfile.ZipFile(wheel).namelist()
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
 
-    assert {f"unprocess_gen/{option}" for option in OPTIONS} <= set(names)
-    assert CURVES in names
-    assert not any(name.startswith(("conf/", "tests/")) for name in names)
-    assert "unprocess_gen/py.typed" in names
-    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+    options = {f"unprocess_gen/{name}" for folder in ("conf", "manifests") for name in files_below(folder)}
+    assert names == files_below("unprocess_gen") | options
+    assert {"unprocess_gen/py.typed", "unprocess_gen/conf/config.yaml"} <= names
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in zipfile.ZipFile(wheel).namelist())
 
 
 def test_the_installed_command_reads_its_own_files(installed: Path, tmp_path: Path) -> None:
@@ -78,8 +82,12 @@ def test_the_installed_command_reads_its_own_files(installed: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_the_installed_command_compiles_its_kernels(installed: Path, tmp_path: Path) -> None:
-    done = run_process(installed / "gen-dataset", "out=ds", "source.limit=1", cwd=tmp_path, PYTHONPATH="")
+def test_the_installed_command_works_without_a_source_tree(installed: Path, tmp_path: Path) -> None:
+    code = "import unprocess_gen as ug; print(len(ug.RawPairs('ds')), [getattr(ug, name) for name in ug.__all__][:0])"
+    for command in ("out=ds source.limit=1", "verify ds", "replay ds", "build --list", "preview ds --to sheets"):
+        done = run_process(installed / "gen-dataset", *command.split(), cwd=tmp_path, PYTHONPATH="")
+        assert done.returncode == 0, done.stderr
+    done = run_process(installed / "python", "-W", "error", "-c", code, cwd=tmp_path, PYTHONPATH="")
 
-    assert done.returncode == 0, done.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ds"]
+    assert done.stdout == "1 []\n", done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ds", "sheets"]
