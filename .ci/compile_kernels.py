@@ -1,10 +1,13 @@
-"""Compile the kernels of every kind of noise and frames, for pictures of 8 and 16 bits and of floats.
+"""Compile the kernels of every kind of noise and frames, and of bursts, for pictures of 8 and 16 bits and of floats.
 
 Two processes of pytest that need the same kernels at once would both compile them.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 
+from unprocess_gen.simulation.kernels import burst
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.self_test import GOLDEN_PLANS, failures, golden_image, kernels
 
@@ -12,3 +15,11 @@ for plan in GOLDEN_PLANS.values():
     assert not any(map(failures, kernels([plan])))
     if not plan.source.is_linear:
         make_pair(golden_image().astype(np.uint16), plan)
+
+_IDENTITY = SimpleNamespace(
+    motion_yy=1.0, motion_yx=0.0, motion_y=0.0, motion_xy=0.0, motion_xx=1.0, motion_x=0.0,
+    burst_downscale=1, burst_phase="centre",
+)  # fmt: skip
+for pixels, name in ((np.uint8(1), "plain"), (np.uint16(1), "plain"), (np.float32(1), "linear_physical")):
+    light = burst.scene_light(np.full((1, 1, 3), pixels), GOLDEN_PLANS[name])
+    burst.frame_light(light, _IDENTITY, (0, 0), (0, 0), (1, 1))
