@@ -20,6 +20,6 @@ _IDENTITY = SimpleNamespace(
     motion_yy=1.0, motion_yx=0.0, motion_y=0.0, motion_xy=0.0, motion_xx=1.0, motion_x=0.0,
     burst_downscale=1, burst_phase="centre",
 )  # fmt: skip
-for pixels, name in ((np.uint8(1), "plain"), (np.uint16(1), "plain"), (np.float32(1), "linear_physical")):
-    light = burst.scene_light(np.full((1, 1, 3), pixels), GOLDEN_PLANS[name])
+for dtype, name in ((np.uint8, "plain"), (np.uint16, "plain"), (np.float32, "linear_physical")):
+    light = burst.scene_light(np.ones((1, 1, 3), dtype), GOLDEN_PLANS[name])
     burst.frame_light(light, _IDENTITY, (0, 0), (0, 0), (1, 1))

@@ -77,9 +77,10 @@ def by_definition(light: Normalised, motion: Motion, corner: tuple[int, int], sh
 
 def kernel_frame(motion: Motion, first: tuple[int, int], shape: tuple[int, int]) -> Normalised:
     """Return the light of a crop, from no more of the scene than it reads, once the reference agrees."""
-    box = scene_box([motion], shape, first)
-    frame = burst.frame_light(scene(box), motion, box[:2], first, shape)
-    assert frame.tobytes() == reference.frame_light(scene(box), motion, box[:2], first, shape).tobytes()
+    y0, x0, y1, x1 = scene_box([motion], shape, first)
+    light = scene((y0 - 1, x0 - 1, y1 + 1, x1 + 1))[1:-1, 1:-1]
+    frame = burst.frame_light(light, motion, (y0, x0), first, shape)
+    assert frame.tobytes() == reference.frame_light(light, motion, (y0, x0), first, shape).tobytes()
     return frame
 
 
@@ -134,6 +135,7 @@ def test_the_box_is_as_small_as_possible(motion: Motion, shape: tuple[int, int],
 
 def test_the_box_of_frames_contains_each() -> None:
     near, far = Motion(motion_y=-2.5, burst_downscale=4), Motion(motion_x=1.25, burst_downscale=4, burst_phase="corner")
+    assert scene_box([Motion(burst_downscale=4)], (2, 3)) == (0, 0, 8, 12)
     assert scene_box([near], (2, 3)) == (-3, 0, 6, 12)
     assert scene_box([far], (2, 3)) == (-2, -1, 7, 12)
     assert scene_box([near, far], (2, 3)) == (-3, -1, 7, 12)
@@ -148,7 +150,7 @@ def test_a_position_that_is_no_number_is_outside() -> None:
 
 WIDE = Profile("wide", (1.25, -0.125, -0.125, 0.0, 1.0, 0.0, 0.0, -0.25, 1.25), (None, (2.0, 1, 0, 0, 0, 0, 0), None))
 VIVID = (1.5, -0.375, -0.125, -0.25, 1.5, -0.25, 0.0, -0.5, 1.5)
-PHOTOGRAPH = GOLDEN_PLAN.replace(rgb2cam=VIVID)
+PHOTOGRAPH = GOLDEN_PLAN.replace(rgb2cam=VIVID, blue_gain=0.7)
 LINEAR = GOLDEN_PLANS["linear_per_channel"].replace(rgb2cam=VIVID, ev=0.0)
 SCENES = {
     **{name: PHOTOGRAPH.replace(highlight=name) for name in INVERSE_HIGHLIGHTS},

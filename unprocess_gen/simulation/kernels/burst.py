@@ -104,7 +104,7 @@ def _fill_scene(curves: Any, pixels: NDArray[Any], colours: SceneColours, light:
             if gray > threshold:
                 m = (gray - threshold) / divisor
                 value = i * max(m * m + (1.0 - m * m) * gain, gain)
-            if headroom > 0.0 and i > threshold:
+            if i > threshold:
                 m = (i - threshold) / divisor
                 value += i * (m * m) * headroom
             light[n + channel] = max(min(value, MOST_SCENE_LIGHT), -MOST_SCENE_LIGHT)
