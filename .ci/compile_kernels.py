@@ -4,6 +4,7 @@ Two processes of pytest that need the same kernels at once would both compile th
 """
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,9 @@ _IDENTITY = SimpleNamespace(
     motion_yy=1.0, motion_yx=0.0, motion_y=0.0, motion_xy=0.0, motion_xx=1.0, motion_x=0.0,
     burst_downscale=1, burst_phase="centre",
 )  # fmt: skip
-for dtype, name in ((np.uint8, "plain"), (np.uint16, "plain"), (np.float32, "linear_physical")):
+_KINDS: tuple[tuple[Any, str], ...] = (
+    (np.uint8, "plain"), (np.uint16, "plain"), (np.float32, "linear_physical"),
+)  # fmt: skip
+for dtype, name in _KINDS:
     light = burst.scene_light(np.ones((1, 1, 3), dtype), GOLDEN_PLANS[name])
     burst.frame_light(light, _IDENTITY, (0, 0), (0, 0), (1, 1))
