@@ -57,7 +57,7 @@ def frame_light(
     light : ndarray of float32, [H, W, 3]
         Light of the scene; finite.
     motion : Motion
-        A and b of the frame, the downscale s, and the phase, which decides the offset o (`phase_offset`).
+        A and b of the frame, the downscale s, and the phase, which decides the offset o (`sample_places`).
     corner : (int, int)
         Row and column of ``light[0, 0]`` in the target.
     first, shape : (int, int)
@@ -74,13 +74,12 @@ def frame_light(
         If a position is outside of ``light``.
     """
     check_inside(light, motion, corner, first, shape)
-    step, offset = motion.burst_downscale, phase_offset(motion)
-    rows, columns = (step * np.arange(start, start + count) + offset for start, count in zip(first, shape, strict=True))
+    step, (rows, columns) = motion.burst_downscale, sample_places(motion, first, shape)
     total = np.zeros((2, *shape, 3), np.float32)
     for m in range(step):
         row = np.zeros_like(total)
         for n in range(step):
-            y, x = _position(motion, rows[:, None] + m, columns + n)
+            y, x = _position(motion, rows[m::step, None], columns[n::step])
             row += _weighted_columns(light, y, x, corner)
         total += row
     return np.asarray((total[0] + total[1]) / np.float32(step * step))
@@ -91,30 +90,33 @@ def _weighted_columns(light: Normalised, y: Float, x: Float, corner: tuple[int, 
 
     The neighbour of the last row or column has the weight 0, so any value may replace it.
     """
-    top, left = (np.floor(position).astype(np.int64) for position in (y, x))
-    down, right = ((position - low).astype(np.float32)[..., None] for position, low in ((y, top), (x, left)))
-    top, left = top - corner[0], left - corner[1]
-    bottom = np.minimum(top + 1, light.shape[0] - 1)
-    columns = left, np.minimum(left + 1, light.shape[1] - 1)
-    one = np.float32(1)
-    start, end = (light[top, column] * (one - down) + light[bottom, column] * down for column in columns)
-    return np.stack([start * (one - right), end * right])
+    down, right = ((position - np.floor(position)).astype(np.float32)[..., None] for position in (y, x))
+    top, left = (np.floor(position).astype(np.int64) - low for position, low in zip((y, x), corner, strict=True))
+    bottom, next_left = (np.minimum(low + 1, size - 1) for low, size in zip((top, left), light.shape, strict=False))
+    start, end = (light[top, column] * (1 - down) + light[bottom, column] * down for column in (left, next_left))
+    return np.stack([start * (1 - right), end * right])
 
 
-def phase_offset(motion: Motion) -> float:
-    """Compute the offset of the samples of a pixel from s·i, in high-resolution pixels.
+def sample_places(motion: Motion, first: tuple[int, int], shape: tuple[int, int]) -> tuple[Float, Float]:
+    """Compute the rows and the columns p of the samples of a crop, before the motion.
 
     Parameters
     ----------
     motion : Motion
-        Downscale s and phase.
+        Downscale s, and the phase: with ``corner``, samples are at -(s - 1) / 2 to (s - 1) / 2 from s·i, else from s·i
+        on.
+    first, shape : (int, int)
+        Those of `frame_light`.
 
     Returns
     -------
-    float
-        0, or -(s - 1) / 2 in the phase ``corner``.
+    tuple of two ndarrays of float64, [h·s] and [w·s]
+        Rows and columns, in high-resolution pixels.
     """
-    return -(motion.burst_downscale - 1) / 2 if motion.burst_phase == "corner" else 0.0
+    step = motion.burst_downscale
+    offset = (step - 1) / 2 if motion.burst_phase == "corner" else 0.0
+    rows, columns = (step * start + np.arange(step * count) - offset for start, count in zip(first, shape, strict=True))
+    return rows, columns
 
 
 def scene_box(
@@ -170,16 +172,11 @@ def check_inside(
 
 def _end_positions(motion: Motion, first: tuple[int, int], shape: tuple[int, int]) -> list[tuple[float, float]]:
     """Compute the positions of the four corner samples of a crop."""
-    step, offset = motion.burst_downscale, phase_offset(motion)
-    rows, columns = (
-        (step * start + offset, step * (start + count) - 1 + offset) for start, count in zip(first, shape, strict=True)
-    )
+    rows, columns = (places[[0, -1]].tolist() for places in sample_places(motion, first, shape))
     return [_position(motion, y, x) for y in rows for x in columns]
 
 
 def _position(motion: Motion, y: Any, x: Any) -> tuple[Any, Any]:
     """Compute A·p + b; sums are computed from left to right."""
-    return (
-        motion.motion_yy * y + motion.motion_yx * x + motion.motion_y,
-        motion.motion_xy * y + motion.motion_xx * x + motion.motion_x,
-    )
+    row = motion.motion_yy * y + motion.motion_yx * x + motion.motion_y
+    return row, motion.motion_xy * y + motion.motion_xx * x + motion.motion_x
