@@ -232,19 +232,17 @@ def test_weights_are_shown_for_a_mix_of_cameras_only() -> None:
     assert not page["camera.weights"].visible
 
 
-def test_zoom_keeps_the_place_of_the_site_pointed_at() -> None:
+@pytest.mark.parametrize("shape", [(512, 768), (8, 900), (900, 9), (4, 4)])
+def test_buttons_show_the_detail_or_the_frame(shape: tuple[int, int]) -> None:
     (shown,) = [state.shown() for state in explorations(None, "source.limit=1")]
-    site, window = np.array([300.0, 100.0]), np.array([[0.0, length] for length in shown.clean.shape])
-    for _ in range(3):
-        nearer = views.moved("Zoom in", window, shown, (300.0, 100.0))
-        places = [(site - ends[:, 0]) / (ends[:, 1] - ends[:, 0]) for ends in (window, nearer)]
-        np.testing.assert_allclose(*places)
-        np.testing.assert_allclose(np.diff(nearer), np.diff(window) / 2)
-        window = nearer
-    for label in views.MOVES:
-        rows, columns = views.moved(label, window, shown, None)
-        assert 0 <= rows[0] < rows[1] <= shown.clean.shape[0]
-        assert 0 <= columns[0] < columns[1] <= shown.clean.shape[1]
+    shown = shown._replace(clean=np.zeros(shape, np.uint16), srgb=shown.srgb[: shape[0], : shape[1]])
+    detail, frame = (views.window_of(label, shown) for label in views.WINDOWS)
+    assert frame.tolist() == [[0, shape[0]], [0, shape[1]]]
+    assert (detail[:, 0] >= 0).all() and (detail[:, 1] <= shape).all()
+    rows, columns = np.ptp(detail, axis=1)
+    assert min(rows, columns) >= min(views.SMALLEST_PX, *shape) - 1e-9
+    assert rows / columns == pytest.approx(shape[0] / shape[1])
+    assert columns <= max(views.DETAIL_PX, views.SMALLEST_PX * shape[1] / shape[0]) + 1e-9
 
 
 # ------------------------------------------------------------------------------------------------------------ browser
@@ -392,8 +390,10 @@ def test_page_works_in_a_browser_without_network(width: int, address: str, brows
 
     model(browser, "sensor.bits", "it.value = '12'")
     wait(browser, "message", "return it.text === ''")
-    press(browser, "Zoom in", Keys.ENTER)
-    wait(browser, "clean", "return it.x_range.end - it.x_range.start < 127")
+    for label in views.WINDOWS:
+        model(browser, "clean", "it.x_range.end = 40")
+        press(browser, label, Keys.ENTER)
+        wait(browser, "clean", "return it.x_range.end - it.x_range.start === 128")
     press(browser, "Copy the command")
     assert browser.execute_async_script("navigator.clipboard.readText().then(arguments[0])") == model(
         browser, "command", "return it.text"
@@ -432,23 +432,6 @@ def test_one_picture_stays_on_top_on_a_phone(address: str, browser: Any) -> None
         top, bottom = wait(browser, "noisy_developed", VIEW)
         assert 0 <= top < bottom <= 844 / 2, name
         assert wait(browser, name, VIEW)[0] >= bottom
-
-
-@pytest.mark.slow
-def test_button_zooms_where_the_picture_was_clicked(address: str, browser: Any) -> None:
-    open_page(browser, address, 1280, 900)
-    place = "const place = Bokeh.index.find_one(it).el.getBoundingClientRect(); return [place.x, place.y, place.width];"
-    x, y, width = wait(browser, "clean", place)
-    for kind in ("mousePressed", "mouseReleased"):
-        event = {"type": kind, "x": x + width / 4, "y": y + 30, "button": "left", "clickCount": 1}
-        browser.execute_cdp_cmd("Input.dispatchMouseEvent", event)
-    time.sleep(1)  # a click waits for a second one
-    press(browser, "Zoom in")
-    wait(browser, "clean", "return it.x_range.end - it.x_range.start < 127")
-    ends = model(browser, "clean", "return [it.x_range.start, it.x_range.end]")
-    assert (32 - ends[0]) / (ends[1] - ends[0]) == pytest.approx(0.25, abs=0.02)  # 128 columns
-    press(browser, "Everything")
-    wait(browser, "clean", "return it.x_range.end - it.x_range.start === 128")
 
 
 @pytest.mark.slow

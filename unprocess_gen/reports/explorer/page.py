@@ -10,9 +10,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import numpy as np
 from bokeh.document import Document
-from bokeh.events import Tap
 from bokeh.models import (
     Button,
     ColumnDataSource,
@@ -102,7 +100,6 @@ class Page:
         self._syncing, self._waiting = False, set[Callable[[], None]]()
         self._pixels, self._points = ColumnDataSource(), ColumnDataSource({"x": [], "y": []})
         self._x, self._y = (Range1d(*ends, min_interval=views.SMALLEST_PX) for ends in ((0, 1), (1, 0)))
-        self._pointed: tuple[float, float] | None = None
         self._message, self._refusal, self._facts, self._plan = map(_text_box, ("message", "refusal", "facts", "plan"))
         self._command = _text_box("command", render_as_text=True, css_classes=["command"])
         self._pictures = [self._picture(name) for name in views.PICTURES]
@@ -129,7 +126,6 @@ class Page:
         drawn.axis.visible = drawn.grid.visible = False
         renderer = drawn.image_rgba(name, "x", "y", "dw", "dh", source=self._pixels)
         whole = {"$x": "printf", "$y": "printf"}  # other formats round, to the next site
-        drawn.on_event(Tap, self._point)
         drawn.add_tools(HoverTool(renderers=[renderer], tooltips=TIPS, point_policy="follow_mouse", formatters=whole))
         return drawn
 
@@ -148,7 +144,7 @@ class Page:
         """Fill the document, and show the first pair."""
         document = self._document
         document.title, document.template = "unprocess_gen explorer", page_template("explorer.html")
-        shown = {"pictures": views.PICTURES, "curves": views.PLOTS, "moves": views.MOVES}
+        shown = {"pictures": views.PICTURES, "curves": views.PLOTS, "windows": views.WINDOWS}
         document.template_variables.update(sections=SECTIONS, **shown)
         controls = self._widgets | self._others
         for name, control in controls.items():
@@ -162,24 +158,19 @@ class Page:
                 end.on_change(side, lambda attr, old, new: self._later(self._draw_view))
         copy = Button(label="Copy the command", name="copy", button_type="primary")
         copy.js_on_click(CustomJS(args={"text": self._command}, code="navigator.clipboard.writeText(text.text)"))
-        moves = {label: Button(label=label, name=label, margin=0) for label in views.MOVES}
-        for label, button in moves.items():
-            button.on_click(partial(self._move, label))
+        windows = [Button(label=label, name=label, margin=0) for label in views.WINDOWS]
+        for button in windows:
+            button.on_click(partial(self._zoom, button.name))
         boxes = [self._message, self._refusal, self._command, self._facts, self._plan, copy, self._stretch]
         with document.models.freeze():  # else Bokeh searches all models again for each root, 1 s in total
-            for model in (*boxes, *moves.values(), *self._pictures, *self._curves.values(), *controls.values()):
+            for model in (*boxes, *windows, *self._pictures, *self._curves.values(), *controls.values()):
                 document.add_root(model)
         self._update()
 
-    def _point(self, event: Any) -> None:
-        """Zoom at a site from now on."""
-        self._pointed = event.y, event.x
-
-    def _move(self, label: str) -> None:
-        """Show the window that a button asks for."""
+    def _zoom(self, label: str) -> None:
+        """Show the part that a button asks for."""
         if self._shown is not None:
-            window = np.array([(self._y.end, self._y.start), (self._x.start, self._x.end)])
-            (top, bottom), (left, right) = views.moved(label, window, self._shown, self._pointed).tolist()
+            (top, bottom), (left, right) = views.window_of(label, self._shown).tolist()
             self._x.update(start=left, end=right)
             self._y.update(start=bottom, end=top)
 
@@ -219,12 +210,12 @@ class Page:
         is_new = is_new or self._shown is None or shown.clean.shape != self._shown.clean.shape
         self._shown = shown
         if is_new:
-            self._pointed, (height, width) = None, shown.clean.shape
+            height, width = shown.clean.shape
             for drawn in self._pictures:
                 drawn.update(
                     aspect_ratio=width / height, styles={"max-width": f"calc(var(--tallest) * {width / height:.4f})"}
                 )
-            self._move("Everything")
+            self._zoom("Everything")
         self._draw_view()
         self._draw_statistics(shown)
         self._command.text = self._state.command

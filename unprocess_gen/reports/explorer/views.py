@@ -32,33 +32,17 @@ SMALLEST_PX = 8
 """Fewest sites of a side of the window."""
 DETAIL_PX = 160
 """Columns of the window that shows the finest detail: a site is about two pixels of the screen."""
-MOVES = {
-    "Zoom in": (0.5, 0, 0),
-    "Zoom out": (2, 0, 0),
-    "Left": (1, 0, -0.25),
-    "Right": (1, 0, 0.25),
-    "Up": (1, -0.25, 0),
-    "Down": (1, 0.25, 0),
-    "Detail": (0, 0, 0),
-    "Everything": (np.inf, 0, 0),
-}
-"""Buttons: the factor of the size of the window, and its steps down and to the right in parts of its size."""
+WINDOWS = "Detail", "Everything"
+"""Buttons that show a part of the pictures."""
 
 
-def moved(label: str, window: Float, shown: Shown, pointed: tuple[float, float] | None) -> Float:
-    """First and last row and column, [2, 2], of the window after a move.
-
-    It is zoomed about the site that was pointed at, or else the finest detail, or its centre if that is not in view.
-    """
-    shape, (factor, *steps) = np.array(shown.clean.shape, float), MOVES[label]
-    detail = panels.finest_detail(shown.srgb, (DETAIL_PX, DETAIL_PX))
-    site = np.array(detail if pointed is None or label == "Detail" else pointed)
-    if label == "Detail":
-        window, factor = np.stack([site - shape / 2, site + shape / 2], axis=1), min(1, DETAIL_PX / shape[1])
-    low, high = window.T
-    site = site if ((low <= site) & (site <= high)).all() else (low + high) / 2
-    size = np.minimum((high - low) * max(factor, SMALLEST_PX / (high - low).min()), shape)
-    start = np.clip(site - (site - low) * size / (high - low) + np.array(steps) * size, 0, shape - size)
+def window_of(label: str, shown: Shown) -> Float:
+    """First and last row and column, [2, 2], of the finest detail, or of the frame."""
+    shape = np.array(shown.clean.shape, float)
+    site = np.array(panels.finest_detail(shown.srgb, (DETAIL_PX, DETAIL_PX)))
+    share = max(DETAIL_PX / shape[1], SMALLEST_PX / shape.min()) if label == "Detail" else 1
+    size = shape * min(share, 1)
+    start = np.clip(site - size / 2, 0, shape - size)
     return np.stack([start, start + size], axis=1)
 
 
