@@ -162,29 +162,11 @@ def runs_by_channel() -> bytes:
     return bytes(rows)
 
 
-def runs_by_pixel() -> bytes:
-    """Rows in the older encoding: 1, 1, 1, n repeats the last pixel, and 256 n after another repeat."""
-    rows = bytearray()
-    for row in CODES:
-        x = 0
-        while x < 40:
-            same = int((np.diff(row[x:].astype(int), axis=0, append=-1) != 0).any(axis=1).argmax()) + 1
-            rows += row[x].tobytes() + (bytes([1, 1, 1, same - 1]) if same > 1 else b"")
-            x += same
-    return bytes(rows)
-
-
-@pytest.mark.parametrize("rows", [CODES.tobytes(), runs_by_channel(), runs_by_pixel()], ids=["flat", "new", "old"])
+@pytest.mark.parametrize("rows", [CODES.tobytes(), runs_by_channel()], ids=["flat", "runs"])
 def test_radiance_pictures_are_decoded_and_cut_ones_refused(rows: bytes) -> None:
     assert (read(header() + rows, "a.hdr").srgb == DECODED.astype(np.float32)).all()
     for cut in (1, len(rows) // 2, len(rows)):
         assert refused((header() + rows)[:-cut], "a.hdr").startswith(("corrupt: ends", "truncated: ends"))
-
-
-def test_long_runs_of_the_older_encoding_are_decoded() -> None:
-    rows = bytes([128, 64, 32, 129]) + bytes([1, 1, 1, 44]) + bytes([1, 1, 1, 1])
-    light = read(header(size="-Y 1 +X 301") + rows, "a.hdr").srgb
-    assert light.shape == (1, 301, 3) and (light == np.float32([1, 0.5, 0.25])).all()
 
 
 def test_exposures_divide_light() -> None:
@@ -210,6 +192,7 @@ REFUSED = {
     "line.hdr": (flat("PRIMARIES=0 0 0 0 0 0 0 0\n"), "corrupt: states the chromaticities 0;0"),
     "large.hdr": (header(size="-Y 99999 +X 99999"), "too_large: has 99999 x 99999 pixels"),
     "bomb.hdr": (header(size="-Y 8000 +X 8000") + bytes(9), "truncated: ends before its 8000 x 8000 pixels"),
+    "repeats.hdr": (header() + bytes([9, 9, 9, 9, 1, 1, 1, 39]) + flat(), "corrupt: .* or repeats pixels, in row 0"),
     "wide.npy": (npy(LIGHT.astype(float)), r"unsupported: is float64 \[13, 40, 3\]"),
     "gray.npy": (npy(LIGHT[..., 0]), r"unsupported: is float32 \[13, 40\]"),
     "nan.npy": (npy(np.where(LIGHT > 4, np.nan, LIGHT).astype(np.float32)), "corrupt: has .* pixels that are NaN"),

@@ -1,6 +1,6 @@
-"""Decode Radiance pictures (RGBE): flat, and with both of their run-length encodings.
+"""Decode Radiance pictures (RGBE): flat, or with runs by channel.
 
-OpenCV 5 ignores EXPOSURE and cannot decode the older encoding. Format: Ward, "Real Pixels", Graphics Gems II, 1991, and
+OpenCV 5 ignores EXPOSURE, and decodes from a temporary file. Format: Ward, "Real Pixels", Graphics Gems II, 1991, and
 the manual of Radiance, "File Formats".
 """
 
@@ -18,7 +18,7 @@ from unprocess_gen.sources.linear.pixels import SRGB, Light, chromaticity_text
 
 HEADER = re.compile(rb"#\?[^\n]*\n((?:[^\n]+\n)*)\n(-Y (\d{1,9}) \+X (\d{1,9})|[^\n]*)\n")
 SHORTEST, LONGEST = 8, 0x7FFF
-"""Widths between which the newer encoding is possible."""
+"""Widths between which runs are possible."""
 
 
 def decode_radiance(content: bytes, max_pixels: int) -> Light:
@@ -53,7 +53,10 @@ def decode_radiance(content: bytes, max_pixels: int) -> Light:
     codes = np.zeros((height, width, 4), np.uint8)
     row = _fill_codes(np.frombuffer(content, np.uint8, offset=header.end()), codes)
     if row < height:
-        raise SourceError("corrupt", f"ends, or contradicts itself, in row {row} of {height}")
+        raise SourceError(
+            "corrupt",
+            f"ends, contradicts itself, or repeats pixels, in row {row} of {height}; expected runs by channel",
+        )
     step = np.where(codes[..., 3:] > 0, np.ldexp(1.0, codes[..., 3:].astype(np.int64) - 136), 0.0)
     with np.errstate(over="ignore", under="ignore"):  # infinite light is refused
         return Light((codes[..., :3] * step / exposure).astype(np.float32), stated)
@@ -84,19 +87,11 @@ def _fill_codes(data: NDArray[np.uint8], codes: NDArray[np.uint8]) -> Any:
                         codes[y, x + n, channel] = data[place + 1 + (0 if is_run else n)]
                     x, place = x + count, place + (2 if is_run else 1 + count)
             continue
-        x, shift = np.int64(0), 0
-        while x < width:
-            if place + 4 > size:
-                return y
-            if data[place] == 1 and data[place + 1] == 1 and data[place + 2] == 1:  # repeats the last pixel
-                count = np.int64(data[place + 3]) << shift
-                if x == 0 or shift > 16 or x + count > width:
-                    return y
-                for n in range(count):
-                    codes[y, x + n] = codes[y, x - 1]
-                x, shift = x + count, shift + 8
-            else:
-                codes[y, x] = data[place : place + 4]
-                x, shift = x + 1, 0
+        if place + 4 * width > size:
+            return y
+        for column in range(width):
+            codes[y, column] = data[place : place + 4]
+            if codes[y, column, 0] == 1 and codes[y, column, 1] == 1 and codes[y, column, 2] == 1:
+                return y  # repeats the last pixel in an encoding of before 1991
             place += 4
     return height
