@@ -52,10 +52,10 @@ def test_key_of_several_pairs_is_refused(ladder: Path) -> None:
     assert pairs.select(patch=1, level=1.0, draw=0)["00000001"].row["key"] == "00000001-p0001-l01d00"
 
 
-def test_rows_are_selected_by_value_list_and_function(ladder: Path, dataset: Path) -> None:
+def test_rows_are_selected_by_value_and_function(ladder: Path, dataset: Path) -> None:
     pairs = ug.RawPairs([dataset, ladder])
-    assert keys(pairs.select(dataset="ladder", a_dn=8)) == keys(ug.RawPairs(ladder).select(level=[1, 7]))
-    assert keys(pairs[::-1].select(lambda row: row["draw"] == 1, patch=range(1, 9))) == [
+    assert keys(pairs.select(dataset="ladder", a_dn=8)) == keys(ug.RawPairs(ladder).select(level=1))
+    assert keys(pairs[::-1].select(lambda row: row["draw"] == 1, patch=1)) == [
         f"{index:08d}-p0001-l{level:02d}d01" for index in (2, 1, 0) for level in (1, 0)
     ]
     assert len(pairs.select()) == len(pairs)
@@ -67,7 +67,7 @@ def test_rows_are_selected_by_value_list_and_function(ladder: Path, dataset: Pat
         ({"izo": 3}, r"izo: no such column; expected one of the manifest, or dataset; did you mean iso\?"),
         ({"level": "1"}, r"level='1': no pair is selected; expected level=[01], [01]$"),
         ({"key": "1"}, r"expected key=('\d{8}-p\d{4}-l\d\dd\d\d', ){5}…$"),
-        ({"level": 0, "a_dn": [8, 9]}, r"level=0, a_dn=\[8, 9\]: no pair .* expected level=0, 1; a_dn=2.0, 8.0$"),
+        ({"level": 0, "a_dn": 9}, r"level=0, a_dn=9: no pair .* expected level=0, 1; a_dn=2.0, 8.0$"),
     ],
 )
 def test_what_selects_no_pair_is_refused(columns: dict[str, Any], message: str, ladder: Path) -> None:

@@ -57,8 +57,8 @@ class PairTable:
         ----------
         test : callable, optional
             Function of a row that is true for the pairs to select.
-        **columns : str, int, float, None, or an iterable of them
-            Value of a column of `rows`, or the allowed values.
+        **columns : str, int, float or None
+            Value of a column of `rows`.
 
         Returns
         -------
@@ -76,7 +76,7 @@ class PairTable:
 
         >>> import unprocess_gen as ug
         >>> pairs = ug.RawPairs("ds")
-        >>> pairs.select(key=["00000001", "00000002"], camera="convex")
+        >>> pairs.select(key="00000001", camera="convex")
         RawPairs('ds', length=1)
         >>> pairs.select(lambda row: row["red_gain"] > 1.9)
         RawPairs('ds', length=2)
@@ -85,15 +85,11 @@ class PairTable:
         for name in sorted(columns.keys() - {*known}):
             hint = did_you_mean(name, known)
             raise ConfigError(f"select: {name}: no such column; expected one of the manifest, or dataset{hint}")
-        wanted = {
-            name: [value] if isinstance(value, str) or not np.iterable(value) else [*value]
-            for name, value in columns.items()
-        }
         positions, seen = list[int](), {name: set[str]() for name in columns}
         for position, row in enumerate(self.rows):
             for name, texts in seen.items():
                 texts.add(repr(row[name]))
-            if all(row[name] in values for name, values in wanted.items()) and (test is None or test(row)):
+            if all(row[name] == value for name, value in columns.items()) and (test is None or test(row)):
                 positions.append(position)
         if not positions:
             given = ", ".join(f"{name}={value!r:.60}" for name, value in columns.items()) or "function"
