@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -158,19 +156,7 @@ def differences(config_yaml: str, other_yaml: str) -> list[str]:
     """List the differences between two ``config.yaml`` texts, ``key=value (there: value)``, sorted by key."""
     here, there = (ADDED | flat(parse_yaml_mapping(text)) for text in (config_yaml, other_yaml))
     return [
-        "{}={} (there: {})".format(key, *_shortened(value_text(here.get(key)), value_text(there.get(key))))
+        f"{key}={value_text(here.get(key))} (there: {value_text(there.get(key))})"
         for key in sorted(here.keys() | there.keys())
         if here.get(key) != there.get(key)
     ]
-
-
-CHARACTERS_SHOWN = 60
-"""Characters of a value in a difference; longer values are cut around the first character that differs."""
-
-
-def _shortened(*values: str) -> Iterator[str]:
-    common = sum(1 for _ in itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*values, strict=False)))
-    start = max(0, common - CHARACTERS_SHOWN // 3) if max(map(len, values)) > CHARACTERS_SHOWN else 0
-    for value in values:
-        part = value[start : start + CHARACTERS_SHOWN]
-        yield "…" * (start > 0) + part + "…" * (len(value) > start + len(part))
