@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from helpers.commands import run_process
 
+import unprocess_gen
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 INCLUDED: list[str] = PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
@@ -64,6 +66,7 @@ def test_the_sdist_is_what_the_project_includes(built: Path) -> None:
 
 def test_the_wheel_is_the_package_with_options_and_manifests(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
+    assert wheel.name.startswith(f"unprocess_gen-{unprocess_gen.__version__}-")
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
 
     options = {f"unprocess_gen/{name}" for folder in ("conf", "manifests") for name in files_below(folder)}
