@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.format_1 import ARCHIVE
+from helpers.promise_report import Figure
 
 import unprocess_gen as ug
 from unprocess_gen.core.files import array_xxh3
@@ -40,7 +41,7 @@ def test_archive_is_small_and_has_every_kind(kept: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", DATASETS)
-def test_kept_dataset_is_read_verified_and_replayed(kept: Path, kind: str) -> None:
+def test_kept_dataset_is_read_verified_and_replayed(kept: Path, kind: str, figure: Figure) -> None:
     dataset, sources, darks = (kept / kind / name for name in ("ds", "sources", "darks"))
     pairs = ug.RawPairs(dataset)
     first = pairs[0]
@@ -51,6 +52,7 @@ def test_kept_dataset_is_read_verified_and_replayed(kept: Path, kind: str) -> No
     assert ug.verify(dataset) == []
     done = ug.replay(dataset, root=sources, dark_frames=darks if darks.exists() else None)
     assert [(one.key, one.complaint, one.compared) for one in done] == [(row["key"], "", True) for row in pairs.rows]
+    figure("kept-datasets", f"{kind}: {len(done)} of {len(pairs)} pairs are the same")
 
 
 @pytest.mark.parametrize("kind", sorted(DATASETS.keys() - {"dark_frames"}))  # LivePairs takes no folder of dark frames
