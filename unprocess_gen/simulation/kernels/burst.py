@@ -6,7 +6,7 @@ A frame has s x s bilinear values for each pixel. One vector holds two neighbour
     weights                                     [ 1-f 1-f 1-f  f   f   f   0  0 ]
 
 Products are summed in such vectors; at the end, the halves are added. Positions are computed for a row of samples at a
-time, in a loop that LLVM vectorises. A sample takes 4 ns, a third of one of OpenCV's ``warpAffine``.
+time, in a loop that LLVM vectorises. NumPy takes 20 to 40 times as long: 0.3 s for a burst of 14 frames of 96 x 96.
 """
 
 from __future__ import annotations

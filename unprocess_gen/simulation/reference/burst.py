@@ -17,6 +17,7 @@ from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.reference.unprocess import camera_light, dequantise
 
 Motion = Any
+"""Numbers of a frame: ``motion_yy`` … ``motion_x`` of A·p + b, ``burst_downscale`` and ``burst_phase``."""
 
 MOST_SCENE_LIGHT = 2.0**64
 """Limit of the light of a scene: far above what frames hold, and sums of 64 x 64 values stay finite in float32."""
