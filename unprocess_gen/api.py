@@ -117,7 +117,7 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     Raises
     ------
     ConfigError
-        If the config is incomplete or not allowed, or ``source.patch`` is set.
+        If the config is incomplete or not allowed, or ``source.patch`` or ``source.burst`` is set.
     TypeError
         If ``config`` is not a config.
     ValueError
@@ -166,7 +166,8 @@ def make_pair(
     Raises
     ------
     ConfigError
-        If the config is incomplete or not allowed, ``source.patch`` is set, or ``seed`` or ``key`` come with a plan.
+        If the config is incomplete or not allowed, ``source.patch`` or ``source.burst`` is set, or ``seed`` or ``key``
+        come with a plan.
     MachineError
         If the self-test of the kernels fails on this machine.
     TypeError
@@ -194,6 +195,8 @@ def make_pair(
         raise ConfigError("make_pair: the plan names a dark frame, whose folder it lacks; expected a config")
     elif config.source.is_raw:
         raise ConfigError("make_pair: the plan is of a raw frame; expected that of a photograph; use ug.LivePairs")
+    elif config.motion is not None:
+        raise ConfigError("make_pair: the plan is of a burst; expected that of a photograph; use ug.LivePairs")
     elif seed is None and key is None:
         recorded, patches = _recorded(pixels, config.source.downscale, config.output.layout)
         plan = config.replace(pixels_xxh3=array_xxh3(pixels)) if is_linear else config
@@ -456,6 +459,9 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
             "make_pair returns complete frames; expected null; cut the arrays of the pair at even rows and columns"
         )
         raise refusal("source.patch", config.source.patch, problem)
+    if config.source.burst is not None:
+        problem = "make_pair returns one pair; expected null; give the config to ug.generate or ug.LivePairs"
+        raise refusal("source.burst", config.source.burst, problem)
     source = dataclasses.replace(config.source, root=None, list=None, limit=None, clips=False, include=("*",))
     config = dataclasses.replace(config, source=source, seed=config.seed if seed is None else seed)
     validate_config(config)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ from unprocess_gen.config.schema import (
     ProvenanceConfig,
     SourceConfig,
 )
-from unprocess_gen.config.values import refusal
+from unprocess_gen.config.values import one_of, refusal
 from unprocess_gen.core.arrays import FLOAT32
 from unprocess_gen.core.fields import is_integer, is_number, value_text
 from unprocess_gen.simulation.effects import BY_NAME
@@ -178,6 +179,59 @@ def canonical_patch(source: SourceConfig) -> list[Any] | None:
     """Return ``source.patch`` in the one spelling that ``config.yaml`` uses: ``[kind, side, stride or count]``."""
     rule = patch_rule(source)
     return None if rule is None else [rule.kind, rule.side, rule.stride or rule.count]
+
+
+@dataclass(frozen=True, slots=True)
+class BurstRule:
+    """Frames of a burst, and the largest motion of a frame: pixels and degrees; ``ev`` repeats."""
+
+    frames: int = 14
+    shift: float = 24.0
+    rotation_deg: float = 1.0
+    downscale: int = 4
+    ev: tuple[float, ...] = (0.0,)
+    phase: str = "centre"
+
+    @property
+    def tile(self) -> int:
+        """Pixels of the picture along a 2x2 tile of the sensor."""
+        return 2 * self.downscale
+
+    def stops(self, frame: int) -> float:
+        """Exposure of a frame in stops."""
+        return self.ev[frame % len(self.ev)]
+
+    def margin(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns around a target of these sides that its frames may show."""
+        angle, before = math.radians(self.rotation_deg), 0 if self.phase == "centre" else self.downscale - 1
+        sides, reach = (height + before, width + before), self.shift + before / 2
+        # at least sin a and 1 - cos a times half of each side
+        turned, rest = (tuple(factor * side / 2 for side in sides) for factor in (angle, angle * angle / 2))
+        spare = 1 if self.rotation_deg else 0
+        return math.ceil(reach + rest[0] + turned[1]) + spare, math.ceil(reach + rest[1] + turned[0]) + spare
+
+
+def burst_rule(source: SourceConfig) -> BurstRule | None:
+    """Interpret ``source.burst``; omitted keys have the defaults of `BurstRule`."""
+    burst = source.burst
+    if burst is None:
+        return None
+    if not isinstance(burst, dict):
+        raise refusal("source.burst", burst, f"expected {limits.BURST}")
+    for name, value in burst.items():
+        one_of("source.burst", name, limits.BURST_KEYS)
+        limit = limits.BURST_KEYS[name]
+        if not limit.allows(value):
+            raise refusal(f"source.burst.{name}", value, f"expected {limit}")
+    numbers = {name: float(burst[name]) for name in ("shift", "rotation_deg") if name in burst}
+    ev = {"ev": tuple(map(float, burst["ev"]))} if "ev" in burst else {}
+    return BurstRule(**{**burst, **numbers, **ev})
+
+
+def canonical_burst(source: SourceConfig) -> dict[str, Any] | None:
+    """Return ``source.burst`` with all of its keys, as ``config.yaml`` has it."""
+    rule = burst_rule(source)
+    return None if rule is None else {**dataclasses.asdict(rule), "ev": list(rule.ev)}
 
 
 # ---------------------------------------------------------------------------------------------- switches and choices

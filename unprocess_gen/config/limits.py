@@ -8,10 +8,10 @@ from typing import Any
 
 from unprocess_gen.config.distributions import Drawn
 from unprocess_gen.config.values import GroupLimit, one_of, refusal
-from unprocess_gen.core.fields import Choice, Limit, Numbers, is_number, value_text
+from unprocess_gen.core.fields import Choice, Integers, Limit, Numbers, is_number, value_text
 from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.simulation.plan import numbers_of
+from unprocess_gen.simulation.plan import FIELDS, numbers_of
 from unprocess_gen.simulation.reference.light import LIGHTS
 
 
@@ -148,6 +148,26 @@ PATCH = Limit(
     "null, a side, [grid, side], [grid, side, stride] or [random, side, count]; side and stride are even, "
     f"{MIN_PATCH} to {MAX_PATCH} pixels, count is 1 to {MAX_RANDOM_PATCHES}"
 )
+MAX_BURST_FRAMES = 100
+"""Most frames of a burst: keys have two digits for them."""
+
+BURST_KEYS: dict[str, Limit] = {
+    "frames": Integers(1, MAX_BURST_FRAMES),
+    "shift": Numbers(0, 4096),
+    "rotation_deg": Numbers(0, 45),
+    "downscale": FIELDS["burst_downscale"].limit,
+    "ev": Limit(
+        f"a list of 1 to {MAX_BURST_FRAMES} numbers of stops from -16 to 16",
+        lambda value: (
+            isinstance(value, list | tuple)
+            and 1 <= len(value) <= MAX_BURST_FRAMES
+            and all(is_number(stops) and -16 <= stops <= 16 for stops in value)
+        ),
+    ),
+    "phase": FIELDS["burst_phase"].limit,
+}
+"""Keys of ``source.burst`` with their allowed values."""
+BURST = Limit("null, or a mapping of " + "; ".join(f"{name}: {limit}" for name, limit in BURST_KEYS.items()))
 LEVELS = Limit(f"how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}")
 DIGEST = Limit(
     "64 hexadecimal digits",

@@ -123,6 +123,11 @@ class SourceConfig(Group):
         treat each folder as a clip: its frames share camera, gains, noise level and fixed patterns
     patch
         cut images into square patches, after downscaling
+    burst
+        make a burst of each patch or picture: frames of a moving camera with 1 / downscale of the resolution, to whose
+        pixels patch then refers; shift in pixels and rotation_deg are the largest motion of a frame, around the centre
+        of the patch; frame k has the exposure time times 2^ev, the k-th of the list, which repeats; ev above 0 needs
+        linear sources, because photographs hold nothing above white
     own_noise
         noise of raw sources themselves: subtract lowers the variance that a profile with two numbers adds by that of
         the source, down to 0; the column zero_variance counts the sites where the source has as much or more
@@ -152,6 +157,7 @@ class SourceConfig(Group):
     downscale: int = key(1, of="downscale")
     dequantize: str = key("off", of="dequantize")
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
+    burst: Any = key(None, limits.BURST, null="one frame of each image")
     shrink: int = key(1, of="shrink", unit="sites")
     own_noise: str = key("keep", Choice("keep", "subtract"))
     primaries: Optional[str] = key(

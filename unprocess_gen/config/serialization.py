@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import yaml
 
-from unprocess_gen.config.interpretation import canonical_patch
+from unprocess_gen.config.interpretation import canonical_burst, canonical_patch
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GROUPS, Config
 from unprocess_gen.config.settings import groups_in, settings_of
@@ -38,9 +38,9 @@ def data_keys(group: Any) -> tuple[str, ...]:
 TYPE_NAMES = {"array": "list", "object": "mapping", "Number out of range": "float"}
 """Names of types in messages, by those of msgspec."""
 
-ADDED: dict[str, Any] = {"source.exclude": [], "source.primaries": None, "scene.ev": 0.0}
+ADDED: dict[str, Any] = {"source.exclude": [], "source.primaries": None, "source.burst": None, "scene.ev": 0.0}
 """Keys that format 1 had not from its start, with the value that is meant where one is missing."""
-WRITTEN_IF_SET = (("source", "primaries"), ("scene", "ev"))
+WRITTEN_IF_SET = (("source", "primaries"), ("source", "burst"), ("scene", "ev"))
 """Keys of `ADDED` that ``config.yaml`` has only with another value, so that the bytes of other datasets stay."""
 
 SOURCE_KINDS = {"folder": "srgb", "synthetic": "srgb", "raw": "raw", "linear": "linear", "synthetic_linear": "linear"}
@@ -56,7 +56,10 @@ def source_kind(config: Config) -> str:
 def dataset_yaml(config: Config) -> str:
     """Text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
     settings = recorded(config)
-    settings["source"] |= {"kind": source_kind(config), "patch": canonical_patch(config.source)}
+    source = config.source
+    settings["source"] |= {
+        "kind": source_kind(config), "patch": canonical_patch(source), "burst": canonical_burst(source),
+    }  # fmt: skip
     for group, name in WRITTEN_IF_SET:
         if settings[group][name] == ADDED[f"{group}.{name}"]:
             del settings[group][name]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable
 
-from unprocess_gen.config.interpretation import is_physical, uses_dark_frames
+from unprocess_gen.config.distributions import highest, lowest
+from unprocess_gen.config.interpretation import burst_rule, is_physical, patch_rule, uses_dark_frames
+from unprocess_gen.config.limits import EXPOSURE_S
 from unprocess_gen.config.schema import Config, RawConfig, SourceConfig
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import refusal
@@ -40,6 +42,7 @@ def check_source(config: Config) -> None:
         raise refusal("source.kind", kind, f"{problem}'- override /source: {kind}' in the defaults of the file")
     if kind == "linear" and source.primaries == CAMERA and config.sensor.pattern == MONO:
         raise refusal("sensor.pattern", MONO, "source.primaries=camera is light behind filters; choose a Bayer pattern")
+    _check_burst(config)
     if kind == "raw":
         _check_raw_levels(config)
         _check_own_noise(config)
@@ -49,6 +52,32 @@ def check_source(config: Config) -> None:
     elif config.sensor.levels == "source":
         problem = f"{KINDS[kind]} state no levels; choose a sensor, or set source.kind=raw"
         raise refusal("sensor.levels", "source", problem)
+
+
+def _check_burst(config: Config) -> None:
+    """Raise ConfigError for settings with which no burst can be made."""
+    source, rule, patch = config.source, burst_rule(config.source), patch_rule(config.source)
+    if rule is None:
+        return
+    if source.kind == "raw":
+        problem = "a burst needs all colours at each pixel of the moving scene; expected srgb or linear"
+        raise refusal("source.kind", "raw", f"{problem}; or set source.burst=null")
+    if source.clips or source.downscale != 1:
+        key, value = ("clips", True) if source.clips else ("downscale", source.downscale)
+        instead = "its frames are a clip" if source.clips else "use source.burst.downscale"
+        raise refusal(f"source.{key}", value, f"source.burst has frames of its own resolution: {instead}; remove it")
+    for name, length in (("side", patch.side), ("stride", patch.stride)) if patch else ():
+        if length % rule.tile:
+            problem = (
+                f"{name}={length} with source.burst.downscale={rule.downscale}; expected a multiple of {rule.tile}"
+            )
+            raise refusal("source.patch", source.patch, f"{problem} pixels, 2 x 2 sites of the sensor")
+    if is_physical(config.noise):
+        seconds, numbers = EXPOSURE_S.parse("scene.exposure_s", config.scene.exposure_s), EXPOSURE_S.numbers
+        ends = lowest(seconds) * 2.0 ** min(rule.ev), highest(seconds) * 2.0 ** max(rule.ev)
+        if not numbers.low <= ends[0] <= ends[1] <= numbers.high:
+            problem = f"exposure times from {ends[0]:g} to {ends[1]:g} s; expected {numbers}; change scene.exposure_s"
+            raise refusal("source.burst.ev", list(rule.ev), problem)
 
 
 NOT_APPLIED = {

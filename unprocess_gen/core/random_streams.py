@@ -40,7 +40,7 @@ def declare_stream(name: str, number: int) -> int:
 
 
 PARAMETERS, PATCH, SCATTER = declare_stream("parameters", 0), declare_stream("patch", 11), declare_stream("scatter", 12)
-DARK_FRAME = declare_stream("dark_frame", 14)
+DARK_FRAME, MOTION = declare_stream("dark_frame", 14), declare_stream("motion", 17)
 
 MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 KEY_STEPS = (0x9E3779B9, 0xBB67AE85)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.reader import DatasetPath, RawPairs
 
 
@@ -33,7 +34,7 @@ class Clip(_Frames):
     dataset : str
         Name of the dataset, as in `Sample`.
     targets : dict of str to ndarray
-        Stored targets by name, with T as first axis.
+        Stored targets by name, with T as first axis; of a burst those of its first frame.
     """
 
     dataset: str
@@ -44,8 +45,20 @@ class Clip(_Frames):
         clean, noisy = (np.stack([getattr(frame, name) for frame in frames]) for name in ("clean", "noisy"))
         clip = super().__new__(cls, clean, noisy, [frame.row for frame in frames])
         clip.dataset = frames[0].dataset
-        clip.targets = {name: np.stack([frame.targets[name] for frame in frames]) for name in frames[0].targets}
+        targets = frames[0].targets
+        if clip.rows[0]["motion_y"] is None:
+            targets = {name: np.stack([frame.targets[name] for frame in frames]) for name in targets}
+        clip.targets = targets
         return clip
+
+    @property
+    def target(self) -> NDArray[Any] | None:
+        """Stored ``linear_rgb``, or None.
+
+        Of a burst, float32 [s H, s W, 3] with s = ``burst_downscale``: the light of its first frame before it was
+        averaged, exposed and clipped.
+        """
+        return self.targets.get(LINEAR_RGB)
 
     def __repr__(self) -> str:
         name, frames = self.rows[0]["clip"], self.noisy
@@ -96,7 +109,9 @@ class RawClips:
                 place = dataset, row["clip"], row["patch"], row["level"], row["draw"]
                 clips.setdefault(place, []).append(number)
         if not clips:
-            raise ConfigError(f"RawClips: {path}: has no clips; expected a dataset of source.clips=true; use RawPairs")
+            raise ConfigError(
+                f"RawClips: {path}: has no clips; expected a dataset of source.clips=true or source.burst; use RawPairs"
+            )
         self._clips = [np.array(numbers) for numbers in clips.values()]
 
     def __len__(self) -> int:

@@ -19,6 +19,16 @@ def patch_key(index: int, patch: int, several: bool) -> str:
     return f"{key_text(index)}-p{patch:04d}" if several else key_text(index)
 
 
+def frame_key(sample: str, frame: int) -> str:
+    """Key of a frame of a burst: the burst's, with for example ``-f02``."""
+    return f"{sample}-f{frame:02d}"
+
+
+def burst_key(key: str) -> str:
+    """Key of the burst to which a frame belongs, without its number, level and draw."""
+    return key.partition("-f")[0]
+
+
 def pair_key(sample: str, place: Place, several: bool) -> str:
     """Key of a row: the sample's, with for example ``-l01d02`` for level 1, draw 2 if there are several frames."""
     return f"{sample}-l{place.level:02d}d{place.draw:02d}" if several else sample

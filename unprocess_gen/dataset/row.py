@@ -27,7 +27,7 @@ from unprocess_gen.core.records import check_record, parse_record
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Column, Row, Value, flatten, places_of, rebuild
-from unprocess_gen.dataset.keys import key_text
+from unprocess_gen.dataset.keys import burst_key, key_text
 from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.frames import PATCHES, Counts, Pair, Patch
 from unprocess_gen.simulation.plan import (
@@ -37,6 +37,7 @@ from unprocess_gen.simulation.plan import (
     FINITE,
     HEX_128,
     HEX_256,
+    LIGHT,
     LINEAR,
     NOISY_FRAMES,
     Plan,
@@ -59,7 +60,9 @@ FRAMES = Condition("output.frames is false", lambda config: config.output.frames
 FOUND_FILES = Condition("the sources are synthetic pictures", lambda config: config.source.place is not None)
 STORED_TARGETS = Condition("output.targets is empty", lambda config: bool(config.output.targets))
 
-KEY_TEXT = Text(r"\d{8,12}(-p\d{4,12})?(-l\d\dd\d\d)?", "eight digits, then -pNNNN and -lNNdNN if present")
+KEY_TEXT = Text(
+    r"\d{8,12}(-p\d{4,12})?(-f\d\d)?(-l\d\dd\d\d)?", "eight digits, then -pNNNN, -fNN and -lNNdNN if present"
+)
 
 
 def _is_relative(value: Any) -> bool:
@@ -78,8 +81,8 @@ class Origin(PlanRecord, frozen=True, kw_only=True):
 
     # fmt: off
     key: Annotated[str, Field(
-        "source index as eight digits, then number of patch, level and draw if there are several", KEY_TEXT,
-        empty_if="")]
+        "source index as eight digits, then number of patch, frame of a burst, level and draw if there are several",
+        KEY_TEXT, empty_if="")]
     source: Annotated[str, Field(
         "path below the source folder, percent-encoded where unsafe", RELATIVE_PATH, empty_if="")]
     source_sha256: Annotated[str, Field("SHA-256 of the source's bytes", HEX_256, empty_if="the source cannot be read")]
@@ -97,7 +100,8 @@ class Origin(PlanRecord, frozen=True, kw_only=True):
     orientation: Annotated[int | None, Field(
         "EXIF orientation that was applied to the source, 1 to 8", Integers(1, 8))] = None
     shard: Annotated[int, Field("number of the shard", Integers(0, 10**9), empty_if="")]
-    clip: Annotated[str, Field("name of the clip", ANY_TEXT, needs=CLIPS)] = ""
+    clip: Annotated[str, Field(
+        "name of the clip; of a burst, the key of its source or patch", ANY_TEXT, needs=CLIPS)] = ""
     # fmt: on
 
 
@@ -168,11 +172,13 @@ def pair_row(
     ``sha256`` is that of the source's bytes, ``orientation`` the EXIF orientation that was applied, ``digests`` the
     XXH3-128 of the clean and of the noisy array. A manifest without frames has no pair and empty digests.
     """
+    clip = source.clip or (burst_key(key) if plan.motion else "")
     uses = {
         NOISY_FRAMES: "-l" in key,
         PATCHES: "-p" in key or any(patch.origin),
-        CLIPS: bool(source.clip),
+        CLIPS: bool(clip),
         LINEAR: plan.source.is_linear,
+        LIGHT: plan.source.is_linear or plan.motion is not None,
     }
     origin = Origin(
         key=key,
@@ -183,7 +189,7 @@ def pair_row(
         patch=patch,
         orientation=orientation,
         shard=shard,
-        clip=source.clip,
+        clip=clip,
     )
     measured = Measured(
         dark_variance_dn2=dark_variance_dn2(plan),
@@ -286,7 +292,8 @@ def check_row(row: Row) -> None:
     for name in _NEEDED if any(row[name] not in (None, "") for name in _FRAME_COLUMNS) else _NEEDED_TO_PLAN:
         if row[name] is None or row[name] == "":
             raise ValueError(f"{name} is empty")
-    largest = TARGET_BYTES if row["targets"] else 4 if FLOAT32 in (row["dtype"], row["clean_dtype"]) else 2
+    target_bytes = TARGET_BYTES * int(row["burst_downscale"] or 1) ** 2
+    largest = target_bytes if row["targets"] else 4 if FLOAT32 in (row["dtype"], row["clean_dtype"]) else 2
     size = int(row["width"] or 0) * int(row["height"] or 0) * largest
     if size > FRAME_BYTES:
         raise ValueError(

@@ -274,7 +274,9 @@ def arrays_of(row: Row) -> dict[str, ExpectedFrame]:
     dtype, clean_dtype = str(row["dtype"]), str(row["clean_dtype"] or row["dtype"])
     arrays = {"clean": (str(row["clean_xxh3"]), array_format(clean_dtype, layout, height, width))}
     if row["targets"]:
-        arrays[LINEAR_RGB] = str(row["targets"]).rpartition(":")[2], ArrayFormat(FLOAT32, (height, width, 3))
+        side = int(row["burst_downscale"] or 1)
+        shape = height * side, width * side, 3
+        arrays[LINEAR_RGB] = str(row["targets"]).rpartition(":")[2], ArrayFormat(FLOAT32, shape)
     arrays["noisy"] = str(row["noisy_xxh3"]), array_format(dtype, layout, height, width)
     place = int(row["level"] or 0), int(row["draw"] or 0)
     return {name: ExpectedFrame(member_of(name, *place), *array) for name, array in arrays.items()}

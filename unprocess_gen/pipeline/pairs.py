@@ -5,19 +5,23 @@ Runs, estimates, replays, the Python functions and benchmarks use it; they diffe
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from unprocess_gen.config.interpretation import patch_rule
+from unprocess_gen.config.interpretation import BurstRule, burst_rule, patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.arrays import Array, Srgb
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Value
+from unprocess_gen.dataset.keys import frame_key, patch_key
 from unprocess_gen.dataset.training import frame_noise_std
 from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.motion import draw_motion
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.raw_source import with_raw_sensor
+from unprocess_gen.simulation.bursts import BurstLight
 from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.facts import DarkFrames, Facts
 from unprocess_gen.simulation.frames import Pair, Patch
@@ -26,6 +30,8 @@ from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.patches import crop_patch, list_patches
+
+Targets = dict[str, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,29 +64,73 @@ class PlannedImage:
     config: Config | None = None
 
     def pairs(self) -> Iterator[tuple[Patch, Plan, Pair]]:
-        """Simulate the pairs of every patch, in the order of the manifest; pairs of a patch share their clean frame."""
-        for patch in self.patches:
-            for plan, pair in zip(self.plans, self.pairs_of(patch), strict=True):
-                yield patch, plan, pair
+        """Simulate the pairs of every patch, in the order of the manifest."""
+        for sample in self.samples():
+            for plan, pair in zip(sample.plans, sample.pairs(), strict=True):
+                yield sample.patch, plan, pair
 
-    def pairs_of(self, patch: Patch) -> Iterator[Pair]:
-        """Simulate the pairs of a patch, one for each plan."""
-        return make_pairs(crop_patch(self.srgb, patch), self.plans, patch.origin, self.dark_folder)
+    def samples(self) -> Iterator[Sample]:
+        """List the samples of every patch, in the order of the manifest: frames of bursts, or one sample a patch."""
+        rule = None if self.config is None else burst_rule(self.config.source)
+        for patch in self.patches:
+            if self.plans[0].motion is None:
+                yield Sample(self.srgb, patch, self.plans, self.dark_folder)
+                continue
+            plans = self.plans if rule is None else with_motion(rule, self.plans, patch)
+            light = BurstLight(self.srgb, plans[0], [plan.motion for plan in plans if plan.motion], patch)
+            for _, of_frame in itertools.groupby(plans, lambda plan: plan.place.frame):
+                yield Sample(self.srgb, patch, tuple(of_frame), self.dark_folder, light)
+
+
+def with_motion(rule: BurstRule, plans: Sequence[Plan], patch: Patch, epoch: int = 0) -> tuple[Plan, ...]:
+    """Plans of a burst's frames with the motion of a patch."""
+    keys, frames = plans[0].stream_key, {plan.place.frame for plan in plans}
+    motions = {frame: draw_motion(rule, keys, patch, frame, epoch) for frame in frames}
+    return tuple(plan.replace(motion=motions[plan.place.frame]) for plan in plans)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Pairs that share a clean frame: a patch of an image, or a frame of a burst, which has ``light``."""
+
+    srgb: Srgb
+    patch: Patch
+    plans: tuple[Plan, ...]
+    dark_folder: DarkFolder | None = None
+    light: BurstLight | None = None
+
+    def key(self, index: int, config: Config) -> str:
+        """Key of the sample in its shard."""
+        key = patch_key(index, self.patch.patch, several=config.source.patch is not None)
+        return key if self.light is None else frame_key(key, self.plans[0].place.frame)
+
+    def pairs(self) -> Iterator[Pair]:
+        """Simulate the pairs, one for each plan."""
+        if self.light is not None:
+            return self.light.pairs(self.plans, self.dark_folder)
+        return make_pairs(crop_patch(self.srgb, self.patch), self.plans, self.patch.origin, self.dark_folder)
+
+    def targets(self, names: Sequence[str], pair: Pair) -> Targets:
+        """Compute targets by name; of a burst, those of its first frame."""
+        if self.light is None:
+            return targets_of(names, self.srgb, self.plans[0], self.patch, pair)
+        return {LINEAR_RGB: self.light.target} if LINEAR_RGB in names and not self.plans[0].place.frame else {}
 
 
 def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, sha256: str) -> PlannedImage:
     """Plan the pairs of a decoded image; ``sha256`` is the digest of the source's bytes."""
     srgb, raw = photograph.srgb, photograph.raw
     config = with_raw_sensor(settings.config, raw)
-    facts = facts_for(config, srgb, source.frames, raw, photograph.source, photograph.profile)
+    burst, sides = burst_rule(config.source), (srgb.shape[0], srgb.shape[1])
+    frames = source.frames if burst is None else burst.frames
+    facts = facts_for(config, srgb, frames, raw, photograph.source, photograph.profile)
+    if burst is not None and facts is not None:
+        facts = replace(facts, height=sides[0] // burst.downscale, width=sides[1] // burst.downscale)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, settings.dark_frames)
     plans = tuple(plan.decoded(photograph.profile, photograph.pixels_xxh3) for plan in plans)
-    height, width = srgb.shape[:2]
-    patches = list_patches(patch_rule(config.source), plans[0].stream_key, height, width, config.output.layout)
+    rule, layout = patch_rule(config.source), config.output.layout
+    patches = list_patches(rule, plans[0].stream_key, *sides, layout, burst=burst)
     return PlannedImage(srgb, plans, patches, facts, settings.dark_folder, config)
-
-
-Targets = dict[str, Array]
 
 
 def targets_of(

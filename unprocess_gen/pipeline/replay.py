@@ -16,13 +16,13 @@ from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedErr
 from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.source import Source
+from unprocess_gen.core.source import NO_CLIP, Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.row import has_frames, patch_from_row, plan_from_row
 from unprocess_gen.dataset.shards import arrays_of
-from unprocess_gen.pipeline.pairs import PlannedImage, Targets, targets_of
+from unprocess_gen.pipeline.pairs import PlannedImage, Targets
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
@@ -114,16 +114,20 @@ class PairRegenerator:
         self_test.check([plan], names)
         photograph = self._photographs.load(source_of(row), str(row["source_sha256"]), plan.source)
         plan, patch = plan.decoded(photograph.profile, photograph.pixels_xxh3), patch_from_row(row)
-        height, width = photograph.srgb.shape[:2]
+        step = plan.motion.burst_downscale if plan.motion else 1
+        height, width = (side // step for side in photograph.srgb.shape[:2])
         if patch.patch_y + patch.height > height or patch.patch_x + patch.width > width:
             raise DamageError(
                 f"its patch of {patch.width} x {patch.height} pixels at row {patch.patch_y}, column {patch.patch_x} "
                 f"exceeds its source of {width} x {height} pixels"
             )
         image = PlannedImage(photograph.srgb, (plan,), (patch,), dark_folder=self._dark_pixels(plan))
-        _, _, pair = next(image.pairs())
-        targets = targets_of(names, photograph.srgb, plan, patch, pair)
-        return {"clean": pair.clean, "noisy": pair.noisy, **targets}
+        try:
+            sample = next(image.samples())
+        except ValueError as error:  # of an edited manifest, whose motion leads outside
+            raise DamageError(str(error)) from error
+        pair = next(sample.pairs())
+        return {"clean": pair.clean, "noisy": pair.noisy, **sample.targets(names, pair)}
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
         """Give access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
@@ -159,5 +163,6 @@ def source_of(row: Row) -> Source:
     """Source that a row was made from."""
     name, size = str(row["source"]), row["source_bytes"]
     path = decode_name(name)
-    size, frame = size if isinstance(size, int) else None, int(row["frame"] or 0)
-    return Source(int(image_key(row)), name, path, size, clip=str(row["clip"]), frame=frame)
+    size, of_clip = size if isinstance(size, int) else None, row["motion_y"] is None  # frames of bursts share a source
+    clip, frame = (str(row["clip"]), int(row["frame"] or 0)) if of_clip else (NO_CLIP, 0)
+    return Source(int(image_key(row)), name, path, size, clip=clip, frame=frame)

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import patch_rule
+from unprocess_gen.config.interpretation import burst_rule, patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import free_bytes
@@ -33,15 +33,17 @@ OTHER_BYTES = 8000
 def source_bytes(config: Config, height: int, width: int) -> int:
     """Bytes of the pairs of a source with these sides after ``source.downscale``: arrays, and 8 kB a pair."""
     output, pairs = config.output, noisy_frames(config)
-    rule = patch_rule(config.source)
-    if rule is not None and rule.kind == "random":  # places change no size
+    rule, burst = patch_rule(config.source), burst_rule(config.source)
+    if rule is not None and rule.kind == "random" and burst is None:  # places change no size
         patches: Sequence[Patch] = [Patch(rule.side, rule.side)] * rule.count
     else:
-        patches = list_patches(rule, 0, height, width, output.layout)
+        patches = list_patches(rule, 0, height, width, output.layout, burst=burst)
+    frames, step = (1, 1) if burst is None else (burst.frames, burst.downscale)
     clean, noisy = (np.dtype(name).itemsize for name in (output.clean_dtype or output.dtype, output.dtype))
-    site = clean + pairs * noisy + len(output.targets) * 3 * np.dtype(np.float32).itemsize
+    target = len(output.targets) * 3 * np.dtype(np.float32).itemsize * step**2
     sites = sum(patch.height * patch.width for patch in patches)
-    return (sites * site + len(patches) * pairs * OTHER_BYTES) * output.frames
+    samples = frames * (sites * (clean + pairs * noisy) + len(patches) * pairs * OTHER_BYTES)
+    return (samples + sites * target) * output.frames
 
 
 def check_free_space(config: Config, sources: Sequence[Source]) -> None:

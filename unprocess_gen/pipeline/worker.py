@@ -23,12 +23,12 @@ from unprocess_gen.core.errors import RESUME, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error, machine_errors
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.keys import pair_key, patch_key
+from unprocess_gen.dataset.keys import pair_key
 from unprocess_gen.dataset.row import columns_of, failed_row, has_frames, pair_row, row_json
 from unprocess_gen.dataset.shards import ShardWriter, shard_name, targets_cell
 from unprocess_gen.pipeline.deaths import counted_attempt
 from unprocess_gen.pipeline.folder import OutFolder
-from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels, targets_of
+from unprocess_gen.pipeline.pairs import PlannedImage, plan_pixels
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, commit_shard
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
@@ -114,11 +114,11 @@ def make_image(
         _test_kernels(context, image, made)
     identity = source, sha256, photograph.orientation, shard
     rows = list[Row]()
-    for patch in image.patches:
-        key, sample = patch_key(source.index, patch.patch, several=config.source.patch is not None), list[Row]()
-        pairs = image.pairs_of(patch) if config.output.frames else itertools.repeat(None)
-        for plan in image.plans:
-            row_key = pair_key(key, plan.place, several=len(image.plans) > 1)
+    for made_of in image.samples():
+        patch, key, sample = made_of.patch, made_of.key(source.index, config), list[Row]()
+        pairs = made_of.pairs() if config.output.frames else itertools.repeat(None)
+        for plan in made_of.plans:
+            row_key = pair_key(key, plan.place, several=len(made_of.plans) > 1)
             with timed("simulate_s"):
                 pair = next(pairs)
             if pair is None:
@@ -126,7 +126,7 @@ def make_image(
                 continue
             if not sample:
                 with timed("simulate_s"):
-                    targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair)
+                    targets = made_of.targets(config.output.targets, pair)
                 clean_xxh3, stored_targets = array_xxh3(pair.clean), targets_cell(targets)
             row = pair_row(
                 row_key, *identity, plan, pair, (clean_xxh3, array_xxh3(pair.noisy)), patch, noise_dn, photograph.note

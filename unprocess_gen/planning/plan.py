@@ -16,9 +16,11 @@ from typing import Any, NamedTuple
 
 from unprocess_gen.config import interpretation
 from unprocess_gen.config.distributions import Distribution
+from unprocess_gen.config.interpretation import burst_rule
 from unprocess_gen.config.limits import EV, EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.arrays import FLOAT32
+from unprocess_gen.core.exact_distributions import power_of_two
 from unprocess_gen.core.random_streams import DARK_FRAME, PARAMETERS, frame_word, purpose, split_uniform, stream_key
 from unprocess_gen.core.sequences import Recent
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
@@ -30,6 +32,7 @@ from unprocess_gen.planning.frame_model import (
     raw_signal_range,
     signal_range,
 )
+from unprocess_gen.planning.motion import still
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.planning.parameters import draw_parameter
 from unprocess_gen.planning.raw_source import own_noise, parts_of, with_raw_sensor
@@ -79,12 +82,16 @@ def plan_pairs(
 ) -> tuple[Plan, ...]:
     """Draw the parameters of all pairs of one image: each noise level, and each draw of the noise at that level.
 
+    The plans of a burst are those of all of its frames, without their motion, which depends on the patch.
+
     The first dark frame is chosen at random for each image, and the frames of a clip, the levels and the draws take the
     next ones in turn. All use the same part of the frames, so that the fixed pattern of the camera does not move.
     """
+    levels, rule = [*_plan_exposures(config, source_sha256, occurrence, facts, dark_frames)], burst_rule(config.source)
     plans = [
-        plan.replace(place=Place(frame, plan.place.level, draw)) if draw or frame else plan
-        for plan, _ in plan_levels(config, source_sha256, occurrence, facts, dark_frames)
+        plan.replace(place=Place(number, plan.place.level, draw)) if draw or number else plan
+        for number in ([frame] if rule is None else range(rule.frames))
+        for plan, _ in (exposures[number % len(exposures)] for exposures in levels)
         for draw in range(config.noise.draws)
     ]
     if dark_frames is not None and facts is not None:
@@ -96,8 +103,9 @@ def plan_pairs(
 def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int) -> Plan:
     """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay."""
     planner = _planner(with_raw_sensor(config, parts_of(plan)))
-    image = planner.image(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
-    redrawn = planner.plan(image, plan.place, plan.dark)[0]
+    images = planner.images(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
+    exposures = planner.plans(images, plan.place, plan.dark)
+    redrawn = exposures[plan.place.frame % len(exposures)][0]
     return redrawn.decoded(plan.source.profile, plan.source.pixels_xxh3)
 
 
@@ -133,9 +141,16 @@ def plan_levels(
     dark_frames: DarkFrames | None = None,
 ) -> Iterator[tuple[Plan, Selection | None]]:
     """Yield the plan of one image at each noise level, and the selection of effects of a physical profile."""
+    return (exposures[0] for exposures in _plan_exposures(config, source_sha256, occurrence, facts, dark_frames))
+
+
+def _plan_exposures(
+    config: Config, source_sha256: str, occurrence: int, facts: Facts | None, dark_frames: DarkFrames | None
+) -> Iterator[Sequence[tuple[Plan, Selection | None]]]:
+    """Yield the plans of one image at each noise level: one, or one for each exposure of a burst."""
     planner, key = _planner(config), stream_key(config.seed, source_sha256, occurrence)
-    image = planner.image(config.seed, key, draw_split(config, source_sha256), facts, dark_frames)
-    return (planner.plan(image, Place(level=number)) for number in range(len(planner.levels)))
+    images = planner.images(config.seed, key, draw_split(config, source_sha256), facts, dark_frames)
+    return (planner.plans(images, Place(level=number)) for number in range(len(planner.levels)))
 
 
 def draw_split(config: Config, source_sha256: str) -> str:
@@ -191,13 +206,16 @@ class Planner:
             self._isp, self._inverse_rgb = LINEAR_ISP, UNCHANGED
         levels_dn, saturated_as = (sensor.black_level_dn, sensor.white_level_dn), interpretation.saturated_as(config)
         self._sensor = SensorPlan(sensor.pattern, sensor.bits, *levels_dn, sensor.clip, saturated_as)
+        rule = burst_rule(config.source)
+        self._stops = (0.0,) if rule is None else rule.ev[: rule.frames]
+        self._motion = None if rule is None else still(rule)
         clean_dtype = FLOAT32 if interpretation.has_float_clean(config) else ""
         self._output = OutputPlan(config.output.dtype, config.output.layout, clean_dtype)
 
-    def image(
+    def images(
         self, seed: int, key: int, split: str, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int = 0
-    ) -> Image:
-        """Draw what the noise levels of an image share in an epoch."""
+    ) -> list[Image]:
+        """Draw what the noise levels of an image share in an epoch, for each exposure of a burst."""
         if self._needs_dark_frames and dark_frames is None:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
@@ -207,8 +225,7 @@ class Planner:
             draw_parameter(distribution, uniforms[counter])
             for distribution, counter in ((self._exposure_ratio, Draw.EXPOSURE_RATIO), (self._ev, Draw.EV))
         )
-        scene = ScenePlan(self._scene_name, ratio, ev)
-        raw, light = None if facts is None else facts.raw, (scene.exposure, float(self._sensor.span_dn))
+        raw = None if facts is None else facts.raw
         if raw is None:
             # compiling takes as long as 20,000 matrices, which only redrawn plans may need
             name, weights, rgb2cam = plan_camera(self._camera, uniforms, is_compiled=epoch > 0)
@@ -223,16 +240,39 @@ class Planner:
             camera = without_filters(camera) if self._sensor.pattern == MONO else camera
             source, isp = (facts and facts.source) or self._source, self._isp
         else:
-            source, isp, camera = own_noise(raw, *light), raw.isp, raw.camera
-        signals = None
-        if self._is_physical and facts is not None:
-            if raw is not None:
-                signals = raw_signal_range(facts, source, *light)
-            elif source.is_linear:
-                signals = linear_signal_range(facts, *light_colours(source, camera), scene.exposure, self._sensor)
-            else:
-                signals = signal_range(facts, isp, camera, *light)
-        return Image(seed, key, split, epoch, uniforms, scene, source, camera, isp, facts, signals, dark_frames)
+            source, isp, camera = raw.source, raw.isp, raw.camera
+        images = []
+        for stops in self._stops:
+            scene = ScenePlan(self._scene_name, ratio, ev + stops)
+            light = scene.exposure, float(self._sensor.span_dn)
+            of_scene = source if raw is None else own_noise(raw, *light)
+            signals = None
+            if self._is_physical and facts is not None:
+                if raw is not None:
+                    signals = raw_signal_range(facts, of_scene, *light)
+                elif source.is_linear:
+                    signals = linear_signal_range(facts, *light_colours(source, camera), light[0], self._sensor)
+                else:
+                    signals = signal_range(facts, isp, camera, *light)
+            shared = facts, signals, dark_frames, stops
+            images.append(Image(seed, key, split, epoch, uniforms, scene, of_scene, camera, isp, *shared))
+        return images
+
+    def plans(
+        self, images: Sequence[Image], place: Place, dark: DarkFramePlan | None = None
+    ) -> list[tuple[Plan, Selection | None]]:
+        """Draw the noise of an image at the level of a place, for each exposure of a burst.
+
+        All frames of a burst have the effects that one of them calls for.
+        """
+        plans = [self.plan(image, place, dark) for image in images]
+        selections = [selection for _, selection in plans if selection is not None]
+        if len(selections) < 2:
+            return plans
+        on = frozenset[str]().union(*(selection.on for selection in selections))
+        together = [selection._replace(on=on) for selection in selections]
+        chosen = ({name: getattr(selection, name) for name in CHOSEN} for selection in together)
+        return [(plan.replace(**names), own) for (plan, _), names, own in zip(plans, chosen, together, strict=True)]
 
     def plan(self, image: Image, place: Place, dark: DarkFramePlan | None = None) -> tuple[Plan, Selection | None]:
         """Draw the noise of an image at the level of a place."""
@@ -244,8 +284,8 @@ class Planner:
         noise, physics, selection = self.levels[place.level].draw(image, uniforms)
         return Plan(
             seed=image.seed, stream_key=image.stream_key, split=image.split, place=place, camera=image.camera,
-            isp=image.isp, source=image.source, sensor=self._sensor, scene=image.scene, noise=noise,
-            accuracy=self._accuracy, physics=physics, dark=dark, output=self._output,
+            isp=image.isp, source=image.source, motion=self._motion, sensor=self._sensor, scene=image.scene,
+            noise=noise, accuracy=self._accuracy, physics=physics, dark=dark, output=self._output,
         ), selection  # fmt: skip
 
 
@@ -260,6 +300,9 @@ def without_filters(camera: CameraPlan) -> CameraPlan:
     rows = red, green, blue, red, green, blue, red, green, blue
     return camera.replace(rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=sum(gains) / 3)
 
+
+CHOSEN = "effects", "skipped", "assumed"
+"""Fields of a plan that the selection of effects decides."""
 
 DrawnNoise = tuple[NoisePlan, Physics | None, Selection | None]
 """Noise of a plan, and of a physical profile its numbers and the selection of effects."""
@@ -280,6 +323,7 @@ class Image(NamedTuple):
     facts: Facts | None
     signals: SignalRange | None
     dark_frames: DarkFrames | None
+    stops: float = 0.0  # of the exposure time, against that of the scene
 
 
 class TwoNumberLevel:
@@ -336,6 +380,8 @@ class PhysicalLevel:
         assert image.facts is not None and image.signals is not None
         facts, lens, dark = image.facts, self._noise.has_lens_shading, image.dark_frames
         drawn = self._noise.draw(uniforms, image.stream_key, image.seed)
+        if image.stops:
+            drawn = drawn._replace(exposure_s=drawn.exposure_s * power_of_two(image.stops))
         key = drawn, dark and dark.variance_dn2, facts.frames > 1, (facts.height, facts.width) if lens else None
         known = self._sensors.get(key)
         if known is None:

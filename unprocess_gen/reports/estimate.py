@@ -13,12 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from unprocess_gen.config.schema import Config
+from unprocess_gen.core.arrays import Array
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
-from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels, targets_of
+from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.pipeline.progress import COMPILING, with_bar
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.sizes import source_bytes
@@ -127,12 +128,17 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
     levels = predicted_levels(settings, image, source, sha256)
     _compile_kernels([plan for plan, _ in levels])
     started, clipped, sites = time.perf_counter(), 0, 0
-    for patch, plan, pair in image.pairs():
-        clipped, sites = clipped + pair.counts.clean_clipped_low, sites + patch.width * patch.height
-        targets = targets_of(config.output.targets, photograph.srgb, plan, patch, pair).values()
-        for frame in (*((pair.clean, *targets) if plan is image.plans[0] else ()), pair.noisy):
-            array_xxh3(frame)
-            hashlib.sha256(frame.data)
+    for sample in image.samples():
+        arrays: list[Array] = []
+        for pair in sample.pairs():
+            clipped += pair.counts.clean_clipped_low
+            sites += sample.patch.width * sample.patch.height
+            if not arrays:
+                arrays += pair.clean, *sample.targets(config.output.targets, pair).values()
+            arrays.append(pair.noisy)
+        for array in arrays:
+            array_xxh3(array)
+            hashlib.sha256(array.data)
     warning = clipped_low_warning(clipped, sites) if photograph.raw is not None else ""
     return SourceEstimate(
         source,

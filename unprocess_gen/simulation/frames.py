@@ -5,16 +5,19 @@ from typing import Annotated, Any
 
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.fields import FAILED, Condition, Field, Integers
-from unprocess_gen.simulation.plan import COORDINATE, COUNT, LINEAR, PlanRecord
+from unprocess_gen.simulation.plan import BURSTS, COORDINATE, COUNT, LIGHT, PlanRecord
 
-PATCHES = Condition("source.patch is null", lambda config: config.source.patch is not None)
+PATCHES = Condition(
+    f"source.patch is null, and {BURSTS.unless}",
+    lambda config: config.source.patch is not None or BURSTS.holds(config),
+)
 SIDE = Integers(1, 2**32)
 LIMITED_LIGHT = Condition(
-    "scene.exposure_ratio is 1 and source.kind is not linear, or output.frames is false",
-    lambda config: config.output.frames and (config.scene.exposure_ratio != 1 or LINEAR.holds(config)),
+    f"scene.exposure_ratio is 1, {LIGHT.unless}; or output.frames is false",
+    lambda config: config.output.frames and (config.scene.exposure_ratio != 1 or LIGHT.holds(config)),
 )
 LINEAR_LIGHT = Condition(
-    "source.kind is not linear, or output.frames is false", lambda config: config.output.frames and LINEAR.holds(config)
+    f"{LIGHT.unless}; or output.frames is false", lambda config: config.output.frames and LIGHT.holds(config)
 )
 
 
@@ -45,7 +48,7 @@ class Counts(PlanRecord, frozen=True):
     """Numbers of sites at a limit; for float32 frames, clipped noisy values are counted without rounding.
 
     Variance is zero where a fitted b is negative, or if no noise is simulated. ``light_clipped_high`` is None for
-    photographs without an exposure ratio, ``light_clipped_low`` for all but linear sources.
+    photographs without an exposure ratio, ``light_clipped_low`` for all but linear sources and bursts.
     """
 
     # fmt: off
@@ -58,10 +61,10 @@ class Counts(PlanRecord, frozen=True):
     zero_variance: Annotated[int, _sites("sites at which the noise has no variance")]
     light_clipped_high: Annotated[int | None, _sites(
         "sites whose light is clipped: of photographs, above white before the exposure ratio divides it; of linear "
-        "sources, above 2^16 times white", needs=LIMITED_LIGHT,
-        empty_if=f"{FAILED}, or exposure_ratio is 1 and the source is not linear")] = None
+        "sources and bursts, above 2^16 times white", needs=LIMITED_LIGHT,
+        empty_if=f"{FAILED}, or exposure_ratio is 1 and the source neither linear nor a burst")] = None
     light_clipped_low: Annotated[int | None, _sites(
-        "sites of a linear source whose light is negative, and clipped to 0", needs=LINEAR_LIGHT)] = None
+        "sites of a linear source or a burst whose light is negative, and clipped to 0", needs=LINEAR_LIGHT)] = None
     # fmt: on
 
 

@@ -243,6 +243,8 @@ _LINEAR_DTYPES = (np.dtype(np.float32),)
 
 def _check_image(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> None:
     """Raise ValueError if an image has an unusable dtype or shape, or is not inside the frame of the lens shading."""
+    if plan.motion is not None:
+        raise ValueError(f"plan={plan}: is that of a frame of a burst, which `bursts` resamples; expected another plan")
     dtypes = _LINEAR_DTYPES if plan.source.is_linear else _DTYPES
     if srgb.dtype not in dtypes or srgb.ndim != 3 or srgb.shape[2] != 3:
         expected = " or ".join(map(str, dtypes))

@@ -105,7 +105,11 @@ DECODED = Condition(
         )
     ),
 )
-CLIPS = Condition("source.clips is false", lambda config: config.source.clips)
+BURSTS = Condition("source.burst is null", lambda config: config.source.burst is not None)
+CLIPS = Condition(
+    f"source.clips is false, and {BURSTS.unless}", lambda config: config.source.clips or BURSTS.holds(config)
+)
+LIGHT = Condition(f"{LINEAR.unless}, and {BURSTS.unless}", lambda config: LINEAR.holds(config) or BURSTS.holds(config))
 SPLITS = Condition("split is null", lambda config: config.split is not None)
 LIGHTS = Condition("gains.light is null", lambda config: config.gains.light is not None)
 PHYSICAL = Condition("the noise profile is not physical", lambda config: bool(config.noise.branches))
@@ -194,7 +198,7 @@ class Place(PlanRecord, frozen=True):
     """Numbers that select the random values of a frame of an image; ``epoch`` numbers those of live pairs."""
 
     # fmt: off
-    frame: Annotated[int, Field("number of the frame in its clip, from 0", COORDINATE, needs=CLIPS)] = 0
+    frame: Annotated[int, Field("number of the frame in its clip or burst, from 0", COORDINATE, needs=CLIPS)] = 0
     level: Annotated[int, Field("number of the noise level, from 0", Integers(0, 99), needs=NOISY_FRAMES)] = 0
     draw: Annotated[int, Field("number of the draw at this level, from 0", Integers(0, 99), needs=NOISY_FRAMES)] = 0
     epoch: int = 0
@@ -322,6 +326,10 @@ class SourcePlan(PlanRecord, frozen=True):
         return (black,) * 4, (black + span * steps,) * 4
 
 
+CAMERA_LIGHT = SourcePlan(downscale=1, dequantize="off", primaries="camera")
+"""Source of the frames of a burst: neither matrix nor gains are applied to their light."""
+
+
 class SensorPlan(PlanRecord, frozen=True):
     """Digital output of the sensor.
 
@@ -365,14 +373,45 @@ class ScenePlan(PlanRecord, frozen=True):
         "divisor of the light in the photograph: 100 leaves a hundredth; frames are not brightened afterwards",
         Numbers(1e-3, 1e6))]
     ev: Annotated[float, Field(
-        "exposure of a linear source, whose light is multiplied by 2^ev", Numbers(-64, 64), "stops",
-        needs=LINEAR)] = 0.0
+        "exposure of a linear source or of a frame of a burst, whose light is multiplied by 2^ev", Numbers(-64, 64),
+        "stops", needs=LIGHT)] = 0.0
     # fmt: on
 
     @property
     def exposure(self) -> float:
         """Factor applied to the light of the scene."""
         return power_of_two(self.ev) / self.exposure_ratio
+
+
+class Motion(PlanRecord, frozen=True):
+    """Place of a frame of a burst in the picture of its first frame, the target, and the resolution of the frames.
+
+    High-resolution pixel (p, q) of the frame shows the position (motion_yy p + motion_yx q + motion_y, motion_xy p +
+    motion_xx q + motion_x) of the target; centres of pixels are integers.
+    """
+
+    # fmt: off
+    motion_yy: Annotated[float, Field(
+        "row in the target that a high-resolution pixel of a burst's frame shows: factor of the pixel's row", FINITE)]
+    motion_yx: Annotated[float, Field("the same row: factor of the pixel's column", FINITE)]
+    motion_y: Annotated[float, Field("the same row: of the pixel (0, 0)", FINITE, "high-resolution pixels")]
+    motion_xy: Annotated[float, Field(
+        "column in the target that a high-resolution pixel of a burst's frame shows: factor of the pixel's row",
+        FINITE)]
+    motion_xx: Annotated[float, Field("the same column: factor of the pixel's column", FINITE)]
+    motion_x: Annotated[float, Field("the same column: of the pixel (0, 0)", FINITE, "high-resolution pixels")]
+    burst_downscale: Annotated[int, Field(
+        "side of the squares of high-resolution pixels whose mean is a pixel of a burst's frame", Integers(1, 64),
+        "pixels")] = 1
+    burst_phase: Annotated[str, Field(
+        "centre of pixel i of a burst's frame in high-resolution pixels: centre is s i + (s - 1) / 2, corner is s i, "
+        "with s = burst_downscale", Choice("centre", "corner"))] = "centre"
+    # fmt: on
+
+    @property
+    def pixel_offset(self) -> float:
+        """Offset of the first of the squares' pixels: 0, or with ``corner`` half a square less half a pixel before."""
+        return 0.0 if self.burst_phase == "centre" else -(self.burst_downscale - 1) / 2
 
 
 class NoisePlan(PlanRecord, frozen=True):
@@ -547,6 +586,7 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
     camera: CameraPlan
     isp: IspPlan
     source: SourcePlan
+    motion: Annotated[Motion | None, BURSTS] = None
     sensor: SensorPlan
     scene: ScenePlan
     noise: NoisePlan
@@ -561,6 +601,13 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
     def __repr__(self) -> str:
         key, camera, noise, scene = self.stream_key, self.camera.camera, self.noise.noise, self.scene.scene
         return f"Plan(stream_key={key:016x}, camera={camera}, noise={noise}, scene={scene}, accuracy={self.accuracy})"
+
+    @property
+    def of_light(self) -> Self:
+        """Plan whose source is the light of the camera at the resolution of the sensor; without motion, this plan."""
+        if self.motion is None:
+            return self
+        return self.replace(motion=None, source=CAMERA_LIGHT, highlight="none")
 
     def decoded(self, profile: Profile, pixels_xxh3: str = "") -> Self:
         """Return the plan with the colours of its photograph, which no draw depends on, and the digest of pixels."""

@@ -126,11 +126,11 @@ GOLDEN = {
 
 def kernels(plans: Sequence[Plan], targets: Sequence[str] = ()) -> list[str]:
     """Names of the sets of kernels that simulate plans and targets; sets are compiled one by one, in seconds."""
-    if LINEAR_RGB in targets:
+    if LINEAR_RGB in targets and plans[0].motion is None:
         exact = [plan.replace(accuracy=EXACT) for plan in plans]
         plans = [*plans, *exact, *(plan.replace(clean_dtype=FLOAT32) for plan in exact)]
     sets: dict[str, None] = {}
-    for plan in plans:
+    for plan in [plan.of_light for plan in plans]:
         noise = "electrons" if plan.counts_electrons else "gaussian"
         if plan.accuracy == REFERENCE:
             noise = "reference"

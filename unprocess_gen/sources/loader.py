@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import patch_rule
+from unprocess_gen.config.interpretation import burst_rule, patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb, last_code
 from unprocess_gen.core.errors import FilteredError, MachineError, SourceError
@@ -17,6 +17,7 @@ from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.decode import Photograph, decode
 from unprocess_gen.sources.linear.files import read_linear_source
 from unprocess_gen.sources.linear.pixels import linear_photograph
+from unprocess_gen.sources.patches import list_patches
 from unprocess_gen.sources.raw.frames import read_raw_source
 from unprocess_gen.sources.reading import ReadFile, read_bytes
 
@@ -79,8 +80,12 @@ def _check_size(config: SourceConfig, srgb: Srgb, layout: str, digest: str) -> N
     if config.min_side is not None and min(prepared) < config.min_side:
         text = f"{width} x {height} pixels have a side shorter than source.min_side={config.min_side}"
         raise FilteredError("too_small", text, digest)
-    rule = patch_rule(config)
+    rule, burst = patch_rule(config), burst_rule(config)
     side = 1 if rule is None else rule.side
+    if burst is not None and not list_patches(rule, 0, *prepared, layout, burst=burst):
+        what = "frame" if rule is None else f"patch of {side} x {side}"
+        text = f"{width} x {height} pixels contain no {what} with the margin that the motion of source.burst needs"
+        raise SourceError("too_small", text, digest)
     for (height, width), least, problem in (
         (decoded, config.downscale, f"are less than one square of source.downscale={config.downscale}"),
         (prepared, side, f"contain no patch of {side} x {side} (source.patch)"),

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
-from unprocess_gen.config.interpretation import PatchRule
+from unprocess_gen.config.interpretation import BurstRule, PatchRule
 from unprocess_gen.core.arrays import MOSAIC, PACKED, Srgb
 from unprocess_gen.core.random_streams import PATCH, even_corner, frame_word, purpose
 from unprocess_gen.simulation.frames import Patch
@@ -21,11 +21,22 @@ from unprocess_gen.simulation.kernels.draws import draws
 
 
 def list_patches(
-    rule: PatchRule | None, stream_key: int, height: int, width: int, layout: str = MOSAIC, epoch: int = 0
+    rule: PatchRule | None,
+    stream_key: int,
+    height: int,
+    width: int,
+    layout: str = MOSAIC,
+    epoch: int = 0,
+    burst: BurstRule | None = None,
 ) -> tuple[Patch, ...]:
-    """List the patches of an image in order; random ones are elsewhere in each epoch."""
+    """List the patches of an image in order; random ones are elsewhere in each epoch.
+
+    Those of bursts are in pixels of their frames. None is closer to the edge of the picture than a frame may move.
+    """
+    side = 2 if layout == PACKED else 1
+    if burst is not None:
+        return _list_bursts(rule, burst, stream_key, (height, width), side, epoch)
     if rule is None:
-        side = 2 if layout == PACKED else 1
         return (Patch(width // side * side, height // side * side),)
     corners: Iterable[tuple[int, int]]
     if rule.kind == "grid":
@@ -35,6 +46,38 @@ def list_patches(
         words, _ = draws(stream_key, rule.count, purpose(PATCH), frame_word(0, epoch))
         corners = (even_corner(place, rule.side, height, width) for place in words.tolist())
     return tuple(Patch(rule.side, rule.side, number, y, x) for number, (y, x) in enumerate(corners))
+
+
+def _list_bursts(
+    rule: PatchRule | None, burst: BurstRule, stream_key: int, picture: tuple[int, int], side: int, epoch: int
+) -> tuple[Patch, ...]:
+    """List the patches of bursts, whose corners are at sites (0, 0) of the sensor's tiles; none if none fits."""
+    target = picture if rule is None else (rule.side, rule.side)
+    margins = burst.margin(*target)
+    firsts = [-(-margin // burst.tile) * burst.tile for margin in margins]
+    ends = [length - margin for length, margin in zip(picture, margins, strict=True)]
+    if rule is None:
+        height, width = (
+            (end - first) // (burst.downscale * side) * side for first, end in zip(firsts, ends, strict=True)
+        )
+        corner = firsts[0] // burst.downscale, firsts[1] // burst.downscale
+        return (Patch(width, height, 0, *corner),) if min(height, width) > 0 else ()
+    places = [range(first, end - rule.side + 1, burst.tile) for first, end in zip(firsts, ends, strict=True)]
+    if not all(places):
+        return ()
+    corners: Iterable[tuple[int, int]]
+    if rule.kind == "grid":
+        rows, columns = (place[:: rule.stride // burst.tile] for place in places)
+        corners = itertools.product(rows, columns)
+    else:
+        words, _ = draws(stream_key, rule.count, purpose(PATCH), frame_word(0, epoch))
+        corners = ((places[0][y * len(places[0]) >> 32], places[1][x * len(places[1]) >> 32])
+                   for y, x, *_ in words.tolist())  # fmt: skip
+    length = rule.side // burst.downscale
+    return tuple(
+        Patch(length, length, number, y // burst.downscale, x // burst.downscale)
+        for number, (y, x) in enumerate(corners)
+    )
 
 
 def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:
