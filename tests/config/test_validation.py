@@ -299,7 +299,7 @@ def test_config_yaml_contains_source_kind_but_no_path(settings: Settings, tmp_pa
 def test_config_yaml_has_the_keys_that_decide_data(settings: Settings) -> None:
     omitted = {"out", "n_jobs", "self_test", "check_disk", "source.root", "source.list", "source.max_failed"}
     omitted |= {"noise.dark_frames", "noise.provenance", "body.name", "body.missing"}
-    omitted |= {"source.primaries", "scene.ev"}  # unless they have a value
+    omitted |= {"source.primaries", "source.burst", "scene.ev"}  # unless they have a value
     omitted |= {"executor.kind", "executor.address", "executor.no_workers_s"}
     loaded = yaml.safe_load(dataset_yaml(settings()))
     groups = {group: loaded.get(group, {}) for group in GROUPS} | {"source.raw": loaded["source"].pop("raw")}

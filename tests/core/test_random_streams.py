@@ -88,7 +88,7 @@ def test_stream_numbers_never_change() -> None:
     assert streams.STREAMS == {
         "parameters": 0, "heteroscedastic": 1, "prnu": 2, "shot": 3, "dark_current": 4, "hot_pixels": 5, "read": 6,
         "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10, "patch": 11, "scatter": 12,
-        "column_temporal": 13, "dark_frame": 14, "dark_dither": 15, "dsnu": 16,
+        "column_temporal": 13, "dark_frame": 14, "dark_dither": 15, "dsnu": 16, "motion": 17,
     }  # fmt: skip
     with pytest.raises(ValueError, match="stream new, number 2: one of them is taken"):
         streams.declare_stream("new", 2)

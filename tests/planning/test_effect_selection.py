@@ -279,8 +279,8 @@ def test_redrawn_plans_are_those_of_a_new_planner(settings: Settings, profile: s
     kept = Planner(config)
     for epoch in range(6):
         facts = Facts(256, 128 + epoch // 3, 256, epoch % 2, 250)
-        own, shared = (
-            planner.plan(planner.image(0, 5, "", facts, None, epoch), Place()) for planner in (Planner(config), kept)
+        (own,), (shared,) = (
+            planner.plans(planner.images(0, 5, "", facts, None, epoch), Place()) for planner in (Planner(config), kept)
         )
         assert shared[0] == own[0]
         selection = own[1]

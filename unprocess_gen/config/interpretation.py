@@ -181,6 +181,9 @@ def canonical_patch(source: SourceConfig) -> list[Any] | None:
     return None if rule is None else [rule.kind, rule.side, rule.stride or rule.count]
 
 
+RADIANS_PER_DEGREE = math.pi / 180
+
+
 @dataclass(frozen=True, slots=True)
 class BurstRule:
     """Frames of a burst, and the largest motion of a frame: pixels and degrees; ``ev`` repeats."""
@@ -203,7 +206,7 @@ class BurstRule:
 
     def margin(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns around a target of these sides that its frames may show."""
-        angle, before = math.radians(self.rotation_deg), 0 if self.phase == "centre" else self.downscale - 1
+        angle, before = RADIANS_PER_DEGREE * self.rotation_deg, 0 if self.phase == "centre" else self.downscale - 1
         sides, reach = (height + before, width + before), self.shift + before / 2
         # at least sin a and 1 - cos a times half of each side
         turned, rest = (tuple(factor * side / 2 for side in sides) for factor in (angle, angle * angle / 2))

@@ -28,21 +28,10 @@ from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Column, Row, Value, flatten, places_of, rebuild
 from unprocess_gen.dataset.keys import burst_key, key_text
+from unprocess_gen.simulation.conditions import CLIPS, LIGHT, LINEAR, NOISY_FRAMES
 from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.frames import PATCHES, Counts, Pair, Patch
-from unprocess_gen.simulation.plan import (
-    ANY_TEXT,
-    CLIPS,
-    COUNT,
-    FINITE,
-    HEX_128,
-    HEX_256,
-    LIGHT,
-    LINEAR,
-    NOISY_FRAMES,
-    Plan,
-    PlanRecord,
-)
+from unprocess_gen.simulation.plan import ANY_TEXT, COUNT, FINITE, HEX_128, HEX_256, Plan, PlanRecord
 
 MAX_PATH = 2**15
 """Characters of the percent-encoded path of a source."""

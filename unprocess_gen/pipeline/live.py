@@ -42,10 +42,11 @@ from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import draw_split, next_dark_frame, redraw_plan
 from unprocess_gen.planning.raw_source import parts_of, stated_source
 from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.conditions import noisy_frames
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.frames import Pair, Patch
 from unprocess_gen.simulation.pair import CropMaker, crop_maker
-from unprocess_gen.simulation.plan import Place, Plan, noisy_frames
+from unprocess_gen.simulation.plan import Place, Plan
 from unprocess_gen.sources.image.decode import Photograph
 from unprocess_gen.sources.loader import identity_sha256, load_source
 from unprocess_gen.sources.patches import crop_patch, list_patches

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
-from unprocess_gen.config.interpretation import BurstRule
+from unprocess_gen.config.interpretation import RADIANS_PER_DEGREE, BurstRule
 from unprocess_gen.core.random_streams import MOTION, frame_word, purpose
 from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.kernels.draws import draws
@@ -25,7 +23,7 @@ def draw_motion(rule: BurstRule, stream_key: int, patch: Patch, frame: int, epoc
         return still(rule)
     words = purpose(MOTION, *divmod(patch.patch, NUMBERS_OF_PATCH)), frame_word(frame, epoch)
     down, right, turn = (2 * uniform - 1 for uniform in draws(stream_key, 3, *words)[1].tolist())
-    cosine, sine = cosine_and_sine(math.radians(rule.rotation_deg * turn))
+    cosine, sine = cosine_and_sine(RADIANS_PER_DEGREE * (rule.rotation_deg * turn))
     y, x = ((side * rule.downscale - 1) / 2 for side in (patch.height, patch.width))
     return Motion(
         *(cosine, sine, y - (cosine * y + sine * x) + rule.shift * down),

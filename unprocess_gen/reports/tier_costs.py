@@ -35,11 +35,12 @@ from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports.formatting import counted
 from unprocess_gen.reports.pictures import picture_jpeg
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
+from unprocess_gen.simulation.conditions import noisy_frames
 from unprocess_gen.simulation.frames import Pair
 from unprocess_gen.simulation.kernels.render import render_clean
 from unprocess_gen.simulation.kernels.site_patterns import forget_patterns
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan, noisy_frames
+from unprocess_gen.simulation.plan import EXACT, REFERENCE, TIERS, Plan
 from unprocess_gen.simulation.reference.electrons import noise_variance
 from unprocess_gen.simulation.reference.sensor import in_dn
 from unprocess_gen.sources.image.decode import Photograph

@@ -5,7 +5,8 @@ from typing import Annotated, Any
 
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.fields import FAILED, Condition, Field, Integers
-from unprocess_gen.simulation.plan import BURSTS, COORDINATE, COUNT, LIGHT, PlanRecord
+from unprocess_gen.simulation.conditions import BURSTS, LIGHT
+from unprocess_gen.simulation.plan import COORDINATE, COUNT, PlanRecord
 
 PATCHES = Condition(
     f"source.patch is null, and {BURSTS.unless}",
