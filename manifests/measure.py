@@ -1,8 +1,7 @@
 """Measure how hard the benchmark builds are, and write their cards: PSNR and SSIM of noisy and of denoised frames.
 
 ``python manifests/measure.py DIR`` makes every build in DIR, or uses what is there, and rewrites ``scores.csv``, the
-cards and the table of ``README.md``; names after DIR select builds. ``measure`` takes any denoiser, so that its results
-can be quoted next to these. Needs scikit-image (``pip install '.[photos]'``).
+cards and the table of ``README.md``; names after DIR select builds. Needs scikit-image (``pip install '.[photos]'``).
 
 With ``--pin``, builds whose NAME.sha256 is missing get their digests and rows; those of others are not changed.
 """
@@ -11,98 +10,37 @@ from __future__ import annotations
 
 import argparse
 import csv
-import math
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from skimage.metrics import structural_similarity
-from skimage.restoration import denoise_nl_means
 
 import unprocess_gen as ug
 from unprocess_gen.cli.main import run
 from unprocess_gen.cli.runs import make_build
-from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.manifest import csv_lines, read_columns, read_rows
 from unprocess_gen.dataset.row import COLUMN_NAMES
 from unprocess_gen.reports.builds import MANIFEST, Build, build_names, read_build
-from unprocess_gen.simulation.reference.cfa import unpack
+from unprocess_gen.reports.scoring.items import dataset_items
+from unprocess_gen.reports.scoring.scoring import score_items
 
 FOLDER = Path(__file__).resolve().parent
 SCORES = FOLDER / "scores.csv"
 UNRECORDED = {"dataset.json", "sweep.csv", "sweep.csv.lock"}
 DIGITS = {"psnr": 2, "ssim": 3}
 BEGIN, END = "<!-- scores: written by measure.py -->", "<!-- end of scores -->"
-COLUMNS = tuple(
-    f"{frame}_{domain}_{kind}"
-    for frame in ("noisy", "denoised")
-    for domain in ("raw", "srgb")
-    for kind in ("psnr", "ssim")
-)
-
-Denoiser = Callable[[Frame, Row], Frame]
-"""Function of a noisy mosaic in DN, uint16 [H, W], and its manifest row; returns the denoised mosaic, uint16."""
+METHODS, DOMAINS = ("noisy", "non_local_means"), ("raw", "srgb")
+COLUMNS = tuple(f"{frame}_{domain}_{kind}" for frame in ("noisy", "denoised") for domain in DOMAINS for kind in DIGITS)
 
 
-def non_local_means(noisy: Frame, row: Row) -> Frame:
-    """Denoise a mosaic by non-local means on its four planes, after the generalised Anscombe transformation.
-
-    The transformation takes gain and variance without light from the row, so that all noise has a standard deviation
-    near 1. The inverse is the closed form of Mäkitalo and Foi (IEEE Transactions on Image Processing 22, 2013).
-    """
-    dark = row["dark_variance_dn2"]
-    gain, black, white = float(row["a_dn"]), int(row["black_level_dn"]), int(row["white_level_dn"])
-    variance = max(float(dark or 0), 0.0) / gain**2
-    light = (ug.pack(noisy, str(row["pattern"])).astype(np.float64) - black) / gain
-    stable = 2 * np.sqrt(np.maximum(light + 3 / 8 + variance, 0))
-    settings = {"patch_size": 5, "patch_distance": 6, "h": 0.8, "sigma": 1.0, "fast_mode": True}
-    smooth = denoise_nl_means(stable, channel_axis=0, preserve_range=True, **settings)
-    smooth = np.maximum(smooth, 2 * math.sqrt(3 / 8 + variance))
-    root = math.sqrt(3 / 2)
-    unbiased = smooth**2 / 4 + root / 4 / smooth - 11 / 8 / smooth**2 + 5 / 8 * root / smooth**3 - 1 / 8 - variance
-    planes = np.clip(np.rint(np.maximum(unbiased, 0) * gain + black), 0, white).astype(noisy.dtype)
-    return unpack(planes, str(row["pattern"]))
-
-
-def psnr(clean: NDArray[Any], other: NDArray[Any], peak: float) -> float:
-    """Return the peak signal-to-noise ratio in dB."""
-    return 10 * math.log10(peak**2 / float(np.mean((other.astype(np.float64) - clean) ** 2)))
-
-
-def ssim(clean: NDArray[Any], other: NDArray[Any], peak: float, axis: int) -> float:
-    """Return the mean structural similarity of Wang et al. (2004): Gaussian window of sigma 1.5."""
-    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    return float(structural_similarity(clean, other, data_range=peak, channel_axis=axis, **window))
-
-
-def score(clean: Frame, other: Frame, row: Row) -> tuple[float, float, float, float]:
-    """Compare a frame with the clean one: PSNR and SSIM of the raw frames, then of the developed ones.
-
-    The peak of raw frames is white - black; SSIM is the mean over the four planes of the mosaic. Developed frames are
-    8-bit sRGB, ``ug.develop`` with the parameters of the row; SSIM is the mean over R, G and B.
-    """
-    peak, pattern = int(row["white_level_dn"]) - int(row["black_level_dn"]), str(row["pattern"])
-    raw = ug.pack(clean, pattern), ug.pack(other, pattern)
-    srgb = ug.develop(clean, row), ug.develop(other, row)
-    return psnr(*raw, peak), ssim(*raw, peak, 0), psnr(*srgb, 255), ssim(*srgb, 255, 2)
-
-
-def measure(dataset: Path, denoise: Denoiser = non_local_means) -> dict[str, float]:
-    """Return means over the pairs of a dataset: scores of the noisy frames, then of the denoised ones.
-
-    A last odd row or column is cut off before.
-    """
-    scores = []
-    for clean, noisy, row in ug.RawPairs(dataset):
-        height, width = (side // 2 * 2 for side in clean.shape)
-        clean, noisy = clean[:height, :width], noisy[:height, :width]
-        scores.append((*score(clean, noisy, row), *score(clean, denoise(noisy, row), row)))
-    return dict(zip(COLUMNS, np.mean(scores, axis=0).tolist(), strict=True))
+def measure(dataset: Path) -> dict[str, float]:
+    """Return mean scores of a dataset, as ``gen-dataset score`` defines them: of noisy frames, then of denoised ones."""
+    scored = [score_items(dataset_items(dataset), method)["all"] for method in METHODS]
+    means = [scores[f"{domain}_{kind}"]["mean"] for scores in scored for domain in DOMAINS for kind in DIGITS]
+    return dict(zip(COLUMNS, means, strict=True))
 
 
 # --------------------------------------------------------------------------------------------------- digests and cards

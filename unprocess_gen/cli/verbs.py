@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from unprocess_gen.cli import cameras, checks, reports, runs
+from unprocess_gen.cli import cameras, checks, reports, runs, scores
 from unprocess_gen.cli.arguments import Verb
 
 _VERBS: tuple[Verb, ...] = (
@@ -22,6 +22,7 @@ _VERBS: tuple[Verb, ...] = (
     runs.build,
     cameras.calibrate,
     cameras.camera,
+    scores.score,
 )
 
 VERBS = {verb.name: verb for verb in _VERBS}

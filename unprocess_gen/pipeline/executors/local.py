@@ -14,9 +14,11 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.pipeline.deaths import count_death, deadly_sources, read_deaths, shards_with_deaths, write_deaths
@@ -93,25 +95,30 @@ def _make_alone(folder: OutFolder, context: RunContext, task: ShardTask) -> Iter
 
 
 def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardReport]:
-    """Yield the reports of a pool of workers as they come; raise TerminatedWorkerError if a worker dies."""
+    """Yield the reports of a pool of workers as they come."""
+    return run_pool(partial(make_and_commit, context), tasks, n_jobs, "generator_unordered")
+
+
+def run_pool(work: Callable[[Any], Any], tasks: Iterable[Any], n_jobs: int, order: str) -> Iterator[Any]:
+    """Yield the results of a pool of workers, for joblib's ``return_as``; TerminatedWorkerError if a worker dies."""
     from joblib import Parallel, delayed
 
-    parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
+    parallel = Parallel(n_jobs=n_jobs, return_as=order, batch_size=1, pre_dispatch="2*n_jobs")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # tasks cancelled by an interrupt
         # where psutil is installed, loky replaces a worker that keeps 300 MB of freed memory, and no work is lost
         warnings.filterwarnings("ignore", message="A worker stopped", module="joblib")
         with interrupts_ignored():
             start_tracker()
-            results = parallel(delayed(_make_in)(Path.cwd(), context, task) for task in tasks)
+            results = parallel(delayed(_work_in)(Path.cwd(), work, task) for task in tasks)
         with closing(results):
             yield from results
 
 
-def _make_in(folder: Path, context: RunContext, task: ShardTask) -> ShardReport:
-    """Make and commit a shard in a folder, because loky keeps workers that an earlier run started in another one."""
+def _work_in(folder: Path, work: Callable[[Any], Any], task: Any) -> Any:
+    """Work in a folder, because loky keeps workers that an earlier run started in another one."""
     os.chdir(folder)
-    return make_and_commit(context, task)
+    return work(task)
 
 
 @contextmanager

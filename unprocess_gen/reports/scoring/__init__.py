@@ -1,0 +1,1 @@
+"""Score restoration methods on datasets: the verb ``score``."""
