@@ -34,7 +34,7 @@ from unprocess_gen.core.errors import SourceError, UnprocessGenError
 
 REFUSED = [
     (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
-    (["word"], r"word: no such verb; expected generate, .*build, calibrate, camera or settings key=value"),
+    (["word"], r"word: no such verb; expected generate, .*build, calibrate, camera, score or settings key=value"),
     (["camera=convex", "word"], r"generate: word: expected a setting key=value"),
     (["--out", "x"], r"generate: --out: no such flag; expected .*; out is a setting: write out=…"),
     (["--help", "verfy"], r"--help verfy: no such verb or group; expected one of generate, .*; did you mean verify"),

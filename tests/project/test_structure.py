@@ -66,7 +66,7 @@ ONLY_IN = {
     "numba": {"simulation.kernels.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "simulation.reference.isp", "pipeline.worker"),
-        *("reports.explorer.views", "reports.panels", "picture_isp", "picture_mean"),
+        *("reports.explorer.views", "reports.panels", "reports.scoring.metrics", "picture_isp", "picture_mean"),
     },
     "PIL": {"dataset.notebook", "reports.pictures", "sources.image.headers", "sources.image.heif"},
     "pillow_heif": {"sources.image.heif"},

@@ -47,7 +47,7 @@ class Items(NamedTuple):
 
 
 def dataset_items(folder: AnyPath, keys: str | None = None, split: str | None = None) -> Items:
-    """Select the frames of a dataset, or of all datasets of a sweep; ConfigError if there are none."""
+    """Select the frames of a dataset, or of all of a sweep, that have a 2 x 2 tile; ConfigError if there are none."""
     folders = {folder_name(dataset): dataset for dataset in dataset_folders(folder)}
     for dataset in [*folders.values()] or [folder]:
         if not (dataset / "dataset.json").exists():
@@ -60,11 +60,12 @@ def dataset_items(folder: AnyPath, keys: str | None = None, split: str | None = 
     except ConfigError as error:
         raise ConfigError(f"score: {str(error).removeprefix('RawPairs: ')}") from error
     for number, row in enumerate(pairs.rows):
-        if keys is None or (row["dataset"], row["key"]) in wanted:
+        has_tile = all(int(row[side] or 0) > 1 for side in ("height", "width"))
+        if has_tile and (keys is None or (row["dataset"], row["key"]) in wanted):
             clip = [row[name] for name in ("clip", "patch", "level", "draw")] if row["clip"] else [row["key"]]
             groups.setdefault((row["dataset"], *clip), []).append(number)
     if not groups:
-        raise ConfigError(f"score: {folder}: no pair is in --keys {keys} --split {split}; expected one; choose others")
+        raise ConfigError(f"score: {folder}: no pair of 2 x 2 sites in --keys {keys} --split {split}; expected one")
     digests = {name: read_dataset(dataset / "dataset.json")["fingerprint"] for name, dataset in folders.items()}
     data = {"name": folder_name(folder), "keys": keys, "split": split, "datasets": digests}
     return Items(data, len(groups), (_item([pairs[number] for number in group]) for group in groups.values()))

@@ -16,8 +16,8 @@ import numpy as np
 from unprocess_gen.core.arrays import Float
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.row import plan_from_row
+from unprocess_gen.dataset.training import pack
 from unprocess_gen.simulation.reference import isp
-from unprocess_gen.simulation.reference.cfa import pack
 
 Scores = dict[str, float | None]
 """Scores by name, such as ``raw_psnr``, dB."""
