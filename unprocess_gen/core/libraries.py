@@ -10,4 +10,4 @@ from unprocess_gen.core.errors import ConfigError
 def require(module: str, use: str, extra: str, alternative: str = "") -> None:
     """Raise ConfigError if a library is missing; ``use`` begins the sentence, an ``alternative`` ends it."""
     if find_spec(module) is None:
-        raise ConfigError(f"{use}; in the repository, run: pip install '.[{extra}]'{alternative}")
+        raise ConfigError(f"{use}; run: pip install 'unprocess_gen[{extra}]'{alternative}")

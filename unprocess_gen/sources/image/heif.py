@@ -28,7 +28,7 @@ def open_heic(data: bytes, is_decoded: bool = False) -> Any:
     Raises SourceError if libheif cannot read the file, or is not installed.
     """
     if find_spec("pillow_heif") is None:
-        problem = "HEIC is read by pillow-heif; in the repository, run: pip install '.[heic]', or convert it to JPEG"
+        problem = "HEIC is read by pillow-heif; run: pip install 'unprocess_gen[heic]', or convert it to JPEG"
         raise SourceError("unsupported", problem)
     import pillow_heif
 
