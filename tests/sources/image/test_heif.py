@@ -142,5 +142,5 @@ def test_damaged_headers_are_read_or_refused() -> None:
 def test_missing_library_is_named_with_its_installation(monkeypatch: pytest.MonkeyPatch) -> None:
     data = heic(PICTURE)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(SourceError, match=r"unsupported: HEIC is read by pillow-heif; .*pip install 'unprocess_gen\[heic\]'"):
+    with pytest.raises(SourceError, match=r"unsupported: HEIC is read by pillow-heif; .*'unprocess_gen\[heic\]'"):
         read(data)
