@@ -224,7 +224,7 @@ def test_bad_methods_are_refused_in_one_line(
     [
         (("nowhere",), "nowhere: no such folder; expected .*the name of a benchmark build"),
         (("DS", "--keys", "77"), "--keys 77: .* has no such key"),
-        (("DS", "--split", "test"), "score: split='test': no pair is in it; there are no splits"),
+        (("DS", "--split", "test"), "split='test': no pair is in it; there are no splits"),
         (("DS", "--to", "DS/in"), "is inside the dataset"),
         (("DS", "--against", "no.json"), "no.json: .*No such file.*; expected a score.json"),
         (("DS", "n_jobs=0"), "n_jobs=0: expected"),
@@ -267,7 +267,7 @@ def test_methods_are_compared_pair_by_pair_with_the_same_digits_for_any_n_jobs(
     assert [line["raw_psnr"] for line in lines] == [repr(record["raw_psnr"]) for record in second["pairs"]]
     part = run_main("score", dataset, *against, "--keys", lines[0]["key"], "--to", "c")
     assert (part.code, len(part.err.splitlines())) == (2, 1)
-    assert "scores of noisy for other pairs; expected those of ds with the same --keys and --split" in part.err
+    assert "has scores of other pairs; expected those of ds, with the same --keys and --split" in part.err
 
 
 def test_sweep_is_scored_by_dataset(run_main: RunMain, tmp_path: Path) -> None:

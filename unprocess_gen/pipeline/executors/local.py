@@ -51,13 +51,13 @@ def _make_in_pools(
 ) -> Iterator[ShardReport]:
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    known = shards_with_deaths(folder)
+    known, make = shards_with_deaths(folder), partial(make_and_commit, context)
     waiting = {task.shard: task for task in tasks if task.shard not in known}
     alone = [task for task in tasks if task.shard in known]
     try:
         while waiting:
             try:
-                for report in _run_pool(context, [*waiting.values()], n_jobs):
+                for report in run_pool(make, [*waiting.values()], n_jobs):
                     del waiting[report.shard]
                     yield report
             except TerminatedWorkerError:
@@ -84,7 +84,8 @@ def _make_alone(folder: OutFolder, context: RunContext, task: ShardTask) -> Iter
             yield make_and_commit(context, task)  # reads no source
             return
         try:
-            yield from _run_pool(context, [task], n_jobs=2)  # n_jobs=1 would make the coordinator do the work, and die
+            # n_jobs=1 would make the coordinator do the work, and die
+            yield from run_pool(partial(make_and_commit, context), [task], n_jobs=2)
             return
         except TerminatedWorkerError:
             count_death(folder, task, deaths)
@@ -94,15 +95,11 @@ def _make_alone(folder: OutFolder, context: RunContext, task: ShardTask) -> Iter
             raise
 
 
-def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardReport]:
-    """Yield the reports of a pool of workers as they come."""
-    return run_pool(partial(make_and_commit, context), tasks, n_jobs, "generator_unordered")
-
-
-def run_pool(work: Callable[[Any], Any], tasks: Iterable[Any], n_jobs: int, order: str) -> Iterator[Any]:
-    """Yield the results of a pool of workers, for joblib's ``return_as``; TerminatedWorkerError if a worker dies."""
+def run_pool(work: Callable[[Any], Any], tasks: Iterable[Any], n_jobs: int, in_order: bool = False) -> Iterator[Any]:
+    """Yield the results of a pool of workers as they come, or in order; TerminatedWorkerError if a worker dies."""
     from joblib import Parallel, delayed
 
+    order = "generator" if in_order else "generator_unordered"
     parallel = Parallel(n_jobs=n_jobs, return_as=order, batch_size=1, pre_dispatch="2*n_jobs")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # tasks cancelled by an interrupt

@@ -55,10 +55,7 @@ def dataset_items(folder: AnyPath, keys: str | None = None, split: str | None = 
             raise ConfigError(f"score: {dataset}: is not finished; expected a dataset.json; {advice}")
     chosen = {name: select_pairs(dataset / "manifest.csv", keys) for name, dataset in folders.items() if keys}
     wanted = {(name, row["key"]) for name, selected in chosen.items() for row in selected.rows.values()}
-    try:
-        pairs, groups = RawPairs(folder, split=split), dict[tuple[Any, ...], list[int]]()
-    except ConfigError as error:
-        raise ConfigError(f"score: {str(error).removeprefix('RawPairs: ')}") from error
+    pairs, groups = RawPairs(folder, split=split), dict[tuple[Any, ...], list[int]]()
     for number, row in enumerate(pairs.rows):
         has_tile = all(int(row[side] or 0) > 1 for side in ("height", "width"))
         if has_tile and (keys is None or (row["dataset"], row["key"]) in wanted):

@@ -52,14 +52,14 @@ class MethodError(UnprocessGenError):
 def score_items(items: Items, method: str, n_jobs: int = 1) -> dict[str, Any]:
     """Score a method on items; the contents of ``score.json``. MethodError if the method fails."""
     work, jobs = partial(score_item, method, str(Path.cwd())), effective_jobs(n_jobs, items.number)
-    results = map(work, items.items) if jobs == 1 else run_pool(work, items.items, jobs, "generator")
+    results = map(work, items.items) if jobs == 1 else run_pool(work, items.items, jobs, in_order=True)
     try:
         records, times = zip(*with_bar(results, "item", items.number), strict=True)
     except BrokenExecutor:
         raise MachineError("score: a worker died, usually out of memory; expected more memory; use n_jobs=1") from None
     pairs = [record for of_item in records for record in of_item]
-    names = ("unprocess_gen", "numpy", "opencv-python-headless")
-    facts = {"method": method, "data": items.data, "versions": {name: version(name) for name in names}}
+    versions = {name: version(name) for name in ("unprocess_gen", "numpy", "opencv-python-headless")}
+    facts = {"method": method, "data": items.data, "versions": versions}
     return {**facts, **summaries(pairs), "pairs": pairs, "seconds_per_megapixel": float(f"{np.median(times):.3g}")}
 
 
@@ -122,16 +122,16 @@ def _summary(records: Sequence[Record]) -> dict[str, Any]:
 
 def _interval(name: str, records: Sequence[Record]) -> dict[str, Any]:
     sources = defaultdict[str, Any](lambda: np.zeros(2))
-    for record in records:
-        if (value := record.get(name)) is not None:
-            sources[record["source"]] += value, 1
-    sums, random, low, high = np.array([*sources.values()]).reshape(-1, 2), np.random.RandomState(0), None, None
+    for record in (record for record in records if record.get(name) is not None):
+        sources[record["source"]] += record[name], 1
+    sums, random = np.array([*sources.values()]).reshape(-1, 2), np.random.RandomState(0)
+    draws = range(DRAWS if len(sums) > 1 else 0)  # one source says nothing about others
+    drawn = [sums[random.randint(0, len(sums), len(sums), np.int64)].sum(axis=0) for _ in draws]
+    ends = np.quantile([total / count for total, count in drawn], (0.025, 0.975)) if drawn else (None, None)
     total, count = sums.sum(axis=0)
-    if len(sums) > 1:  # one source says nothing about others
-        drawn = np.array([sums[random.randint(0, len(sums), len(sums), np.int64)].sum(axis=0) for _ in range(DRAWS)])
-        low, high = map(_rounded, np.quantile(drawn[:, 0] / drawn[:, 1], (0.025, 0.975)))
+    mean, low, high = map(_rounded, (total / count if count else None, *ends))
     numbers = {"frames": int(count), "omitted": len(records) - int(count), "sources": len(sums)}
-    return {"mean": _rounded(total / count if count else None), "low": low, "high": high, **numbers}
+    return {"mean": mean, "low": low, "high": high, **numbers}
 
 
 # ------------------------------------------------------------------------------------------------ comparison and files
@@ -141,12 +141,13 @@ def read_scores(file: Path, data: dict[str, Any]) -> dict[str, Any]:
     """Read a ``score.json`` of the same datasets; ConfigError if it is none, or of others."""
     try:
         other = dict[str, Any](parse_json(file.read_bytes()))
-        digests, chosen, method = {key[0] for key in _named(other)}, dict(other["data"]), str(other["method"])
+        _named(other)
+        same = [({*of["datasets"].values()}, of["keys"], of["split"]) for of in (data, other["data"])]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"score: --against {file}: {error_in_one_line(error)}; expected a score.json") from None
-    if digests != {*data["datasets"].values()} or any(chosen.get(name) != data[name] for name in ("keys", "split")):
-        expected = f"expected those of {data['name']} with the same --keys and --split"
-        raise ConfigError(f"score: --against {file}: has scores of {method} for other pairs; {expected}")
+    if same[0] != same[1]:
+        expected = f"expected those of {data['name']}, with the same --keys and --split"
+        raise ConfigError(f"score: --against {file}: has scores of other pairs; {expected}")
     return other
 
 
