@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.commands import RunMain
+from helpers.commands import Cli, RunMain
 from helpers.datasets import Make, text_rows
 
 import unprocess_gen as ug
@@ -270,6 +270,21 @@ def test_methods_are_compared_pair_by_pair_with_the_same_digits_for_any_n_jobs(
     assert "has scores of other pairs; expected those of ds, with the same --keys and --split" in part.err
 
 
+@pytest.mark.slow
+def test_digits_do_not_depend_on_the_instructions_of_the_processor(cli: Cli, tmp_path: Path, make: Make) -> None:
+    """Float32 in `develop` changed codes of such pairs, and so the last digits."""
+    oldest = {
+        "OPENCV_CPU_DISABLE": "SSE4.1,SSE4.2,AVX,FP16,AVX2,FMA3,AVX512F",
+        "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+        "OPENBLAS_CORETYPE": "Prescott",
+    }
+    make(None, tmp_path / "ds", "source.limit=6")
+    for name, env in (("new", {}), ("old", oldest)):
+        done = cli("score", "ds", "--method", "noisy", "--to", name, **env)
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / "new/score.csv").read_bytes() == (tmp_path / "old/score.csv").read_bytes()
+
+
 def test_sweep_is_scored_by_dataset(run_main: RunMain, tmp_path: Path) -> None:
     noise = "noise=imx385_iso1600,imx385_iso12800"
     assert run_main("-m", noise, "source.limit=2", "source.downscale=4", "n_jobs=1", "out=sweep").code == 0
@@ -281,6 +296,7 @@ def test_sweep_is_scored_by_dataset(run_main: RunMain, tmp_path: Path) -> None:
     assert {record["dataset"] for record in scored["pairs"]} == {*scored["by_dataset"]} == {*scored["data"]["datasets"]}
 
 
+@pytest.mark.slow
 def test_build_is_made_and_scored_by_its_name(run_main: RunMain, tmp_path: Path) -> None:
     pytest.importorskip("skimage")
     assert run_main("score", "photos_patches", "--method", "noisy").code == 0
@@ -305,6 +321,22 @@ def test_output_of_the_shape_of_the_target_is_compared_with_it(tmp_path: Path) -
     assert [record["key"] for record in each] == ["0", "1", "2"] and "linear_psnr" not in each[0]
     with pytest.raises(MethodError, match=r"expected numbers \(3, 24, 24\) or \(96, 95, 3\)"):
         score_item("m.py:up", str(tmp_path), item._replace(target=target[:, 1:]))
+
+
+@pytest.mark.slow
+def test_bursts_of_a_photograph_are_one_source(make: Make, tmp_path: Path) -> None:
+    burst = "source.burst={frames: 2, shift: 4, downscale: 2}"
+    make(None, tmp_path / "ds", "source.limit=2", burst, "source.patch=[random,128,2]", "output.targets=[linear_rgb]")
+    (tmp_path / "up.py").write_text(
+        "def up(noisy, rows): return noisy[0].repeat(2, 0).repeat(2, 1)[..., None] * [1, 1, 1]"
+    )
+    scored = score_items(dataset_items(tmp_path / "ds"), f"{tmp_path}/up.py:up")
+    counts = [scored["all"]["linear_psnr"][name] for name in ("frames", "sources")]
+    assert counts == [4, 2] and {record["key"][-3:] for record in scored["pairs"]} == {"f00"}
+    (clip, *_) = ug.RawClips(tmp_path / "ds")
+    inside = slice(BORDER, -BORDER)
+    error = clip.noisy[0].repeat(2, 0).repeat(2, 1)[inside, inside, None] - clip.target[inside, inside].astype(float)
+    assert scored["pairs"][0]["linear_psnr"] == pytest.approx(-10 * math.log10(np.mean(error**2)), abs=LAST_DIGIT)
 
 
 def test_frames_of_other_kinds_are_scored_by_their_own_definition() -> None:

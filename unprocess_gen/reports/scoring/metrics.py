@@ -29,16 +29,6 @@ BORDER = 40
 """Pixels of a target that are left out at each side, because most frames of a burst do not show them."""
 
 
-def blur(planes: Any, side: int, std: float) -> Float:
-    """Filter planes [H, W, …] with a Gaussian window; borders are mirrored."""
-    return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(planes, np.float64), (side, side), std))
-
-
-def planes_of(mosaic: Any, row: Row) -> Float:
-    """Planes of a mosaic as float64, [H / 2, W / 2, 4]."""
-    return np.moveaxis(pack(mosaic, str(row["pattern"])).astype(np.float64), 0, -1)
-
-
 def psnr(squares: Float, peak: float) -> float | None:
     """Peak signal-to-noise ratio of squared errors in dB."""
     mse = float(np.mean(squares)) if squares.size else 0.0
@@ -47,8 +37,8 @@ def psnr(squares: Float, peak: float) -> float | None:
 
 def ssim(x: Float, y: Float) -> float:
     """Structural similarity of two planes whose peak is 1: the mean over the windows that lie inside."""
-    inside = slice(WINDOW // 2, -(WINDOW // 2))
-    moments = (blur(values, WINDOW, WINDOW_STD)[inside, inside] for values in (x, y, x * x, y * y, x * y))
+    inside, side = slice(WINDOW // 2, -(WINDOW // 2)), (WINDOW, WINDOW)
+    moments = (cv2.GaussianBlur(values, side, WINDOW_STD)[inside, inside] for values in (x, y, x * x, y * y, x * y))
     x_mean, y_mean, xx, yy, xy = moments
     means, squares = x_mean * y_mean, x_mean * x_mean + y_mean * y_mean
     similarity = (2 * means + C1) * (2 * (xy - means) + C2) / ((squares + C1) * (xx + yy - squares + C2))
@@ -63,16 +53,18 @@ def scores_of(domain: str, clean: Float, output: Float, peak: float, unsaturated
     return scores if unsaturated is None else scores | {f"{domain}_psnr_unsaturated": psnr(squares[unsaturated], peak)}
 
 
-def raw_scores(clean: Any, output: Float, row: Row) -> Scores:
+def raw_scores(clean: Any, output: Any, row: Row) -> Scores:
     """Scores of a mosaic in DN, not rounded; the peak is white - black."""
-    planes, white = planes_of(clean, row), int(row["white_level_dn"] or 0)
-    return scores_of("raw", planes, planes_of(output, row), white - int(row["black_level_dn"] or 0), planes < white)
+    packed = (pack(mosaic, str(row["pattern"])) for mosaic in (clean, output))
+    planes, restored = (np.moveaxis(planes.astype(np.float64), 0, -1) for planes in packed)
+    white = int(row["white_level_dn"] or 0)
+    return scores_of("raw", planes, restored, white - int(row["black_level_dn"] or 0), planes < white)
 
 
 def frame_scores(clean: Any, output: Float, row: Row) -> Scores:
     """Scores of a mosaic: raw, and developed by ``ug.develop`` after rounding to what the sensor stores."""
     plan = plan_from_row(row)
-    stored = (np.clip(np.rint(frame), 0, 2**plan.sensor.bits - 1) for frame in (clean, output))
+    stored = (np.clip(np.rint(np.float64(frame)), 0, 2**plan.sensor.bits - 1) for frame in (clean, output))
     shown, restored = (isp.to_codes(isp.develop(frame, plan)) for frame in stored)
     developed = scores_of("srgb", shown, restored, 255, clean < plan.sensor.white_level_dn)
     return raw_scores(clean, output, row) | developed

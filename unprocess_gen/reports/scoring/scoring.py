@@ -89,7 +89,8 @@ def score_item(name: str, folder: str, item: Item) -> tuple[list[Record], float]
 
 
 def _record(item: Item, row: Row, scores: Scores) -> Record:
-    cells = {**row, "dataset": item.dataset, "source": row.get("clip") or row["source"]}
+    clip = None if row.get("burst_downscale") else row.get("clip")  # all bursts of a photograph are one source
+    cells = {**row, "dataset": item.dataset, "source": clip or row["source"]}
     facts = {name: cells[name] for name in FACTS if cells.get(name) not in (None, "")}
     return facts | {name: _rounded(value) for name, value in scores.items()}
 
