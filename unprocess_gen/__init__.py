@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         UnprocessGenError,
     )
     from unprocess_gen.dataset.clips import Clip, RawClips
+    from unprocess_gen.dataset.flow import flow
     from unprocess_gen.dataset.inputs import flip
     from unprocess_gen.dataset.reader import RawPairs, Sample
     from unprocess_gen.dataset.sampler import EpochSampler
@@ -60,6 +61,7 @@ __all__ = [
     "__version__",
     "develop",
     "flip",
+    "flow",
     "generate",
     "load_config",
     "make_pair",
@@ -81,6 +83,7 @@ _MODULES = {
         *("ConfigError", "DamageError", "LockedError", "MachineError", "SourceError", "UnprocessGenError"),
     ),
     "dataset.clips": ("Clip", "RawClips"),
+    "dataset.flow": ("flow",),
     "dataset.inputs": ("flip",),
     "dataset.reader": ("RawPairs", "Sample"),
     "dataset.sampler": ("EpochSampler",),

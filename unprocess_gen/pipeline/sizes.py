@@ -15,8 +15,8 @@ from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.source import Source
-from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.conditions import noisy_frames
+from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.sources import synthetic
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.loader import load_source

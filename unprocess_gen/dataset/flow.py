@@ -1,0 +1,97 @@
+"""Compute where the frames of a burst show what its first frame shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.dataset.columns import Row, rebuild
+from unprocess_gen.simulation.plan import Motion
+
+
+def flow(rows: Sequence[Row], k: int, inverse: bool = False) -> NDArray[np.float64]:
+    """Compute the optical flow between the first frame of a burst and another one, from their motion.
+
+    Parameters
+    ----------
+    rows : sequence of mappings
+        Manifest rows of the burst's frames, such as ``rows`` of a `Clip`.
+    k : int
+        Number of the other frame, its column ``frame``.
+    inverse : bool
+        Flow from frame k to frame 0 instead.
+
+    Returns
+    -------
+    ndarray of float64, [2, H, W]
+        Displacements d of rows, then of columns, in pixels of the frames. Frame k shows at (i, j) + d[:, i, j] what
+        frame 0 shows at (i, j). With ``inverse``, frame 0 shows there what frame k shows at (i, j).
+
+    Raises
+    ------
+    ValueError
+        If the rows are not those of a burst, or have no frame 0 or k.
+
+    Notes
+    -----
+    High-resolution pixel p of frame k shows the position A p + b of the target (``motion_*`` of its row), and frame 0
+    the position p. So the flow from frame 0 is the inverse of this map in the pixels of the frames::
+
+        frame 0                      frame k
+        +-----------+                +-----------+
+        |           |       d        |        *  |      * is one point of the scene
+        |     *-----+--------------->+------->   |
+        |   (i, j)  |                |  (i, j) + d
+        +-----------+                +-----------+
+
+    To align frame k with frame 0, sample it at (i, j) + d.
+
+    Examples
+    --------
+    >>> import unprocess_gen as ug
+    >>> settings = ["source.burst={frames: 2, downscale: 2}", "source.limit=1", "out=bursts", "n_jobs=1"]
+    >>> _ = ug.generate(ug.load_config(settings))
+    >>> burst = ug.RawClips("bursts")[0]
+    >>> burst.noisy.shape, ug.flow(burst.rows, 1).shape
+    ((2, 224, 353), (2, 224, 353))
+    """
+    first, other = (_row_of(rows, number) for number in (0, k))
+    origin, moved = (rebuild(Motion, row) for row in (first, other))
+    step, offset = moved.burst_downscale, moved.pixel_offset
+    shape = int(first["height"] or 0), int(first["width"] or 0)
+    y, x = (step * values.astype(float) + offset for values in np.indices(shape, sparse=True))
+    start, end = (moved, origin) if inverse else (origin, moved)
+    y, x = _inverse(end, *_shown(start, y, x))
+    return np.stack(
+        [(at - offset) / step - pixels for at, pixels in zip((y, x), np.indices(shape, sparse=True), strict=True)]
+    )
+
+
+def _row_of(rows: Sequence[Row], frame: int) -> Row:
+    """Find the row of a frame of a burst."""
+    row = next((row for row in rows if int(row["frame"] or 0) == frame), None)
+    if row is None or row.get("motion_y") is None:
+        numbers = [row["frame"] for row in rows]
+        problem = f"no frame of this number in the frames {numbers}" if row is None else "its row has no motion"
+        raise ValueError(f"flow: frame {frame}: {problem}; expected the rows of a burst, as RawClips gives them")
+    return row
+
+
+def _shown(motion: Motion, y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Compute the position in the target that a high-resolution pixel of a frame shows."""
+    return (
+        motion.motion_yy * y + motion.motion_yx * x + motion.motion_y,
+        motion.motion_xy * y + motion.motion_xx * x + motion.motion_x,
+    )
+
+
+def _inverse(motion: Motion, y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Compute the high-resolution pixel of a frame that shows a position in the target."""
+    y, x = y - motion.motion_y, x - motion.motion_x
+    determinant = motion.motion_yy * motion.motion_xx - motion.motion_yx * motion.motion_xy
+    return (
+        (motion.motion_xx * y - motion.motion_yx * x) / determinant,
+        (motion.motion_yy * x - motion.motion_xy * y) / determinant,
+    )
