@@ -267,7 +267,7 @@ def test_methods_are_compared_pair_by_pair_with_the_same_digits_for_any_n_jobs(
     assert [line["raw_psnr"] for line in lines] == [repr(record["raw_psnr"]) for record in second["pairs"]]
     part = run_main("score", dataset, *against, "--keys", lines[0]["key"], "--to", "c")
     assert (part.code, len(part.err.splitlines())) == (2, 1)
-    assert "has scores of other pairs; expected those of ds, with the same --keys and --split" in part.err
+    assert "has other pairs; expected the same dataset, --keys and --split" in part.err
 
 
 @pytest.mark.slow
@@ -293,6 +293,7 @@ def test_sweep_is_scored_by_dataset(run_main: RunMain, tmp_path: Path) -> None:
     assert list(scored["by_dataset"]) == ["noise=imx385_iso12800", "noise=imx385_iso1600"]
     high, low = (group["raw_psnr"]["mean"] for group in scored["by_dataset"].values())
     assert high + 3 < low
+    assert {name: group["raw_psnr"]["mean"] for name, group in scored["by_iso"].items()} == {"1600": low, "12800": high}
     assert {record["dataset"] for record in scored["pairs"]} == {*scored["by_dataset"]} == {*scored["data"]["datasets"]}
 
 

@@ -7,6 +7,7 @@ are those of NumPy's `RandomState`, whose numbers never change.
 from __future__ import annotations
 
 import json
+import re
 import time
 import traceback
 from collections import defaultdict
@@ -27,6 +28,7 @@ from unprocess_gen.core.records import parse_json
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.manifest import csv_lines
 from unprocess_gen.pipeline.executors.local import effective_jobs, run_pool
+from unprocess_gen.pipeline.generate import PACKAGES
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.scoring.items import Item, Items
 from unprocess_gen.reports.scoring.methods import load_method
@@ -58,8 +60,7 @@ def score_items(items: Items, method: str, n_jobs: int = 1) -> dict[str, Any]:
     except BrokenExecutor:
         raise MachineError("score: a worker died, usually out of memory; expected more memory; use n_jobs=1") from None
     pairs = [record for of_item in records for record in of_item]
-    versions = {name: version(name) for name in ("unprocess_gen", "numpy", "opencv-python-headless")}
-    facts = {"method": method, "data": items.data, "versions": versions}
+    facts = {"method": method, "data": items.data, "versions": {name: version(name) for name in PACKAGES}}
     return {**facts, **summaries(pairs), "pairs": pairs, "seconds_per_megapixel": float(f"{np.median(times):.3g}")}
 
 
@@ -76,10 +77,8 @@ def score_item(name: str, folder: str, item: Item) -> tuple[list[Record], float]
         elif not (np.abs(output := output.astype(np.float64)) < LARGEST).all():
             problem = "returned NaN, infinity or values above 2^32; expected DN"
     except (Exception, SystemExit) as error:
-        line = traceback.extract_tb(error.__traceback__)[-1]
-        problem = (
-            f"raised {type(error).__name__}: {error_in_one_line(error)} ({Path(line.filename).name}:{line.lineno})"
-        )
+        line, kind = traceback.extract_tb(error.__traceback__)[-1], type(error).__name__
+        problem = f"raised {kind}: {error_in_one_line(error)} ({Path(line.filename).name}:{line.lineno})"
     if problem:
         raise MethodError(f"score: --method {name}: {rows[0]['key']}: {problem}")
     if item.target is not None and output.shape == item.target.shape:
@@ -90,7 +89,9 @@ def score_item(name: str, folder: str, item: Item) -> tuple[list[Record], float]
 
 def _record(item: Item, row: Row, scores: Scores) -> Record:
     clip = None if row.get("burst_downscale") else row.get("clip")  # all bursts of a photograph are one source
-    cells = {**row, "dataset": item.dataset, "source": clip or row["source"]}
+    stated = re.search(r"_iso(\d+)", str(row.get("noise")))  # profiles of two numbers are named by their ISO
+    iso = row.get("iso") or (stated and float(stated[1]))
+    cells = {**row, "dataset": item.dataset, "source": clip or row["source"], "iso": iso}
     facts = {name: cells[name] for name in FACTS if cells.get(name) not in (None, "")}
     return facts | {name: _rounded(value) for name, value in scores.items()}
 
@@ -147,8 +148,7 @@ def read_scores(file: Path, data: dict[str, Any]) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"score: --against {file}: {error_in_one_line(error)}; expected a score.json") from None
     if same[0] != same[1]:
-        expected = f"expected those of {data['name']}, with the same --keys and --split"
-        raise ConfigError(f"score: --against {file}: has scores of other pairs; {expected}")
+        raise ConfigError(f"score: --against {file}: has other pairs; expected the same dataset, --keys and --split")
     return other
 
 
