@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import operator
+from collections import namedtuple
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, Self, SupportsIndex
 
@@ -13,7 +15,9 @@ from numpy.typing import NDArray
 from unprocess_gen.core.arrays import Frame
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.targets import LINEAR_RGB
-from unprocess_gen.dataset.reader import DatasetPath, RawPairs
+from unprocess_gen.dataset.development import development_parameters
+from unprocess_gen.dataset.inputs import Options, stackable_row
+from unprocess_gen.dataset.reader import DatasetPath, RawPairs, Sample
 
 
 class _Frames(NamedTuple):
@@ -65,12 +69,57 @@ class Clip(_Frames):
         return f"Clip({frames.dtype} {list(frames.shape)}, clip={name}, dataset={self.dataset!r})"
 
 
+_Batch = namedtuple("_Batch", "clean noisy rows targets")
+
+MOTION = "motion_yy", "motion_yx", "motion_y", "motion_xy", "motion_xx", "motion_x"
+"""Columns of the motion of a burst's frame."""
+
+
+def clip_item(samples: Sequence[Any], options: Options) -> Any:
+    """Convert the frames of a clip, which have been cut, to a `Clip`, or with ``inputs`` to a dict of arrays [T, …].
+
+    Frames of a burst have ``motion`` [T, 6], and the target of the first one.
+    """
+    if options.inputs is None:
+        return Clip(samples)
+    is_burst = samples[0].row["motion_y"] is not None
+    frames = [
+        options.item(sample, sample.row, (0, 0), partial(development_parameters, sample.row))
+        for sample in (without_targets(sample) if is_burst and k else sample for k, sample in enumerate(samples))
+    ]
+    development, *_ = [frame.pop("development") for frame in frames]
+    shared = {"development": development}  # that of all frames, which have one camera
+    shared |= {name: frames[0].pop(name) for name in samples[0].targets} if is_burst else {}
+    motion = {"motion": np.array([[sample.row[name] for name in MOTION] for sample in samples])} if is_burst else {}
+    return {**_stacked(frames), **shared, **motion}
+
+
+def without_targets(sample: Any) -> Sample:
+    """Return a sample without its targets."""
+    return Sample(sample.clean, sample.noisy, sample.row, sample.dataset)
+
+
+def _stacked(items: Sequence[Any]) -> Any:
+    """Stack the values of equal names; texts become a list."""
+    if isinstance(items[0], dict):
+        return {name: _stacked([item[name] for item in items]) for name in items[0]}
+    return list(items) if isinstance(items[0], str) else np.stack(items)
+
+
+def stackable_clip(clip: Any) -> Any:
+    """Item that PyTorch's default ``collate_fn`` stacks: a named tuple for a clip; a dict is unchanged."""
+    if isinstance(clip, dict):
+        return clip
+    rows = [stackable_row(row, {}) for row in clip.rows]
+    return _Batch(clip.clean, clip.noisy, rows, dict(clip.targets))
+
+
 class RawClips:
     """Read the clips of a dataset by number: a map-style dataset.
 
-    ``clips[i]`` is a `Clip`. A clip with several noise levels, draws or patches is an item for each of them, in the
-    order of the manifest. Frames that failed are missing; the column ``frame`` of the rows numbers the others. An
-    instance can be pickled and forked as `RawPairs`.
+    ``clips[i]`` is a `Clip`. Bursts are clips whose ``target`` is that of the first frame. A clip with several noise
+    levels, draws or patches is an item for each of them, in the order of the manifest. Frames that failed are missing;
+    the column ``frame`` of the rows numbers the others. An instance can be pickled and forked as `RawPairs`.
 
     Parameters
     ----------
@@ -78,6 +127,9 @@ class RawClips:
         As for `RawPairs`.
     split : str, optional
         Only clips of this split, by default all.
+    inputs, noise_map, rows, clip_black
+        As for `RawPairs`, with T as first axis: dicts that PyTorch's default ``collate_fn`` stacks. Bursts have
+        ``motion`` too, float64 [T, 6]: yy, yx, y, xy, xx, x of the manifest.
 
     Raises
     ------
@@ -98,13 +150,23 @@ class RawClips:
     (2, 8, 7)
     """
 
-    def __init__(self, path: DatasetPath | Sequence[DatasetPath], *, split: str | None = None) -> None:
+    def __init__(
+        self,
+        path: DatasetPath | Sequence[DatasetPath],
+        *,
+        split: str | None = None,
+        inputs: str | None = None,
+        noise_map: bool = False,
+        rows: bool = False,
+        clip_black: bool = False,
+    ) -> None:
+        self._options = Options("RawClips", None, False, inputs, noise_map, rows, clip_black)
         self._pairs = RawPairs(path, split=split)
         self.path = self._pairs.path
         datasets = enumerate(self._pairs._datasets)
-        rows = ((dataset, row) for dataset, pairs in datasets for _, row in pairs.pair_rows(split))
+        numbered = ((dataset, row) for dataset, pairs in datasets for _, row in pairs.pair_rows(split))
         clips: dict[tuple[Any, ...], list[int]] = {}
-        for number, (dataset, row) in enumerate(rows):
+        for number, (dataset, row) in enumerate(numbered):
             if row["clip"]:
                 place = dataset, row["clip"], row["patch"], row["level"], row["draw"]
                 clips.setdefault(place, []).append(number)
@@ -120,14 +182,18 @@ class RawClips:
     def __repr__(self) -> str:
         return f"RawClips({str(self.path)!r}, length={len(self)})"
 
-    def __iter__(self) -> Iterator[Clip]:
+    def __iter__(self) -> Iterator[Any]:
         return (self[number] for number in range(len(self)))
 
-    def __getitem__(self, number: SupportsIndex) -> Clip:
+    def __getitem__(self, number: SupportsIndex) -> Any:  # a Clip, or a dict with inputs
         frames = [self._pairs[frame] for frame in self._clips[operator.index(number)]]
         shapes = {frame.noisy.shape for frame in frames}
         if len(shapes) > 1:
             sizes = " and ".join(map(str, sorted(shapes)))
             name = frames[0].row["clip"]
             raise ConfigError(f"RawClips: clip {name} has frames of {sizes}; expected one size; use RawPairs")
-        return Clip(frames)
+        return clip_item(frames, self._options)
+
+    def __getitems__(self, numbers: Sequence[int]) -> list[Any]:
+        """Read a batch for PyTorch's DataLoader, in items that its default ``collate_fn`` stacks."""
+        return [stackable_clip(self[number]) for number in numbers]

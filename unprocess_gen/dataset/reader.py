@@ -214,7 +214,8 @@ class RawPairs(PairTable):
         targets = sorted(set().union(*(dataset.targets for dataset in self._datasets)))
         if inputs is not None and len(targets) > 1:
             problem = f"the datasets differ in targets ({' and '.join(targets)})"
-            raise ConfigError(f"RawPairs: inputs={inputs!r}: {problem}; expected the same in all; use inputs=None")
+            expected = "expected the same in all; use inputs=None, or ug.RawClips for bursts"
+            raise ConfigError(f"RawPairs: inputs={inputs!r}: {problem}; {expected}")
 
     def __repr__(self) -> str:
         paths = self.path if isinstance(self.path, tuple) else (self.path,)

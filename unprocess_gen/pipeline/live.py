@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.config.interpretation import patch_rule
+from unprocess_gen.config.interpretation import BurstRule, burst_rule, patch_rule
 from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
@@ -26,16 +26,25 @@ from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.random_streams import crop_words, frame_word
 from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.core.source import Source
-from unprocess_gen.core.targets import TARGETS
+from unprocess_gen.core.targets import LINEAR_RGB, TARGETS
+from unprocess_gen.dataset.clips import Clip, clip_item, stackable_clip
 from unprocess_gen.dataset.columns import Value
 from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.development import development_parameters
 from unprocess_gen.dataset.inputs import Options
-from unprocess_gen.dataset.keys import pair_key, patch_key
+from unprocess_gen.dataset.keys import frame_key, pair_key, patch_key
 from unprocess_gen.dataset.reader import DatasetPath, DatasetRows, Sample, check_split, open_datasets, stackable
 from unprocess_gen.dataset.row import pair_row, patch_from_row, plan_from_row
 from unprocess_gen.dataset.table import PairTable
-from unprocess_gen.pipeline.pairs import PairSettings, noise_columns, plan_pixels, targets_of
+from unprocess_gen.pipeline.live_bursts import burst_pairs, moved_burst, redrawn_burst
+from unprocess_gen.pipeline.pairs import (
+    PairSettings,
+    facts_of_burst,
+    noise_columns,
+    plan_pixels,
+    targets_of,
+    with_motion,
+)
 from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
@@ -78,6 +87,9 @@ class LivePairs(PairTable):
     the patch is simulated. An instance can be pickled and forked. ``live[epoch, "00000003"]`` is the pair with this
     key, and a slice is a `LivePairs` of those pairs. Both need items that are pairs (``patches=1``).
 
+    Items of ``source.burst`` are bursts: a `Clip`, or with ``inputs`` a dict as `RawClips` gives it. Their keys are
+    those of the first frames.
+
     Parameters
     ----------
     dataset : str, Path, Config, mapping, or a list of str or Path
@@ -86,8 +98,8 @@ class LivePairs(PairTable):
     root : str or Path, optional
         Folder of the sources; by default the folder in the dataset's record, or ``source.root`` of the config.
     redraw : str
-        ``"noise"``: new noise in each epoch, clean frames as in epoch 0. ``"all"``: new cameras, gains, noise levels
-        and random patches too. ``"none"``: the pairs of epoch 0 in every epoch.
+        ``"noise"``: new noise in each epoch, clean frames as in epoch 0. ``"all"``: new cameras, gains, noise levels,
+        random patches and motion of bursts too. ``"none"``: the pairs of epoch 0 in every epoch.
     cache : str or Path, optional
         Folder for decoded pixels, which worker processes share; ``"memory"`` for a temporary folder. A pixel of an
         8-bit photograph takes 3 bytes. If the disk is full, further pixels are decoded each time.
@@ -167,6 +179,9 @@ class LivePairs(PairTable):
             raise ConfigError(f"LivePairs: patches={patches}: out of range; expected {expected}")
         self._cache = None if cache is None else PixelCache(cache, cache_bytes)
         super().__init__(_live_sources(dataset, None if root is None else os.fspath(root), split))
+        self._rules = [burst_rule(source.settings.config.source) for source in self._datasets]
+        if any(rule is not None for rule in self._rules):
+            self._numbers = self._first_frames(flip, {*targets})
         self._redraw, self._patches, self._targets = redraw, patches, tuple(targets)
         most = (NEW_CROPS if redraw == "all" else KEPT_CROPS), NEW_CROPS
         self._kept: list[Recent[tuple[Any, ...], tuple[Plan, CropMaker]]] = [*map(Recent, most)]
@@ -197,6 +212,10 @@ class LivePairs(PairTable):
         epoch = epoch if self._redraw != "none" else 0
         decode = partial(source.decode, image)
         srgb = decode() if self._cache is None else self._cache.get(image.cache_name, decode)
+        if (rule := self._rules[place]) is not None:
+            step = noisy_frames(source.settings.config)
+            images = [source.image(number_in_dataset + frame * step) for frame in range(rule.frames)]
+            return self._burst(source, rule, images, srgb, epoch, crop)
         plan, patch, make = self._prepared(place, image, srgb, epoch, number)
         options, words = self._options, (0, 0)
         if options.side is not None:
@@ -217,6 +236,42 @@ class LivePairs(PairTable):
         columns = noise_columns(plan) if options.flip or of_white else {}
         return options.item(sample, columns, words, partial(development_parameters, plan), epoch=0)
 
+    def _first_frames(self, flip: bool, targets: set[str]) -> NDArray[np.int64]:
+        """Numbers of the pairs that are items: of a burst the first, at each level and draw."""
+        if flip or targets - {LINEAR_RGB}:
+            problem = "flip=True" if flip else f"targets={sorted(targets)}"
+            raise ConfigError(f"LivePairs: {problem}: bursts have the target {LINEAR_RGB} and no flips; leave it out")
+        firsts = []
+        for source, rule, start in zip(self._datasets, self._rules, self._starts, strict=False):
+            step, numbers = noisy_frames(source.settings.config), np.arange(len(source))
+            firsts.append(start + (numbers if rule is None else numbers[numbers % (rule.frames * step) < step]))
+        return np.concatenate(firsts)
+
+    def _burst(
+        self, source: LiveSource, rule: BurstRule, images: Sequence[LiveImage], srgb: Srgb, epoch: int, crop: int
+    ) -> Any:
+        """Generate a burst: a `Clip`, or a dict with inputs."""
+        settings, options, patch = source.settings, self._options, images[0].patch
+        plans: Sequence[Plan] = [image.plan for image in images]
+        if epoch and self._redraw == "all":
+            facts = facts_of_burst(rule, _facts_of(settings, images[0], srgb))
+            plans = redrawn_burst(settings, rule, plans, facts, epoch)
+            plans, patch = moved_burst(settings, rule, plans, patch, (srgb.shape[0], srgb.shape[1]), epoch)
+        part = patch
+        if options.side is not None:
+            place = plans[0].place
+            words = plans[0].stream_key, patch.patch, place.level, place.draw, frame_word(0, epoch), crop
+            y, x = options.place(crop_words(*words), patch.height, patch.width)
+            part = Patch(options.side, options.side, patch.patch, patch.patch_y + y, patch.patch_x + x)
+        self_test.check(plans[:1])
+        made, targets = burst_pairs(settings, srgb, plans, patch, part, epoch, self._targets)
+        samples = []
+        for image, (plan, pair) in zip(images, made, strict=True):
+            known = partial(Pair, pair.clean, pair.noisy, pair.counts)
+            row: Any = LiveRow(partial(image.row, plan, epoch, part, known))
+            samples.append(LiveSample(pair.clean, pair.noisy, row, source.name, targets))
+        return clip_item(samples, options)
+
     def _part(self, numbers: NDArray[np.int64]) -> Self:
         part = super()._part(numbers)
         part._reads_of_epoch_0 = SharedCount()
@@ -228,7 +283,8 @@ class LivePairs(PairTable):
         With ``inputs``, items are dicts. Otherwise they are named tuples of the clean frame, the noisy frame, the row
         as a dict with NaN for None, and targets if there are any.
         """
-        return [stackable(self[item], epoch=0) for item in items]
+        made = map(self.__getitem__, items)
+        return [stackable_clip(item) if isinstance(item, Clip) else stackable(item, epoch=0) for item in made]
 
     def _warn_of_repetition(self) -> None:
         """Warn when a second epoch begins without a number; a copy in a worker process does not see other epochs."""
@@ -268,9 +324,7 @@ class LivePairs(PairTable):
         if self._redraw == "all":
             facts = self._facts.get(number)
             if facts is None:
-                parts, stated, profile = parts_of(plan), stated_source(plan), plan.source.profile
-                facts = facts_for(settings.config, srgb, image.source.frames, parts, stated, profile)
-                self._facts.keep(number, facts)
+                facts = self._facts.keep(number, _facts_of(settings, image, srgb))
             plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
         if plan.dark and settings.dark_frames is not None:
             plan = next_dark_frame(plan, settings.dark_frames, epoch)
@@ -301,6 +355,13 @@ class LiveRow(Mapping[str, Value]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (self._row,)
+
+
+def _facts_of(settings: PairSettings, image: LiveImage, srgb: Srgb) -> Facts | None:
+    """Facts about the pixels of an image from which its parameters are redrawn."""
+    plan = image.plan
+    parts, stated, profile = parts_of(plan), stated_source(plan), plan.source.profile
+    return facts_for(settings.config, srgb, image.source.frames, parts, stated, profile)
 
 
 def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[LiveSource]:
@@ -414,7 +475,8 @@ class PlannedPairs:
             check_split("LivePairs", split, {*splits})
             self._sources = [source for source, name in zip(self._sources, splits, strict=True) if name == split]
         self._patches = 1 if rule is None else rule.count
-        self._plans = noisy_frames(config)
+        self._rule = burst_rule(config.source)
+        self._plans = noisy_frames(config) * (1 if self._rule is None else self._rule.frames)
         self._planned: Recent[int, tuple[str, int, tuple[Plan, ...], tuple[Patch, ...]]] = Recent(KEPT)
         self._decoded: tuple[Source, str, Photograph] | None = None
 
@@ -432,6 +494,8 @@ class PlannedPairs:
             planned = self._planned.keep(index, (sha256, photograph.orientation, image.plans, image.patches))
         sha256, orientation, plans, patches = planned
         patch, plan = patches[rest // self._plans], plans[rest % self._plans]
+        if self._rule is not None:
+            (plan,) = with_motion(self._rule, [plan], patch)
         shard = source.index // self.settings.config.output.pairs_per_shard
         return LiveImage(source, sha256, orientation, shard, self.key(number), plan, patch)
 
@@ -441,8 +505,10 @@ class PlannedPairs:
         patch, plan = divmod(rest, self._plans)
         config = self.settings.config
         sample = patch_key(self._sources[index].index, patch, several=config.source.patch is not None)
+        frame, plan = divmod(plan, noisy_frames(config))
         level, draw = divmod(plan, config.noise.draws)
-        return pair_key(sample, Place(level=level, draw=draw), several=self._plans > 1)
+        sample = sample if self._rule is None else frame_key(sample, frame)
+        return pair_key(sample, Place(level=level, draw=draw), several=noisy_frames(config) > 1)
 
     def row(self, number: int) -> dict[str, Value]:
         """Raise ConfigError: the rows of a table need every photograph."""

@@ -89,6 +89,14 @@ def with_motion(rule: BurstRule, plans: Sequence[Plan], patch: Patch, epoch: int
     return tuple(plan.replace(motion=motions[plan.place.frame]) for plan in plans)
 
 
+def facts_of_burst(burst: BurstRule | None, facts: Facts | None) -> Facts | None:
+    """Facts about the frames of bursts of a picture; those of the picture without bursts."""
+    if burst is None or facts is None:
+        return facts
+    sides = facts.height // burst.downscale, facts.width // burst.downscale
+    return replace(facts, height=sides[0], width=sides[1], frames=burst.frames)
+
+
 @dataclass(frozen=True, slots=True)
 class Sample:
     """Pairs that share a clean frame: a patch of an image, or a frame of a burst, which has ``light``."""
@@ -122,10 +130,8 @@ def plan_pixels(settings: PairSettings, photograph: Photograph, source: Source, 
     srgb, raw = photograph.srgb, photograph.raw
     config = with_raw_sensor(settings.config, raw)
     burst, sides = burst_rule(config.source), (srgb.shape[0], srgb.shape[1])
-    frames = source.frames if burst is None else burst.frames
-    facts = facts_for(config, srgb, frames, raw, photograph.source, photograph.profile)
-    if burst is not None and facts is not None:
-        facts = replace(facts, height=sides[0] // burst.downscale, width=sides[1] // burst.downscale)
+    facts = facts_for(config, srgb, source.frames, raw, photograph.source, photograph.profile)
+    facts = facts_of_burst(burst, facts)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, settings.dark_frames)
     plans = tuple(plan.decoded(photograph.profile, photograph.pixels_xxh3) for plan in plans)
     rule, layout = patch_rule(config.source), config.output.layout
