@@ -59,7 +59,7 @@ def flow(rows: Sequence[Row], k: int, inverse: bool = False) -> NDArray[np.float
     """
     first, other = (_row_of(rows, number) for number in (0, k))
     origin, moved = (rebuild(Motion, row) for row in (first, other))
-    step, offset = moved.burst_downscale, moved.pixel_offset
+    step, offset = moved.burst_downscale, moved.pixel_offset + (moved.burst_downscale - 1) / 2
     shape = int(first["height"] or 0), int(first["width"] or 0)
     y, x = (step * values.astype(float) + offset for values in np.indices(shape, sparse=True))
     start, end = (moved, origin) if inverse else (origin, moved)
