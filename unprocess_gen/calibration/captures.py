@@ -143,7 +143,8 @@ def read_captures(folder: Path, default: Sensor | None = None) -> CaptureSet:
     notes: list[str] = []
     with machine_errors(folder):
         if (folder / TABLE).is_file():
-            captures = list(_from_list(folder))
+            lines = read_table(folder / TABLE, REQUIRED, OPTIONAL, NUMBERS)
+            captures = [_listed(folder, place, cells) for place, cells in lines]
         elif (folder / EMVA).is_file():
             captures = list(_from_emva(folder))
         else:
@@ -151,8 +152,7 @@ def read_captures(folder: Path, default: Sensor | None = None) -> CaptureSet:
             captures = [_named(folder, file) for file in files]
             notes += [f"{folder}: {hidden}"] if hidden else []
         if not captures:
-            expected = f"expected darks and flats as {', '.join(SUFFIXES)}"
-            raise ConfigError(f"calibrate: {folder}: contains no raw frame; {expected}")
+            raise ConfigError(f"calibrate: {folder}: contains no raw frame; expected {', '.join(SUFFIXES)}")
         digests = [file_sha256(capture.path) for capture in captures]
     _check_twins(captures, digests)
     return CaptureSet(captures, _sensor(captures, notes, default), joined_sha256(digests), notes)
@@ -173,12 +173,6 @@ def _check_twins(captures: Iterable[Capture], digests: Iterable[str]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------- sources
-
-
-def _from_list(folder: Path) -> Iterator[Capture]:
-    """Yield the frames that ``captures.csv`` lists."""
-    for place, cells in read_table(folder / TABLE, REQUIRED, OPTIONAL, NUMBERS):
-        yield _listed(folder, place, cells)
 
 
 def _named(folder: Path, file: Path) -> Capture:

@@ -32,7 +32,7 @@ def read_picture_pairs(folder: Path) -> tuple[Iterator[tuple[Srgb, Srgb]], int, 
             expected = f"expected {TABLE}, or names with {', '.join(f'{a} and {b}' for a, b in NAMES.items())}"
             raise ConfigError(f"calibrate: {folder}: contains no picture as {', '.join(SUFFIXES)}; {expected}")
         sha256 = joined_sha256([file_sha256(path) for pair in paths for path in pair])
-    return ((_read(noisy), _read(clean)) for noisy, clean in paths), len(paths), sha256
+    return ((read_picture(noisy), read_picture(clean)) for noisy, clean in paths), len(paths), sha256
 
 
 def _listed(folder: Path) -> Iterator[tuple[Path, Path]]:
@@ -56,7 +56,7 @@ def _named(folder: Path) -> Iterator[tuple[Path, Path]]:
             yield path, partners[0]
 
 
-def _read(path: Path) -> Srgb:
-    """Decode a picture; ConfigError if it cannot be used."""
-    with machine_errors(path), refused_files(f"calibrate: {path}:", "; expected a picture of 8 or 16 bits"):
+def read_picture(path: Path, key: str = "calibrate") -> Srgb:
+    """Decode a picture; ConfigError, which begins with ``key``, if it cannot be used."""
+    with machine_errors(path), refused_files(f"{key}: {path}:", "; expected a picture of 8 or 16 bits"):
         return decode(path.read_bytes(), max_pixels=MAX_PIXELS, icc="ignore", name=str(path)).srgb
