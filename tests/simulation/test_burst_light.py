@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 from hypothesis import assume, example, given
@@ -12,24 +10,14 @@ from hypothesis import strategies as st
 from unprocess_gen.core.arrays import FLOAT32, Float, Normalised
 from unprocess_gen.simulation.kernels import burst
 from unprocess_gen.simulation.pair import linear_rgb
+from unprocess_gen.simulation.plan import Motion
 from unprocess_gen.simulation.profiles import Profile
 from unprocess_gen.simulation.reference import burst as reference
 from unprocess_gen.simulation.reference.burst import scene_box
 from unprocess_gen.simulation.reference.unprocess import INVERSE_HIGHLIGHTS
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN, GOLDEN_PLANS, golden_image
 
-
-class Motion(NamedTuple):
-    """The identity, unless changed."""
-
-    motion_yy: float = 1.0
-    motion_yx: float = 0.0
-    motion_y: float = 0.0
-    motion_xy: float = 0.0
-    motion_xx: float = 1.0
-    motion_x: float = 0.0
-    burst_downscale: int = 1
-    burst_phase: str = "centre"
+STILL = Motion(1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 def quarters(low: int, high: int) -> st.SearchStrategy[float]:
@@ -107,7 +95,7 @@ def test_the_error_is_within_its_bound(motion: Motion, shape: tuple[int, int]) -
 @given(st.integers(-9, 9), st.integers(-9, 9), sides)
 def test_motion_by_integers_moves_pixels_exactly(y: int, x: int, shape: tuple[int, int]) -> None:
     light = scene((-9, -9, 16, 16))
-    frame = burst.frame_light(light, Motion(motion_y=y, motion_x=x), (-9, -9), (0, 0), shape)
+    frame = burst.frame_light(light, STILL.replace(motion_y=y, motion_x=x), (-9, -9), (0, 0), shape)
     assert np.array_equal(frame, light[9 + y : 9 + y + shape[0], 9 + x : 9 + x + shape[1]])
 
 
@@ -124,8 +112,11 @@ def test_the_box_is_as_small_as_possible(motion: Motion, shape: tuple[int, int],
 
 
 def test_the_box_of_frames_contains_each() -> None:
-    near, far = Motion(motion_y=-2.5, burst_downscale=4), Motion(motion_x=1.25, burst_downscale=4, burst_phase="corner")
-    assert scene_box([Motion(burst_downscale=4)], (2, 3)) == (0, 0, 8, 12)
+    near, far = (
+        STILL.replace(motion_y=-2.5, burst_downscale=4),
+        STILL.replace(motion_x=1.25, burst_downscale=4, burst_phase="corner"),
+    )
+    assert scene_box([STILL.replace(burst_downscale=4)], (2, 3)) == (0, 0, 8, 12)
     assert scene_box([near], (2, 3)) == (-3, 0, 6, 12)
     assert scene_box([far], (2, 3)) == (-2, -1, 7, 12)
     assert scene_box([near, far], (2, 3)) == (-3, -1, 7, 12)
@@ -133,7 +124,7 @@ def test_the_box_of_frames_contains_each() -> None:
 
 def test_a_position_that_is_no_number_is_outside() -> None:
     with pytest.raises(ValueError, match=r"position=\[nan, 0.0\]: outside of the light, which has rows 0 to 3"):
-        burst.frame_light(scene((0, 0, 4, 4)), Motion(motion_y=float("nan")), (0, 0), (0, 0), (1, 1))
+        burst.frame_light(scene((0, 0, 4, 4)), STILL.replace(motion_y=float("nan")), (0, 0), (0, 0), (1, 1))
 
 
 # Light of the scene ---------------------------------------------------------------------------------------------------
@@ -170,5 +161,5 @@ def test_the_largest_light_stays_finite() -> None:
     image = np.full((65, 65, 3), np.finfo(np.float32).max)
     light = burst.scene_light(image, LINEAR)
     assert light.tobytes() == reference.scene_light(image, LINEAR).tobytes()
-    frame = burst.frame_light(light, Motion(motion_x=0.5, burst_downscale=64), (0, 0), (0, 0), (1, 1))
+    frame = burst.frame_light(light, STILL.replace(motion_x=0.5, burst_downscale=64), (0, 0), (0, 0), (1, 1))
     assert (frame == 2.0**64).all()

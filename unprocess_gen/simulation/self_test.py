@@ -20,12 +20,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from unprocess_gen.core.arrays import FLOAT32, Float, Srgb
+from unprocess_gen.core.arrays import FLOAT32, Float, Normalised, Srgb
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS
+from unprocess_gen.simulation.kernels import burst
 from unprocess_gen.simulation.kernels.jit import kernel, kernel_cache_folder, numba_config
 from unprocess_gen.simulation.kernels.render import uses_float32
 from unprocess_gen.simulation.lookup_tables import normal_table
@@ -36,6 +37,7 @@ from unprocess_gen.simulation.plan import (
     REFERENCE,
     CameraPlan,
     IspPlan,
+    Motion,
     NoisePlan,
     Physics,
     Plan,
@@ -122,6 +124,8 @@ GOLDEN = {
     "linear_float_clean": ("d266df2af19e2f10774416a0010e5ab5", "88d88fb2b7e08e2491c57b64b36cebc7"),
     "linear_float_clean_counts": ("1188c137a775ce4ec5d5541836dfd13e", "dacd4243ba515f2d45fc46988ae2c838"),
 }
+GOLDEN_LIGHT = "86947ca9b575c89281b696e72c3f5a7e"
+"""XXH3-128 of the light of a frame of a burst."""
 
 
 def kernels(plans: Sequence[Plan], targets: Sequence[str] = ()) -> list[str]:
@@ -129,7 +133,7 @@ def kernels(plans: Sequence[Plan], targets: Sequence[str] = ()) -> list[str]:
     if LINEAR_RGB in targets and plans[0].motion is None:
         exact = [plan.replace(accuracy=EXACT) for plan in plans]
         plans = [*plans, *exact, *(plan.replace(clean_dtype=FLOAT32) for plan in exact)]
-    sets: dict[str, None] = {}
+    sets: dict[str, None] = dict.fromkeys(["burst"] if any(plan.motion for plan in plans) else [])
     for plan in [plan.of_light for plan in plans]:
         noise = "electrons" if plan.counts_electrons else "gaussian"
         if plan.accuracy == REFERENCE:
@@ -183,6 +187,8 @@ def _failures(kernel_set: str) -> Iterator[str]:
     _product_and_sum(np.full(8, 1 + 2.0**-30), np.full(8, -1 - 2.0**-29), difference)
     if difference.any():
         yield "a kernel uses a fused multiply-add"
+    if kernel_set == "burst" and (digest := array_xxh3(_golden_light())) != GOLDEN_LIGHT:
+        yield f"the golden light of a burst is {digest}, expected {GOLDEN_LIGHT}"
     for name in (name for name, plan in GOLDEN_PLANS.items() if kernels([plan]) == [kernel_set]):
         pair = make_pair(golden_image(GOLDEN_PLANS[name]), GOLDEN_PLANS[name], (1, 57))
         for member, digest in zip(("clean", "noisy"), GOLDEN[name], strict=True):
@@ -199,6 +205,12 @@ def _product_and_sum(x: Float, y: Float, out: Float) -> None:
     """Fill ``out`` with x² + y; its last bits show whether the square was rounded before the addition."""
     for n in range(out.shape[0]):
         out[n] = x[n] * x[n] + y[n]
+
+
+def _golden_light() -> Normalised:
+    """Light of a frame of a burst of the golden image."""
+    light = burst.scene_light(golden_image(), GOLDEN_PLAN)
+    return burst.frame_light(light, Motion(1.0, 0.01, 1.3, -0.01, 1.0, 2.7, 3), (0, 0), (0, 0), (5, 24))
 
 
 def golden_image(plan: Plan = GOLDEN_PLAN) -> Srgb:

@@ -20,9 +20,9 @@ from unprocess_gen.core.arrays import Float, Normalised, Srgb, last_code
 from unprocess_gen.simulation.kernels import simd
 from unprocess_gen.simulation.kernels.jit import inner, kernel
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector, pointer_to
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.plan import Motion, Plan
 from unprocess_gen.simulation.profiles import light_tables
-from unprocess_gen.simulation.reference.burst import MOST_SCENE_LIGHT, Motion, check_inside, sample_places
+from unprocess_gen.simulation.reference.burst import MOST_SCENE_LIGHT, check_inside, sample_places
 from unprocess_gen.simulation.reference.primaries import light_colours
 from unprocess_gen.simulation.reference.unprocess import dequantise
 

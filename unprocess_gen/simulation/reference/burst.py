@@ -13,11 +13,8 @@ from typing import Any
 import numpy as np
 
 from unprocess_gen.core.arrays import Float, Normalised, Srgb
-from unprocess_gen.simulation.plan import Plan
+from unprocess_gen.simulation.plan import Motion, Plan
 from unprocess_gen.simulation.reference.unprocess import camera_light, dequantise
-
-Motion = Any
-"""Numbers of a frame: ``motion_yy`` … ``motion_x`` of A·p + b, ``burst_downscale`` and ``burst_phase``."""
 
 MOST_SCENE_LIGHT = 2.0**64
 """Limit of the light of a scene: far above what frames hold, and sums of 64 x 64 values stay finite in float32."""
@@ -115,8 +112,8 @@ def sample_places(motion: Motion, first: tuple[int, int], shape: tuple[int, int]
         Rows and columns, in high-resolution pixels.
     """
     step = motion.burst_downscale
-    offset = (step - 1) / 2 if motion.burst_phase == "corner" else 0.0
-    rows, columns = (step * start + np.arange(step * count) - offset for start, count in zip(first, shape, strict=True))
+    starts = (step * start + motion.pixel_offset for start in first)
+    rows, columns = (np.arange(step * count, dtype=np.float64) + s for s, count in zip(starts, shape, strict=True))
     return rows, columns
 
 
