@@ -27,15 +27,17 @@ ADDED = {
     "camera=custom": ["camera.xyz2cam=[1,0,0,0,1,0,0,0,1]"],
     "noise=heteroscedastic": ["noise.a=2", "noise.b=9"],
     "sensor=source": ["source=raw"],
-    "experiment=brooks2019_training": ["source.patch=[random,4,1]"],  # the pictures have 24 x 32 pixels
+    "experiment=bracket_hdr": ["source.patch=[random,4,1]"],  # the pictures have 24 x 32 pixels
+    "experiment=brooks2019_training": ["source.patch=[random,4,1]"],
     "experiment=hdr_scenes": ["source.patch=[random,4,1]"],
+    "experiment=ntire_burst_sr": ["source.patch=[random,8,1]", "source.burst.shift=2"],
     "experiment=raw_low_light": ["source.patch=[random,4,1]"],
     "experiment=raw_training": ["source.patch=[random,4,1]"],
 }
 """Values that an option lacks on purpose."""
 
 RAW = ["source=raw", "sensor=source", "experiment=raw_low_light", "experiment=raw_training"]
-LINEAR = ["source=linear", "experiment=hdr_scenes"]
+LINEAR = ["source=linear", "experiment=hdr_scenes", "experiment=bracket_hdr"]
 SWEEPS = [option for option in OPTIONS if option.startswith("sweep=")]
 ARRAYS = ("plan_image", "make_pair", "CameraNoise")
 REFUSED = {
@@ -45,7 +47,8 @@ REFUSED = {
     **{("experiment=brooks2019_training", entry): "source.patch=.* complete frames" for entry in ARRAYS[:2]},
     **{(option, entry): "is uint8" for option in LINEAR[:1] for entry in ARRAYS[:2]},
     **{(option, "CameraNoise"): "source.kind=linear: CameraNoise works on" for option in LINEAR},
-    **{("experiment=hdr_scenes", entry): "source.patch=.* complete frames|is uint8" for entry in ARRAYS[:2]},
+    **{(option, entry): "source.(patch|burst)=.* complete|is uint8" for option in LINEAR[1:] for entry in ARRAYS[:2]},
+    **{("experiment=ntire_burst_sr", entry): "source.(patch|burst)=|output.layout=packed: Camera" for entry in ARRAYS},
     ("experiment=brooks2019_training", "CameraNoise"): "source.downscale=2: CameraNoise keeps the geometry",
 }
 """Reason of each refusal that is right: arrays are photographs, and have one pair that is the complete frame."""
@@ -106,7 +109,8 @@ def test_option_is_simulated(option: str, run_main: RunMain, tmp_path: Path) -> 
     live = ug.LivePairs(overrides)
     assert run_main("plan", *overrides).code == 0
     ug.generate(ug.load_config(overrides))
-    stored = ug.RawPairs(tmp_path / "ds")
+    read = ug.RawPairs if ug.load_config(overrides).source.burst is None else ug.RawClips
+    stored = read(tmp_path / "ds")
     assert len(stored) == len(live) > 0
     np.testing.assert_array_equal(live[0, 0].noisy, stored[0].noisy)
     shutil.rmtree(tmp_path / "ds")

@@ -82,7 +82,7 @@ effects: default
 output: webdataset
 executor: local dask
 experiment: ipol_demo brooks2019_training crvd_like eld_low_light eld_body raw_low_light raw_training hdr_scenes
-experiment: many_highlights no_highlights
+experiment: many_highlights no_highlights ntire_burst_sr bracket_hdr
 sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
 """
 """Options that commands of users name."""
