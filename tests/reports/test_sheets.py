@@ -14,12 +14,14 @@ from helpers.photographs import PHOTOS, pixels
 from helpers.promise_report import Figure
 from PIL import Image
 
+import unprocess_gen as ug
 from unprocess_gen import RawPairs
 from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.reports import panels, sheets
 from unprocess_gen.simulation.reference import isp as process
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import PATTERNS, mosaic
+from unprocess_gen.sources import synthetic
 
 HEIGHT, WIDTH = 60, 90
 """Size of the first photograph, which fits into a panel without scaling."""
@@ -184,7 +186,7 @@ def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Pa
     for dtype in ("uint16", "float32"):
         settings = ("source.include=[large.png]", "output.layout=packed", f"output.dtype={dtype}")
         make(gray_world, tmp_path / dtype, *settings)
-        pairs.append(next(iter(sheets.selected_pairs(tmp_path / dtype, "", None))))
+        pairs.append(next(iter(sheets.sheets.selected_pairs(tmp_path / dtype, "", None))))
     for rounded, exact in zip(*((pair.clean, pair.noisy) for pair in pairs), strict=True):
         assert np.abs(exact - rounded.astype(np.float64)).max() <= 0.5 + 1e-3  # rounding, and float32
 
@@ -280,3 +282,24 @@ def test_wrong_argument_gives_one_line_and_writes_nothing(
     assert done.err.startswith(f"gen-dataset: {words.replace('DS', str(few))}")
     assert done.err.count("\n") == 1
     assert not (tmp_path / "sheets").exists()
+
+
+def test_frames_of_a_burst_are_shown_before_and_after_alignment(tmp_path: Path) -> None:
+    settings = ["source.burst={frames: 2, downscale: 2, ev: [0, -1]}", "source.limit=1", "n_jobs=1"]
+    ug.generate(ug.load_config([*settings, f"out={tmp_path / 'ds'}"]))
+    (_, first), (_, second) = sheets.overview(tmp_path / "ds", "0")
+    *_, base, before, after = second
+    assert (len(first), len(second), base.title) == (6, 9, "frame 0, clean")
+    assert before.overview is not None
+    assert after.overview is not None
+    assert after.overview.std() < before.overview.std() / 3
+
+
+def test_the_source_of_a_burst_is_its_target(tmp_path: Path) -> None:
+    settings = ["source.burst={frames: 2, downscale: 4}", "source.patch=[random,128,1]", "source.limit=1", "n_jobs=1"]
+    ug.generate(ug.load_config([*settings, f"out={tmp_path / 'ds'}"]))
+    (pair, *_) = sheets.selected_pairs(tmp_path / "ds", "0", None)
+    assert pair.source is not None
+    assert pair.source.shape == (128, 128, 3)
+    y, x = 4 * int(pair.row["patch_y"] or 0), 4 * int(pair.row["patch_x"] or 0)
+    assert np.array_equal(pair.source, synthetic.picture(str(pair.row["source"]))[y : y + 128, x : x + 128])

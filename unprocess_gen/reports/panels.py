@@ -78,6 +78,13 @@ def average_planes(raw: MosaicArray, panel_px: tuple[int, int]) -> Float:
     return np.stack([fit_image(plane.astype(np.float32), panel_px) for plane in planes_of(even)], axis=-1)
 
 
+def grey_tiles(raw: NDArray[Any]) -> NDArray[np.float32]:
+    """Mean of each 2 x 2 tile of a mosaic, without a last odd row or column."""
+    height, width = (side // 2 * 2 for side in raw.shape)
+    planes = [np.asarray(plane, dtype=np.float32) for plane in planes_of(raw[:height, :width])]
+    return np.asarray(np.mean(planes, axis=0))
+
+
 def finest_detail(values: NDArray[Any], box_px: tuple[int, int]) -> tuple[float, float]:
     """Centre of the box in which the mean square of the Laplacian of an image ``[H, W, C]`` is largest."""
     squares: Any = cv2.Laplacian(values.mean(axis=2, dtype=np.float32), cv2.CV_32F) ** 2

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from unprocess_gen.core.arrays import Float, Srgb, last_code
@@ -25,14 +26,17 @@ from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import recorded_places
+from unprocess_gen.dataset.flow import flow
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.row import patch_from_row, plan_from_row
 from unprocess_gen.dataset.selection import select_pairs
+from unprocess_gen.dataset.training import to_light
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.reports import panels
 from unprocess_gen.reports.panels import MosaicArray, SheetPanel, Window
 from unprocess_gen.reports.pictures import picture_png
+from unprocess_gen.simulation.frames import Patch
 from unprocess_gen.simulation.plan import CODE_RANGE, Plan
 from unprocess_gen.simulation.profiles import light_tables
 from unprocess_gen.simulation.reference import isp as display
@@ -50,7 +54,10 @@ MARK = "unprocess_gen"
 
 
 class SheetPair(NamedTuple):
-    """The frames, row and plan of a pair, and its source pixels or the reason why they are missing."""
+    """The frames, row and plan of a pair, and its source pixels or the reason why they are missing.
+
+    ``base`` has the clean frame and row of the first frame of a burst, for its other frames.
+    """
 
     clean: MosaicArray
     noisy: MosaicArray
@@ -58,6 +65,7 @@ class SheetPair(NamedTuple):
     plan: Plan
     source: Srgb | None
     missing_source: str
+    base: tuple[MosaicArray, Row] | None = None
 
 
 class SheetFiles(NamedTuple):
@@ -82,11 +90,21 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
         plan, part, missing = plan_from_row(row), None, ""
         try:
             photograph = sources.load(source_of(row), str(row["source_sha256"]), plan.source)
-            part = crop_patch(photograph.srgb, patch_from_row(row))
+            part = crop_patch(photograph.srgb, _part_of_source(row))
             plan = plan.decoded(photograph.profile, photograph.pixels_xxh3)
         except (SourceChangedError, DamageError, ConfigError) as error:  # the sheet is drawn without this photograph
             missing = str(error)
-        yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan, part, missing)
+        base = None
+        if plan.motion is not None and plan.place.frame:
+            first = pairs[re.sub(r"-f\d\d", "-f00", str(row["key"]))]
+            base = mosaic_dn(first.clean, first.row), first.row
+        yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan, part, missing, base)
+
+
+def _part_of_source(row: Row) -> Patch:
+    """Part of a source that a pair shows; of a burst, the target."""
+    patch, step = patch_from_row(row), int(row["burst_downscale"] or 1)
+    return Patch(patch.width * step, patch.height * step, patch.patch, patch.patch_y * step, patch.patch_x * step)
 
 
 # ------------------------------------------------------------------------------------------------------------- sheets
@@ -141,7 +159,7 @@ def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> 
     reason = re.sub(r"([0-9a-f]{8})[0-9a-f]{56}", r"\1...", pair.missing_source)  # of a SHA-256, the beginning
     plan, drawn = pair.plan, [SheetPanel("source", f"not available: {reason}", None)]
     if pair.source is not None:
-        views = (_shown(view, plan) for view in _views(pair.source, window, panel_px))
+        views = (_shown(view, plan) for view in _views(pair, pair.source, window, panel_px))
         drawn = [SheetPanel("source", f"{8 * pair.source.itemsize} bits", *views)]
     white_dn = plan.sensor.black_level_dn + plan.sensor.span_dn / plan.scene.exposure_ratio
     levels = f"{plan.sensor.black_level_dn} to {white_dn:.5g} DN, square root"
@@ -155,13 +173,54 @@ def _pair_panels(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> 
     limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(dn * dn))), 1.0) for dn in differences]
     note = f"+-{limits[0]:.3g} DN, detail +-{limits[1]:.3g} DN"
     pictures = ((dn / limit + 1) / 2 for dn, limit in zip(differences, limits, strict=True))
-    return [*drawn, SheetPanel("noisy - clean", note, *pictures)]
+    drawn.append(SheetPanel("noisy - clean", note, *pictures))
+    return drawn if pair.base is None else [*drawn, *_motion_panels(pair, pair.base, window, panel_px)]
 
 
-def _views(source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Float, Float]:
+def _motion_panels(
+    pair: SheetPair, base: tuple[MosaicArray, Row], window: Window, panel_px: tuple[int, int]
+) -> list[SheetPanel]:
+    """Panels of the first frame of a burst, and of the difference of a frame from it before and after alignment."""
+    clean, row = base
+    number = int(pair.row["frame"] or 0)
+    start, moved = (
+        panels.grey_tiles(to_light(dn, row)) * np.float32(2.0 ** -float(row["ev"] or 0))
+        for dn, row in ((clean, row), (pair.clean, pair.row))
+    )
+    places = np.indices(start.shape, dtype=np.float32) + flow_between_tiles([row, pair.row], number)
+    aligned = cv2.remap(moved, places[1], places[0], cv2.INTER_LINEAR, borderValue=float("nan"))
+    limit = max(RMS_SHOWN * float(np.sqrt(np.mean(np.square(moved - start)))), 1e-6)
+    before, after = (np.nan_to_num(frame - start) / limit / 2 + 0.5 for frame in (moved, aligned))
+    note = f"frame {number} - frame 0, +-{limit:.3g} of white, ev undone"
+    shown = (
+        ("frame 0, clean", "square root", np.sqrt(np.clip(start, 0, 1))),
+        ("difference", note, before),
+        ("difference, aligned by flow", note, after),
+    )
+    rows, columns = (slice(part.start // 2, part.stop // 2) for part in window)
+    return [
+        SheetPanel(title, text, panels.fit_image(picture, panel_px), picture[rows, columns].repeat(2, 0).repeat(2, 1))
+        for title, text, picture in shown
+    ]
+
+
+def flow_between_tiles(rows: Sequence[Row], frame: int) -> Float:
+    """Flow from frame 0 of a burst at the centres of the 2 x 2 tiles, in tiles."""
+    sites = flow(rows, frame)
+    height, width = (side // 2 * 2 for side in sites.shape[1:])
+    tiles = sites[:, :height, :width].reshape(2, height // 2, 2, width // 2, 2)
+    return np.asarray(tiles.mean(axis=(2, 4)) / 2, dtype=np.float32)
+
+
+def _views(pair: SheetPair, source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Float, Float]:
     """The source scaled to a panel, and its detail, in [0, 1]; light of a linear source may be beyond."""
     white = 1.0 if source.dtype.kind == "f" else float(last_code(source))
-    return panels.fit_image(source, panel_px) / white, source[window].astype(np.float64) / white
+    step = int(pair.row["burst_downscale"] or 1)
+    rows, columns = (slice(part.start * step, part.stop * step) for part in window)
+    detail = panels.fit_image(
+        source[rows, columns], (window[0].stop - window[0].start, window[1].stop - window[1].start)
+    )
+    return panels.fit_image(source, panel_px) / white, detail / white
 
 
 def _shown(values: Float, plan: Plan) -> Float:
@@ -174,7 +233,7 @@ def _shown(values: Float, plan: Plan) -> Float:
 
 def _stage_panels(pair: SheetPair, source: Srgb, window: Window) -> list[SheetPanel]:
     """Panels of the source after each step, black 0 and white 1, and of the frames in the colours of their filters."""
-    plan, pattern, views = pair.plan, pair.plan.sensor.pattern, _views(source, window, panels.PANEL_PX)
+    plan, pattern, views = pair.plan, pair.plan.sensor.pattern, _views(pair, source, window, panels.PANEL_PX)
     steps = zip(*(processing_steps(view, plan) for view in views), strict=True)
     drawn = [SheetPanel("source", "", *(_shown(view, plan) for view in views))]
     drawn += [SheetPanel(title, note, overview, detail) for (title, note, overview), (*_, detail) in steps]
