@@ -28,6 +28,8 @@ KINDS = {
     "levels": ["camera=choice", "noise=sony_a7s2", "noise.levels=[1600,3200]", "noise.draws=2", "output.dtype=float32",
                "source.downscale=2", "source.dequantize=dither"],
     "clips": ["source.clips=true", "body=nikon_d850", "effects.all=on", "clean.includes_fixed_pattern=true"],
+    "burst": ["source.burst={frames: 3, shift: 4, rotation_deg: 1, downscale: 2}", "body=sony_a7s2", "scene=night",
+              "output.targets=[linear_rgb]"],
     "raw": ["source.kind=raw", "noise=heteroscedastic", "noise.a=3", "noise.b=20", "source.patch=[grid,32,48]",
             "source.raw.pattern=RGGB", "source.raw.black_dn=256", "source.raw.white_dn=4095"],
     "linear": ["source.kind=linear", "body=canon_70d", "scene.ev=[uniform,-2,1]", "noise.full_well_e=9000",
@@ -41,6 +43,7 @@ KINDS = {
 def save_sources(root: Path) -> None:
     """Write the sources of all kinds; photographs have 8 and 16 bits, a colour profile, a turn, and a missing end."""
     photographs, raw, linear = (fill(root / kind / "sources", 0) for kind in ("photographs", "raw", "linear"))
+    Image.fromarray(pixels(20, 48, 64)).save(fill(root / "burst" / "sources", 0) / "a.png")
     for name, count in (("photographs", 1), ("patches", 2), ("levels", 1), ("split", 6), ("dark_frames", 1)):
         fill(root / name / "sources", count)
     for clip in (1, 2):

@@ -14,6 +14,7 @@ import unprocess_gen as ug
 from unprocess_gen.core.files import array_xxh3
 
 DATASETS = {
+    "burst": (3, "uint16", "uint16", (17, 25)),
     "clips": (4, "uint16", "uint16", (12, 16)),
     "dark_frames": (1, "uint16", "uint16", (12, 16)),
     "levels": (4, "float32", "float32", (6, 8)),
@@ -55,12 +56,20 @@ def test_kept_dataset_is_read_verified_and_replayed(kept: Path, kind: str, figur
     figure("kept-datasets", f"{kind}: {len(done)} of {len(pairs)} pairs are the same")
 
 
-@pytest.mark.parametrize("kind", sorted(DATASETS.keys() - {"dark_frames"}))  # LivePairs takes no folder of dark frames
+@pytest.mark.parametrize("kind", sorted(DATASETS.keys() - {"burst", "dark_frames"}))  # for darks it takes no folder
 def test_live_pairs_of_a_kept_dataset_are_its_pairs(kept: Path, kind: str) -> None:
     live = ug.LivePairs(kept / kind / "ds", root=kept / kind / "sources", redraw="none")
     for number, (clean, noisy, row) in enumerate(ug.RawPairs(kept / kind / "ds")):
         assert (live[number].clean == clean).all() and (live[number].noisy == noisy).all()
         assert dict(live[number].row) == row
+
+
+def test_burst_of_a_kept_dataset_is_read_and_made(kept: Path) -> None:
+    (stored,) = ug.RawClips(kept / "burst" / "ds")
+    live = ug.LivePairs(kept / "burst" / "ds", root=kept / "burst" / "sources", redraw="none")[0]
+    assert (live.clean == stored.clean).all() and (live.noisy == stored.noisy).all()
+    assert stored.target is not None and stored.target.shape == (34, 50, 3)
+    assert np.abs(ug.flow(stored.rows, 2)).max() > 0.1 and (ug.flow(stored.rows, 0) == 0).all()
 
 
 def test_clips_splits_targets_and_failures_of_kept_datasets_are_read(kept: Path) -> None:
