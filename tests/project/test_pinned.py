@@ -50,7 +50,7 @@ def test_pinned_dataset_has_the_recorded_bytes(name: str, tmp_path: Path, figure
     figure("pinned-datasets", f"{name}: {len(recorded)} of {len(recorded)} files have the recorded SHA-256")
 
 
-@pytest.mark.parametrize("settings", [["body=canon_70d", "effects.all=on"]])
+@pytest.mark.parametrize("settings", [["body=canon_70d", "effects.all=on"], ["sensor.pattern=MONO"]])
 def test_no_number_depends_on_how_python_adds_floats(settings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """``sum`` compensates rounding errors from Python 3.12 on, and not before."""
 

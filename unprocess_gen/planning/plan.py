@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from operator import mul
 from typing import Any, NamedTuple
 
 from unprocess_gen.config import interpretation
@@ -22,7 +23,7 @@ from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.arrays import FLOAT32
 from unprocess_gen.core.exact_distributions import power_of_two
 from unprocess_gen.core.random_streams import DARK_FRAME, PARAMETERS, frame_word, purpose, split_uniform, stream_key
-from unprocess_gen.core.sequences import Recent
+from unprocess_gen.core.sequences import Recent, add_in_order
 from unprocess_gen.planning.draws import DRAW_COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import NOT_ROUNDED, BodySelection, EffectRules, Selection
 from unprocess_gen.planning.frame_model import (
@@ -295,10 +296,10 @@ def without_filters(camera: CameraPlan) -> CameraPlan:
     Highlights are kept like highlights of the mean, whose gain is the mean of the three.
     """
     gains, rgb2cam = camera.inverse_gains, camera.rgb2cam
-    sums = [sum(gain * rgb2cam[3 * row + column] for row, gain in enumerate(gains)) for column in range(3)]
-    red, green, blue = (value / sum(sums) for value in sums)
+    sums = [add_in_order(map(mul, gains, rgb2cam[column::3])) for column in range(3)]
+    red, green, blue = (value / add_in_order(sums) for value in sums)
     rows = red, green, blue, red, green, blue, red, green, blue
-    return camera.replace(rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=sum(gains) / 3)
+    return camera.replace(rgb2cam=rows, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=add_in_order(gains) / 3)
 
 
 CHOSEN = "effects", "skipped", "assumed"
