@@ -85,6 +85,12 @@ def grey_tiles(raw: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(np.mean(planes, axis=0))
 
 
+def moved(picture: NDArray[np.float32], by: Float) -> NDArray[Any]:
+    """Sample a picture at each pixel plus a flow [2, H, W]; NaN outside of it."""
+    y, x = np.indices(picture.shape, dtype=np.float32) + by
+    return np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderValue=float("nan")))
+
+
 def finest_detail(values: NDArray[Any], box_px: tuple[int, int]) -> tuple[float, float]:
     """Centre of the box in which the mean square of the Laplacian of an image ``[H, W, C]`` is largest."""
     squares: Any = cv2.Laplacian(values.mean(axis=2, dtype=np.float32), cv2.CV_32F) ** 2

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from unprocess_gen.core.arrays import Float, Srgb, last_code
@@ -187,8 +186,7 @@ def _motion_panels(
         panels.grey_tiles(to_light(dn, row)) * np.float32(2.0 ** -float(row["ev"] or 0))
         for dn, row in ((clean, row), (pair.clean, pair.row))
     )
-    places = np.indices(start.shape, dtype=np.float32) + flow_between_tiles([row, pair.row], number)
-    aligned = cv2.remap(moved, places[1], places[0], cv2.INTER_LINEAR, borderValue=float("nan"))
+    aligned = panels.moved(moved, flow_between_tiles([row, pair.row], number))
     limit = max(RMS_SHOWN * float(np.sqrt(np.mean(np.square(moved - start)))), 1e-6)
     before, after = (np.nan_to_num(frame - start) / limit / 2 + 0.5 for frame in (moved, aligned))
     note = f"frame {number} - frame 0, +-{limit:.3g} of white, ev undone"
