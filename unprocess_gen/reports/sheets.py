@@ -213,7 +213,7 @@ def flow_between_tiles(rows: Sequence[Row], frame: int) -> Float:
 def _views(pair: SheetPair, source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Float, Float]:
     """The source scaled to a panel, and its detail, in [0, 1]; light of a linear source may be beyond."""
     white = 1.0 if source.dtype.kind == "f" else float(last_code(source))
-    step = int(pair.row["burst_downscale"] or 1)
+    step = 1 if pair.plan.motion is None else pair.plan.motion.burst_downscale
     rows, columns = (slice(part.start * step, part.stop * step) for part in window)
     detail = panels.fit_image(
         source[rows, columns], (window[0].stop - window[0].start, window[1].stop - window[1].start)
