@@ -186,7 +186,7 @@ def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Pa
     for dtype in ("uint16", "float32"):
         settings = ("source.include=[large.png]", "output.layout=packed", f"output.dtype={dtype}")
         make(gray_world, tmp_path / dtype, *settings)
-        pairs.append(next(iter(sheets.sheets.selected_pairs(tmp_path / dtype, "", None))))
+        pairs.append(next(iter(sheets.selected_pairs(tmp_path / dtype, "", None))))
     for rounded, exact in zip(*((pair.clean, pair.noisy) for pair in pairs), strict=True):
         assert np.abs(exact - rounded.astype(np.float64)).max() <= 0.5 + 1e-3  # rounding, and float32
 
