@@ -50,6 +50,19 @@ def test_flow_aligns_frames_of_a_smooth_scene(downscale: int, phase: str) -> Non
         assert np.abs(frames[k] - frames[0]).max() > 0.2
 
 
+@pytest.mark.parametrize("phase", ["centre", "corner"])
+def test_both_frames_show_one_position_of_the_target(phase: str) -> None:
+    """Pixel i of a frame is centred on s i + (s - 1) / 2, with ``corner`` on s i: A p + b there is that of frame 0."""
+    rows, motions = burst(downscale=3, phase=phase, rotation_deg=20.0)
+    centre = 1 if phase == "centre" else 0
+    at = np.indices((SIDE, SIDE))
+    y, x = 3 * (at + ug.flow(rows, 2)) + centre
+    moved = motions[2]
+    shown = (moved.motion_yy * y + moved.motion_yx * x + moved.motion_y,
+             moved.motion_xy * y + moved.motion_xx * x + moved.motion_x)  # fmt: skip
+    assert np.abs(np.stack(shown) - (3 * at + centre)).max() < 1e-9
+
+
 def test_a_point_moves_by_the_flow() -> None:
     """A point at a high-resolution pixel is in frame k at its place in frame 0 plus the flow."""
     rows, motions = burst(downscale=1, shift=5.0, rotation_deg=3.0)
