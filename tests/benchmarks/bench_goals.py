@@ -32,6 +32,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.source import Source
 from unprocess_gen.dataset.row import pair_row
+from unprocess_gen.pipeline.pairs import PairSettings, plan_pixels
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.timing import measure_in_turns, thread_ns
@@ -41,7 +42,7 @@ from unprocess_gen.simulation.pair import make_pair, make_pairs
 from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.simulation.tone_curves import linear_table
 from unprocess_gen.sources import synthetic
-from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.sources.image.decode import Photograph, decode
 from unprocess_gen.sources.linear.pixels import linear_photograph
 
 TWO_NUMBERS = "noise=imx385_iso3200"
@@ -162,6 +163,21 @@ class Bench:
 
         return Work(plan, 20 * self.patch_side**2)
 
+    def burst(self, side: int) -> tuple[Work, Work]:
+        """A burst of 14 frames at a quarter of the resolution; its 14 pairs, and 14 warps by OpenCV in float32."""
+        config = config_of(f"{TWO_NUMBERS} source.burst={{frames:14,shift:2}} source.patch=[random,{4 * side},1]")
+        settings, source = PairSettings.read(config), Source(0, "", "", 0)
+        image = plan_pixels(settings, Photograph(self.srgb, 1), source, f"{self.number:064x}")
+        (plan,), frame = self.plans(TWO_NUMBERS), np.ascontiguousarray(self.srgb[:side, :side])
+        light, motion = np.ones((4 * side, 4 * side, 3), np.float32), np.array([[1, 0.01, 1.3], [-0.01, 1, 2.7]])
+
+        def parts() -> object:
+            warps = [cv2.warpAffine(light, motion, light.shape[:2], flags=cv2.INTER_LINEAR) for _ in range(14)]
+            return warps, [make_pair(frame, plan) for _ in range(14)]
+
+        sites = 14 * side * side
+        return Work(lambda: list(image.pairs()), sites, False), Work(parts, sites, False)
+
     def light_and_16_bits(self) -> tuple[Bench, Bench]:
         """The light of the image as a linear source, and the image in 16 bits."""
         codes = self.srgb.astype(np.uint16) * (257 if self.srgb.itemsize == 1 else 1)
@@ -191,6 +207,8 @@ class Bench:
         for settings in (TWO_NUMBERS, daylight, night):
             linear = light.pair(f"source.kind=linear {settings}")
             yield Row("a linear source, against 16 bits", settings, linear, codes.pair(settings))
+        burst, parts = self.burst(96 if min(self.srgb.shape[:2]) > 400 else 8)
+        yield Row("a burst, against its pairs and OpenCV's warps", TWO_NUMBERS, burst, parts)
         for settings in (daylight, night):
             levels = self.levels(f"{settings} noise.levels={LEVELS}")
             yield Row("five levels, against one", f"{settings} noise.levels=5", levels, self.pair(settings))
