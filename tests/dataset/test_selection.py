@@ -52,6 +52,20 @@ def test_indices_ranges_and_keys_select_rows(keys: str, selected: list[str], man
     assert [row["key"] for row in select_rows(manifest, keys)] == selected
 
 
+@pytest.mark.parametrize(
+    ("keys", "selected"),
+    [
+        ("6", [0, 1, 2, 3]), ("00000006-p0001", [2, 3]), ("00000006-p0001-f01", [3]), ("00000006-p0000-f00", [0]),
+    ],
+)  # fmt: skip
+def test_keys_name_bursts_and_their_frames(keys: str, selected: list[int], tmp_path: Path) -> None:
+    source, names = dataclasses.replace(SOURCE, index=6), ["p0000-f00", "p0000-f01", "p0001-f00", "p0001-f01"]
+    made = [pair_row(f"00000006-{name}", source, SHA256, 1, 0, PLAN, PAIR, DIGESTS, PATCH) for name in names]
+    write_manifest(tmp_path / "manifest.csv", COLUMN_NAMES, [csv_lines(made, COLUMN_NAMES)])
+    rows = select_rows(tmp_path / "manifest.csv", keys)
+    assert [row["key"] for row in rows] == [made[number]["key"] for number in selected]
+
+
 def test_failed_rows_inside_a_range_are_skipped_and_counted(manifest: Path) -> None:
     skipped: list[Row] = []
     selected = [row["key"] for row in select_rows(manifest, "0-2", skipped)]

@@ -72,7 +72,9 @@ def _wrong_value(error: OmegaConfBaseException, overrides: Sequence[str]) -> str
         return re.sub(r'^\w+ raised while resolving interpolation: "?(.*?)"?$', r"\1", message)
     if error.object_type in ITEMS:
         return f"expected {settings_of(error.object_type)[key].allowed}"
-    value = _assignment(key, None, overrides).partition("=")[2]
+    written, _, value = _assignment(key, None, overrides).partition("=")
+    if written.startswith("source.burst."):  # it is null until a file or another override makes it a mapping
+        return f"source.burst is no mapping; write source.burst={{{written.rpartition('.')[2]}: {value}}}"
     if "is not a ListConfig, list or tuple" in message and value and value[0] not in "[{":
         return f"expected a list, such as [{value}]"
     allowed = _allowed(key)

@@ -21,9 +21,11 @@ from unprocess_gen.config.schema import (
     ProvenanceConfig,
     SourceConfig,
 )
-from unprocess_gen.config.values import one_of, refusal
+from unprocess_gen.config.values import refusal
 from unprocess_gen.core.arrays import FLOAT32
+from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.fields import is_integer, is_number, value_text
+from unprocess_gen.core.suggestions import did_you_mean
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.dark_current import HEAT
 
@@ -222,7 +224,9 @@ def burst_rule(source: SourceConfig) -> BurstRule | None:
     if not isinstance(burst, dict):
         raise refusal("source.burst", burst, f"expected {limits.BURST}")
     for name, value in burst.items():
-        one_of("source.burst", name, limits.BURST_KEYS)
+        if name not in limits.BURST_KEYS:
+            names, close = ", ".join(limits.BURST_KEYS), did_you_mean(str(name), limits.BURST_KEYS)
+            raise ConfigError(f"source.burst.{name}: no such key; source.burst has {names}{close}")
         limit = limits.BURST_KEYS[name]
         if not limit.allows(value):
             raise refusal(f"source.burst.{name}", value, f"expected {limit}")

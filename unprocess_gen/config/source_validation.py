@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from unprocess_gen.config.distributions import highest, lowest
 from unprocess_gen.config.interpretation import burst_rule, is_physical, patch_rule, uses_dark_frames
-from unprocess_gen.config.limits import EXPOSURE_S
+from unprocess_gen.config.limits import EV, EXPOSURE_S
 from unprocess_gen.config.schema import Config, RawConfig, SourceConfig
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import refusal
@@ -72,9 +72,14 @@ def _check_burst(config: Config) -> None:
                 f"{name}={length} with source.burst.downscale={rule.downscale}; expected a multiple of {rule.tile}"
             )
             raise refusal("source.patch", source.patch, f"{problem} pixels, 2 x 2 sites of the sensor")
+    stops, ev = rule.ev[: rule.frames], EV.parse("scene.ev", config.scene.ev)
+    ends = lowest(ev) + min(stops), highest(ev) + max(stops)
+    if not EV.numbers.low <= ends[0] <= ends[1] <= EV.numbers.high:
+        problem = f"with scene.ev exposures from {ends[0]:g} to {ends[1]:g} stops; expected {EV.numbers}"
+        raise refusal("source.burst.ev", list(rule.ev), f"{problem}; change scene.ev")
     if is_physical(config.noise):
         seconds, numbers = EXPOSURE_S.parse("scene.exposure_s", config.scene.exposure_s), EXPOSURE_S.numbers
-        ends = lowest(seconds) * 2.0 ** min(rule.ev), highest(seconds) * 2.0 ** max(rule.ev)
+        ends = lowest(seconds) * 2.0 ** min(stops), highest(seconds) * 2.0 ** max(stops)
         if not numbers.low <= ends[0] <= ends[1] <= numbers.high:
             problem = f"exposure times from {ends[0]:g} to {ends[1]:g} s; expected {numbers}; change scene.exposure_s"
             raise refusal("source.burst.ev", list(rule.ev), problem)

@@ -9,13 +9,13 @@ from typing import NamedTuple
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.dataset.columns import Row
-from unprocess_gen.dataset.keys import image_key, key_text, sample_key
+from unprocess_gen.dataset.keys import burst_key, image_key, key_text, sample_key
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.row import KEY_TEXT
 
 KEYS_FORM = (
     "expected source indices and ranges such as 3,7-9, or keys: 00000003 names all pairs of an image, "
-    "00000003-p0007 those of a patch, 00000003-l01d02 a level and a draw"
+    "00000003-p0007 those of a patch, 00000003-f02 a frame of a burst, 00000003-l01d02 a level and a draw"
 )
 """What ``--keys`` takes, as messages and help texts describe it."""
 
@@ -64,7 +64,7 @@ def select_rows(manifest: AnyPath, keys: str | None = None, skipped: list[Row] |
     for row in read_rows(manifest):
         key, index = str(row["key"]), int(image_key(row))
         ends = ends[0] or key, key
-        named = names.keys() & {key, sample_key(row), image_key(row)}
+        named = names.keys() & {key, sample_key(row), burst_key(key), image_key(row)}
         around = {text for text, indices in ranges.items() if index in indices}
         matches |= named | around
         if named or (around and row["status"] == "ok"):

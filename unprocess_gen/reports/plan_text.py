@@ -46,6 +46,7 @@ def format_estimate(estimate: RunEstimate, with_numbers: bool = False, with_tabl
             *_labelled("pairs", [f"{about}{estimate.pairs}, in {per_shard}"]),
             *_labelled("splits", [_split_sentence(config, len(run.sources))]),
             *_labelled("patches", [_patch_sentence(config, read)]),
+            *_labelled("bursts", _burst_sentences(config)),
             *_labelled("targets", [", ".join(config.output.targets)]),
             *_labelled("bytes", [size + (": NOT ENOUGH" if estimate.free_bytes < estimate.bytes else "")]),
             f"time      about {total} with {counted(estimate.n_jobs, 'worker')}: start-up {start}, pairs {pairs}",
@@ -139,6 +140,22 @@ def _patch_sentence(config: Config, estimates: Estimates) -> str:
         return ""
     places = f"{rule.count} at random places" if rule.kind == "random" else f"a grid, {rule.stride} apart"
     return f"{rule.side} x {rule.side}, {places}: {value_range(counts)} per image"
+
+
+def _burst_sentences(config: Config) -> list[str]:
+    """State frames, largest motion, margin and exposures of bursts; nothing without them."""
+    rule, patch = interpretation.burst_rule(config.source), interpretation.patch_rule(config.source)
+    if rule is None:
+        return []
+    margin = f", a margin of {rule.margin(patch.side, patch.side)[0]} pixels" if patch else ""
+    stops = sorted({rule.stops(frame) for frame in range(rule.frames)})
+    exposures = ", ".join(f"{stop:g}" for stop in stops)
+    above = config.source.kind == "srgb" and stops[-1] > 0
+    return [
+        f"{counted(rule.frames, 'frame')} at 1/{rule.downscale} of the resolution, moved by up to {rule.shift:g} "
+        f"pixels and {rule.rotation_deg:g} degrees{margin}; ev {exposures}",
+        "ev above 0 saturates photographs, which hold nothing above white; linear sources do" if above else "",
+    ]
 
 
 def _failure_lines(config: Config, estimates: Estimates) -> list[str]:
@@ -287,7 +304,8 @@ def _source_noise_sentence(config: Config, ratios: Sequence[float | None]) -> st
     """Count the sources that bring visible noise into the clean frame."""
     measured = [ratio for ratio in ratios if ratio is not None]
     noisy = sum(ratio > NOISY_SOURCE for ratio in measured)
-    remedy = "" if config.source.kind == "raw" else f"; source.downscale={2 * config.source.downscale} averages it"
+    has_remedy = config.source.kind != "raw" and config.source.burst is None
+    remedy = "" if not has_remedy else f"; source.downscale={2 * config.source.downscale} averages it"
     sentence = f"the noise of {noisy} of {len(measured)} sources exceeds a fifth of the simulated noise{remedy}"
     return sentence if noisy else ""
 
