@@ -94,7 +94,19 @@ def test_flow_and_its_inverse_return_to_the_start(phase: str) -> None:
 @pytest.mark.parametrize(("rows", "k", "problem"), [
     ([], 1, "no frame of this number"),
     ([{"frame": 0, "motion_y": None}], 0, "its row has no motion"),
+    ([{"frame": 0, "motion_y": float("nan")}], 0, "its row has no motion"),
+    (burst()[0] * 2, 1, "2 rows have this number"),
+    (burst()[0][1:], 1, r"no frame of this number in the frames \[1, 2\]"),
 ])  # fmt: skip
 def test_flow_needs_the_rows_of_a_burst(rows: list[dict[str, Any]], k: int, problem: str) -> None:
     with pytest.raises(ValueError, match=f"flow: frame 0: {problem}.*expected the rows of a burst"):
         ug.flow(rows, k)
+
+
+def test_flow_takes_columns_and_refuses_rows_of_two_bursts() -> None:
+    rows, _ = burst()
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    arrays = {name: cells if isinstance(cells[0], str) else np.array(cells) for name, cells in columns.items()}
+    assert np.array_equal(ug.flow(arrays, 2), ug.flow(rows, 2))
+    with pytest.raises(ValueError, match="flow: frames 0 and 1 are of different bursts"):
+        ug.flow([{**row, "patch": k} for k, row in enumerate(rows)], 1)

@@ -37,7 +37,7 @@ def same(one: Any, other: Any) -> bool:
 def test_epoch_0_is_the_stored_dataset(dataset: tuple[Path, list[str]]) -> None:
     clips = ug.RawClips(dataset[0])
     for source in dataset:
-        live = ug.LivePairs(source, redraw="all", targets=["linear_rgb"])
+        live = ug.LivePairs(source, redraw="all")
         assert len(live) == len(clips)
         for i, clip in enumerate(clips):
             assert same(live[0, i], clip)
@@ -99,5 +99,43 @@ def test_what_bursts_lack_is_refused(dataset: tuple[Path, list[str]], options: d
 
 
 def test_single_frames_with_inputs_are_refused(dataset: tuple[Path, list[str]]) -> None:
-    with pytest.raises(ConfigError, match=r"differ in targets.*ug\.RawClips for bursts"):
+    with pytest.raises(ConfigError, match=r"pairs differ in targets.*ug\.RawClips for bursts"):
         ug.RawPairs(dataset[0], inputs="mosaic")
+
+
+def test_bursts_can_be_pickled(dataset: tuple[Path, list[str]]) -> None:
+    for burst in (ug.RawClips(dataset[0])[0], ug.LivePairs(dataset[0])[1, 0]):
+        there = pickle.loads(pickle.dumps(burst))
+        assert same(there, burst)
+        assert there.rows == [dict(row) for row in burst.rows]
+        assert there.dataset == burst.dataset
+
+
+def test_the_target_of_planes_has_the_sites_of_the_planes(tmp_path: Path) -> None:
+    """Planes leave out an odd last row or column, and so does the target, at its resolution."""
+    burst = "source.burst={frames: 2, downscale: 6, shift: 1}"
+    ug.generate(ug.load_config([burst, "source.limit=1", "output.targets=[linear_rgb]", f"out={tmp_path / 'ds'}"]))
+    clip = ug.RawClips(tmp_path / "ds")[0]
+    assert clip.noisy.shape[1] % 2 or clip.noisy.shape[2] % 2
+    height, width = (length // 2 * 2 * 6 for length in clip.noisy.shape[1:])
+    for clips in (ug.RawClips, ug.LivePairs):
+        item = clips(tmp_path / "ds", inputs="packed")[0]
+        assert np.array_equal(item["linear_rgb"], clip.target[:height, :width])
+
+
+def test_flips_of_clips_are_refused(dataset: tuple[Path, list[str]]) -> None:
+    for clip in (ug.RawClips(dataset[0])[0], ug.RawClips(dataset[0], inputs="mosaic")[0]):
+        with pytest.raises(ValueError, match="x: is a clip, whose motion is not flipped"):
+            ug.flip(clip, "horizontal")
+
+
+def test_a_loader_stacks_bursts(dataset: tuple[Path, list[str]]) -> None:
+    data = pytest.importorskip("torch.utils.data", reason="PyTorch is not installed")
+    options: dict[str, Any] = {"inputs": "packed", "rows": True}
+    for bursts in (ug.RawClips(dataset[0], **options), ug.LivePairs(dataset[0], patch=32, **options)):
+        batch = next(iter(data.DataLoader(bursts, batch_size=2)))
+        assert batch["noisy"].shape[:3] == (2, 3, 4)
+        assert batch["motion"].shape == (2, 3, 6)
+        assert batch["linear_rgb"].shape[0] == 2
+    for bursts in (ug.RawClips(dataset[0]), ug.LivePairs(dataset[0])):
+        assert next(iter(data.DataLoader(bursts, batch_size=2))).targets["linear_rgb"].shape[0] == 2

@@ -5,16 +5,16 @@ from __future__ import annotations
 import operator
 from collections import namedtuple
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, Self, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.arrays import Frame
+from unprocess_gen.core.arrays import PACKED, Frame
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.targets import LINEAR_RGB
+from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.development import development_parameters
 from unprocess_gen.dataset.inputs import Options, stackable_row
 from unprocess_gen.dataset.reader import DatasetPath, RawPairs, Sample
@@ -42,17 +42,19 @@ class Clip(_Frames):
     """
 
     dataset: str
-    targets: Mapping[str, NDArray[Any]] = MappingProxyType({})
+    targets: Mapping[str, NDArray[Any]]
 
-    def __new__(cls, frames: Sequence[Any]) -> Self:
-        """Stack the samples of a clip."""
-        clean, noisy = (np.stack([getattr(frame, name) for frame in frames]) for name in ("clean", "noisy"))
-        clip = super().__new__(cls, clean, noisy, [frame.row for frame in frames])
-        clip.dataset = frames[0].dataset
-        targets = frames[0].targets
-        if clip.rows[0]["motion_y"] is None:
-            targets = {name: np.stack([frame.targets[name] for frame in frames]) for name in targets}
-        clip.targets = targets
+    def __new__(
+        cls,
+        clean: Frame,
+        noisy: Frame,
+        rows: list[dict[str, Any]],
+        dataset: str = "",
+        targets: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    ) -> Self:
+        """Tuple of three items with two more attributes."""
+        clip = super().__new__(cls, clean, noisy, rows)
+        clip.dataset, clip.targets = dataset, dict(targets)
         return clip
 
     @property
@@ -75,27 +77,37 @@ MOTION = "motion_yy", "motion_yx", "motion_y", "motion_xy", "motion_xx", "motion
 """Columns of the motion of a burst's frame."""
 
 
-def clip_item(samples: Sequence[Any], options: Options) -> Any:
+def clip_item(samples: Sequence[Any], options: Options, columns: Sequence[Row] = ()) -> Any:
     """Convert the frames of a clip, which have been cut, to a `Clip`, or with ``inputs`` to a dict of arrays [T, …].
 
-    Frames of a burst have ``motion`` [T, 6], and the target of the first one.
+    Frames of a burst have ``motion`` [T, 6], and the target of the first one. ``columns`` are those of the rows that
+    this takes; without them, it reads the rows.
     """
+    columns, first = columns or [sample.row for sample in samples], samples[0]
+    is_burst = columns[0]["motion_y"] is not None
+    targets = first.targets
     if options.inputs is None:
-        return Clip(samples)
-    is_burst = samples[0].row["motion_y"] is not None
-    frames = [
-        options.item(sample, sample.row, (0, 0), partial(development_parameters, sample.row))
-        for sample in (without_targets(sample) if is_burst and k else sample for k, sample in enumerate(samples))
+        if not is_burst:
+            targets = {name: np.stack([sample.targets[name] for sample in samples]) for name in targets}
+        clean, noisy = (np.stack([getattr(sample, name) for sample in samples]) for name in ("clean", "noisy"))
+        return Clip(clean, noisy, [sample.row for sample in samples], first.dataset, targets)
+    development = development_parameters(first.row)  # of all frames, which have one camera
+    items = [
+        options.item(_without_targets(sample) if is_burst else sample, row, (0, 0), lambda: development)
+        for sample, row in zip(samples, columns, strict=True)
     ]
-    development, *_ = [frame.pop("development") for frame in frames]
-    shared = {"development": development}  # that of all frames, which have one camera
-    shared |= {name: frames[0].pop(name) for name in samples[0].targets} if is_burst else {}
-    motion = {"motion": np.array([[sample.row[name] for name in MOTION] for sample in samples])} if is_burst else {}
-    return {**_stacked(frames), **shared, **motion}
+    item = _stacked([{name: item[name] for name in item if name != "development"} for item in items])
+    item["development"] = development
+    item["frame"] = np.array([row["frame"] for row in columns])
+    if is_burst:
+        item["motion"] = np.array([[row[name] for name in MOTION] for row in columns])
+        scale = int(columns[0]["burst_downscale"] or 1) * (2 if options.inputs == PACKED else 1)
+        height, width = (length * scale for length in item["noisy"].shape[-2:])  # planes leave out an odd row
+        item |= {name: np.require(target[:height, :width], requirements=["C", "W"]) for name, target in targets.items()}
+    return item
 
 
-def without_targets(sample: Any) -> Sample:
-    """Return a sample without its targets."""
+def _without_targets(sample: Any) -> Sample:
     return Sample(sample.clean, sample.noisy, sample.row, sample.dataset)
 
 
@@ -128,8 +140,8 @@ class RawClips:
     split : str, optional
         Only clips of this split, by default all.
     inputs, noise_map, rows, clip_black
-        As for `RawPairs`, with T as first axis: dicts that PyTorch's default ``collate_fn`` stacks. Bursts have
-        ``motion`` too, float64 [T, 6]: yy, yx, y, xy, xx, x of the manifest.
+        As for `RawPairs`, with T as first axis: dicts that PyTorch's default ``collate_fn`` stacks. ``frame`` [T] is
+        the number of each frame. Bursts have ``motion`` too, float64 [T, 6]: yy, yx, y, xy, xx, x of the manifest.
 
     Raises
     ------

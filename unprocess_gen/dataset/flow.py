@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.dataset.columns import Row, rebuild
+from unprocess_gen.dataset.reader import row_of_batch
 from unprocess_gen.simulation.plan import Motion
 
 
-def flow(rows: Sequence[Row], k: int, inverse: bool = False) -> NDArray[np.float64]:
+def flow(rows: Sequence[Row] | Mapping[str, Any], k: int, inverse: bool = False) -> NDArray[np.float64]:
     """Compute the optical flow between the first frame of a burst and another one, from their motion.
 
     Parameters
     ----------
-    rows : sequence of mappings
-        Manifest rows of the burst's frames, such as ``rows`` of a `Clip`.
+    rows : sequence of mappings, or mapping of columns
+        Manifest rows of the burst's frames, such as ``rows`` of a `Clip`; or ``row`` of an item with ``inputs`` and
+        ``rows=True``, also as tensors.
     k : int
         Number of the other frame, its column ``frame``.
     inverse : bool
@@ -32,7 +35,7 @@ def flow(rows: Sequence[Row], k: int, inverse: bool = False) -> NDArray[np.float
     Raises
     ------
     ValueError
-        If the rows are not those of a burst, or have no frame 0 or k.
+        If the rows are not those of one burst, or have no frame 0 or k.
 
     Notes
     -----
@@ -57,7 +60,13 @@ def flow(rows: Sequence[Row], k: int, inverse: bool = False) -> NDArray[np.float
     >>> burst.noisy.shape, ug.flow(burst.rows, 1).shape
     ((2, 224, 353), (2, 224, 353))
     """
+    if isinstance(rows, Mapping):
+        columns = [values.tolist() if hasattr(values, "tolist") else values for values in rows.values()]
+        rows = [dict(zip(rows, cells, strict=True)) for cells in zip(*columns, strict=True)]
     first, other = (_row_of(rows, number) for number in (0, k))
+    bursts = [tuple(row.get(name) for name in ("clip", "patch", "level", "draw")) for row in (first, other)]
+    if bursts[0] != bursts[1]:
+        raise ValueError(f"flow: frames 0 and {k} are of different bursts; expected the rows of one")
     origin, moved = (rebuild(Motion, row) for row in (first, other))
     step, offset = moved.burst_downscale, moved.pixel_offset + (moved.burst_downscale - 1) / 2
     shape = int(first["height"] or 0), int(first["width"] or 0)
@@ -71,12 +80,13 @@ def flow(rows: Sequence[Row], k: int, inverse: bool = False) -> NDArray[np.float
 
 def _row_of(rows: Sequence[Row], frame: int) -> Row:
     """Find the row of a frame of a burst."""
-    row = next((row for row in rows if int(row["frame"] or 0) == frame), None)
-    if row is None or row.get("motion_y") is None:
-        numbers = [row["frame"] for row in rows]
-        problem = f"no frame of this number in the frames {numbers}" if row is None else "its row has no motion"
-        raise ValueError(f"flow: frame {frame}: {problem}; expected the rows of a burst, as RawClips gives them")
-    return row
+    found = [row_of_batch(row) for row in rows if row["frame"] == frame]
+    if len(found) == 1 and found[0].get("motion_y") is not None:
+        return found[0]
+    numbers = [row["frame"] for row in rows]
+    problem = "its row has no motion" if found else f"no frame of this number in the frames {numbers}"
+    problem = f"{len(found)} rows have this number" if len(found) > 1 else problem
+    raise ValueError(f"flow: frame {frame}: {problem}; expected the rows of a burst, as RawClips gives them")
 
 
 def _shown(motion: Motion, y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

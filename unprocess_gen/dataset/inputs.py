@@ -155,7 +155,7 @@ def flip(x: Any, how: str, pattern: str = "RGGB") -> Any:
     Raises
     ------
     ValueError
-        If ``how`` or ``pattern`` is unknown.
+        If ``how`` or ``pattern`` is unknown, or ``x`` is a clip.
 
     Examples
     --------
@@ -167,6 +167,8 @@ def flip(x: Any, how: str, pattern: str = "RGGB") -> Any:
     """
     if how not in FLIPS:
         raise ValueError(f"how={how!r}: unknown; expected one of {', '.join(FLIPS)}")
+    if hasattr(x, "rows") or (isinstance(x, Mapping) and "frame" in x):
+        raise ValueError("x: is a clip, whose motion is not flipped; expected a pair, or its arrays of mosaics")
     if isinstance(x, Mapping):
         pattern = FILTERS[int(x["development"].pattern)]
         is_packed = x["noisy"].ndim == 3

@@ -213,7 +213,7 @@ class RawPairs(PairTable):
         self.path = any_path(path) if isinstance(path, DatasetPath) else tuple(map(any_path, path))
         targets = sorted(set().union(*(dataset.targets for dataset in self._datasets)))
         if inputs is not None and len(targets) > 1:
-            problem = f"the datasets differ in targets ({' and '.join(targets)})"
+            problem = f"pairs differ in targets ({' and '.join(targets)})"
             expected = "expected the same in all; use inputs=None, or ug.RawClips for bursts"
             raise ConfigError(f"RawPairs: inputs={inputs!r}: {problem}; {expected}")
 

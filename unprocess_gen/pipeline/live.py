@@ -28,7 +28,7 @@ from unprocess_gen.core.sequences import Recent, first_of
 from unprocess_gen.core.source import Source
 from unprocess_gen.core.targets import LINEAR_RGB, TARGETS
 from unprocess_gen.dataset.clips import Clip, clip_item, stackable_clip
-from unprocess_gen.dataset.columns import Value
+from unprocess_gen.dataset.columns import Row, Value, flatten
 from unprocess_gen.dataset.dataset_json import recorded_places
 from unprocess_gen.dataset.development import development_parameters
 from unprocess_gen.dataset.inputs import Options
@@ -118,7 +118,8 @@ class LivePairs(PairTable):
         Further arrays. ``"variance"``: expected variance of the noise at each site, from row and clean frame.
         ``"noise_std"``: `noise_std` of the noisy frame. ``"srgb"``: pixels of the source. ``"linear_rgb"``: light
         before the mosaic, float32 [H, W, 3], 0 at black and 1 at white. The first two are float32, in DN² and DN, or
-        in units of white with ``inputs``.
+        in units of white with ``inputs``. Bursts have ``"linear_rgb"`` only, [s H, s W, 3] of the first frame; always
+        if a dataset stores it.
     flip, inputs, noise_map, rows, clip_black
         As for `RawPairs`: random flips in each epoch, and dicts of network inputs.
 
@@ -182,6 +183,8 @@ class LivePairs(PairTable):
         self._rules = [burst_rule(source.settings.config.source) for source in self._datasets]
         if any(rule is not None for rule in self._rules):
             self._numbers = self._first_frames(flip, {*targets})
+            if any(LINEAR_RGB in source.settings.config.output.targets for source in self._datasets):
+                targets = [LINEAR_RGB]  # epoch 0 is what is stored
         self._redraw, self._patches, self._targets = redraw, patches, tuple(targets)
         most = (NEW_CROPS if redraw == "all" else KEPT_CROPS), NEW_CROPS
         self._kept: list[Recent[tuple[Any, ...], tuple[Plan, CropMaker]]] = [*map(Recent, most)]
@@ -215,7 +218,7 @@ class LivePairs(PairTable):
         if (rule := self._rules[place]) is not None:
             step = noisy_frames(source.settings.config)
             images = [source.image(number_in_dataset + frame * step) for frame in range(rule.frames)]
-            return self._burst(source, rule, images, srgb, epoch, crop)
+            return self._burst(source, rule, images, srgb, epoch, crop, number)
         plan, patch, make = self._prepared(place, image, srgb, epoch, number)
         options, words = self._options, (0, 0)
         if options.side is not None:
@@ -248,13 +251,14 @@ class LivePairs(PairTable):
         return np.concatenate(firsts)
 
     def _burst(
-        self, source: LiveSource, rule: BurstRule, images: Sequence[LiveImage], srgb: Srgb, epoch: int, crop: int
-    ) -> Any:
+        self, source: LiveSource, rule: BurstRule, images: Sequence[LiveImage], srgb: Srgb, epoch: int, crop: int,
+        number: int,
+    ) -> Any:  # fmt: skip
         """Generate a burst: a `Clip`, or a dict with inputs."""
         settings, options, patch = source.settings, self._options, images[0].patch
         plans: Sequence[Plan] = [image.plan for image in images]
         if epoch and self._redraw == "all":
-            facts = facts_of_burst(rule, _facts_of(settings, images[0], srgb))
+            facts = facts_of_burst(rule, self._facts_of(number, settings, images[0], srgb))
             plans = redrawn_burst(settings, rule, plans, facts, epoch)
             plans, patch = moved_burst(settings, rule, plans, patch, (srgb.shape[0], srgb.shape[1]), epoch)
         part = patch
@@ -265,12 +269,14 @@ class LivePairs(PairTable):
             part = Patch(options.side, options.side, patch.patch, patch.patch_y + y, patch.patch_x + x)
         self_test.check(plans[:1])
         made, targets = burst_pairs(settings, srgb, plans, patch, part, epoch, self._targets)
-        samples = []
+        samples, columns = [], list[Row]()
         for image, (plan, pair) in zip(images, made, strict=True):
             known = partial(Pair, pair.clean, pair.noisy, pair.counts)
             row: Any = LiveRow(partial(image.row, plan, epoch, part, known))
             samples.append(LiveSample(pair.clean, pair.noisy, row, source.name, targets))
-        return clip_item(samples, options)
+            assert plan.motion is not None
+            columns.append({**flatten(plan.motion), **noise_columns(plan), "frame": plan.place.frame})
+        return clip_item(samples, options, columns)
 
     def _part(self, numbers: NDArray[np.int64]) -> Self:
         part = super()._part(numbers)
@@ -322,13 +328,20 @@ class LivePairs(PairTable):
         """Draw the plan of an epoch, without the epoch's number."""
         plan = image.plan
         if self._redraw == "all":
-            facts = self._facts.get(number)
-            if facts is None:
-                facts = self._facts.keep(number, _facts_of(settings, image, srgb))
+            facts = self._facts_of(number, settings, image, srgb)
             plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
         if plan.dark and settings.dark_frames is not None:
             plan = next_dark_frame(plan, settings.dark_frames, epoch)
         return plan
+
+    def _facts_of(self, number: int, settings: PairSettings, image: LiveImage, srgb: Srgb) -> Facts | None:
+        """Facts about the pixels of an image from which its parameters are redrawn; computed once a pair or burst."""
+        plan, facts = image.plan, self._facts.get(number)
+        if facts is None:
+            parts, stated, profile = parts_of(plan), stated_source(plan), plan.source.profile
+            computed = facts_for(settings.config, srgb, image.source.frames, parts, stated, profile)
+            facts = self._facts.keep(number, computed)
+        return facts
 
 
 class LiveRow(Mapping[str, Value]):
@@ -355,13 +368,6 @@ class LiveRow(Mapping[str, Value]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (self._row,)
-
-
-def _facts_of(settings: PairSettings, image: LiveImage, srgb: Srgb) -> Facts | None:
-    """Facts about the pixels of an image from which its parameters are redrawn."""
-    plan = image.plan
-    parts, stated, profile = parts_of(plan), stated_source(plan), plan.source.profile
-    return facts_for(settings.config, srgb, image.source.frames, parts, stated, profile)
 
 
 def _live_sources(dataset: Any, root: str | None, split: str | None) -> list[LiveSource]:
