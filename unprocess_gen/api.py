@@ -459,9 +459,6 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
             "make_pair returns complete frames; expected null; cut the arrays of the pair at even rows and columns"
         )
         raise refusal("source.patch", config.source.patch, problem)
-    if config.source.burst is not None:
-        problem = "make_pair returns one pair; expected null; give the config to ug.generate or ug.LivePairs"
-        raise refusal("source.burst", config.source.burst, problem)
     source = dataclasses.replace(config.source, root=None, list=None, limit=None, clips=False, include=("*",))
     config = dataclasses.replace(config, source=source, seed=config.seed if seed is None else seed)
     validate_config(config)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from helpers.commands import RunMain
 
 import unprocess_gen as ug
 from unprocess_gen.core.errors import ConfigError
@@ -50,3 +52,16 @@ def test_wrong_bursts_are_refused(settings: list[str], sentence: str) -> None:
 def test_other_bursts_are_not(settings: list[str]) -> None:
     burst = ug.load_config(settings).source.burst
     assert burst is None or burst["frames"] in (1, 7)
+
+
+@pytest.mark.parametrize("verb", ["accuracy", "explore"])
+def test_verbs_of_single_frames_refuse_bursts(verb: str, run_main: RunMain) -> None:
+    done = run_main(verb, ONE, *(["--no-browser"] if verb == "explore" else []))
+    assert done.code == 2
+    assert f"{verb} makes single frames; expected null" in done.err and done.err.count("\n") == 1
+
+
+def test_functions_of_single_frames_refuse_bursts() -> None:
+    for call in (lambda config: ug.CameraNoise(config), lambda config: ug.make_pair(np.ones((8, 8, 3), "u1"), config)):
+        with pytest.raises(ConfigError, match=r"source.burst=.* makes single frames; expected null"):
+            call(ug.load_config([ONE]))

@@ -121,11 +121,14 @@ def check_overrides(config: Config, overrides: Iterable[str]) -> None:
 
 
 def require_kind(source: SourceConfig, caller: str, *kinds: str) -> None:
-    """Raise ConfigError if ``caller`` cannot use sources of this kind."""
+    """Raise ConfigError if ``caller`` cannot use sources of this kind, or bursts."""
     if source.kind not in kinds:
         uses, allowed = " or ".join(KINDS[kind] for kind in kinds), " or ".join(kinds)
         problem = f"{caller} works on pixels of {uses}; expected {allowed}; generate a dataset of {KINDS[source.kind]}"
         raise refusal("source.kind", source.kind, f"{problem} instead")
+    if source.burst is not None:
+        problem = f"{caller} makes single frames; expected null; give the config to ug.generate or ug.LivePairs"
+        raise refusal("source.burst", source.burst, problem)
 
 
 def _check_raw_levels(config: Config) -> None:
