@@ -9,7 +9,7 @@ EXIT_CODES = {
     "0": "done",
     "1": "a bug: stderr has a traceback",
     "2": "wrong usage or settings: one line names the key, its value and what is expected; nothing was written",
-    "3": "finished, but more sources failed than source.max_failed allows; or the method of score failed",
+    "3": "finished, but more sources failed than source.max_failed allows; or a method failed that score called",
     "4": "a dataset is damaged, or differs from what it records",
     "5": "a system error (disk full, output deleted), a source that changed, or parts that are missing",
     "11": "another run holds this output",

@@ -19,7 +19,7 @@ METHOD = "noisy, gaussian, non_local_means, or a function of (noisy, row): modul
     flag("--method", "NAME", METHOD, required=True),
     KEYS,
     flag("--split", "NAME", "only pairs of this split"),
-    flag("--real", "FOLDER", "score the pairs of a camera that FOLDER/pairs.csv lists, in place of DIR", local),
+    flag("--real", "FOLDER", "score the recorded pairs that FOLDER/pairs.csv lists, in place of DIR", local),
     flag("--to", "FOLDER", "write score.json and score.csv to FOLDER; default: scores/DIR-METHOD", local),
     flag("--against", "JSON", "compare with the score.json of another method, pair by pair", local),
     keys={"n_jobs=N": "number of worker processes, 1 by default; -1: all cores"},
@@ -36,7 +36,7 @@ def score(call: Call) -> int:
     from unprocess_gen.reports.scoring.scoring import compare, read_scores, score_items, score_table, write_scores
 
     if [call.place, call.real].count(None) != 1 or (call.real and (call.keys or call.split)):
-        raise ConfigError("score: expected DIR, or --real FOLDER without --keys and --split")
+        raise ConfigError("score: expected either DIR, or --real FOLDER without --keys and --split")
     load_method(call.method, str(Path.cwd()))
     n_jobs = load_config([f"n_jobs={call.settings.get('n_jobs', '1')}"]).n_jobs
     name, made = str(call.place), Path("builds", str(call.place))

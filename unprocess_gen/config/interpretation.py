@@ -188,7 +188,7 @@ RADIANS_PER_DEGREE = math.pi / 180
 
 @dataclass(frozen=True, slots=True)
 class BurstRule:
-    """Frames of a burst, and the largest motion of a frame: pixels and degrees; ``ev`` repeats."""
+    """Settings of bursts: the largest motion in pixels of the picture and in degrees, exposures ``ev`` in stops."""
 
     frames: int = 14
     shift: float = 24.0
@@ -199,7 +199,7 @@ class BurstRule:
 
     @property
     def tile(self) -> int:
-        """Pixels of the picture along a 2x2 tile of the sensor."""
+        """Side of a 2 x 2 tile of the sensor in pixels of the picture."""
         return 2 * self.downscale
 
     def stops(self, frame: int) -> float:
@@ -207,10 +207,10 @@ class BurstRule:
         return self.ev[frame % len(self.ev)]
 
     def margin(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns around a target of these sides that its frames may show."""
+        """Rows and columns of the picture that frames may show beyond a target of these sides."""
         angle, before = RADIANS_PER_DEGREE * self.rotation_deg, 0 if self.phase == "centre" else self.downscale - 1
         sides, reach = (height + before, width + before), self.shift + before / 2
-        # at least sin a and 1 - cos a times half of each side
+        # upper bounds of sin a and 1 - cos a, times half of each side
         turned, rest = (tuple(factor * side / 2 for side in sides) for factor in (angle, angle * angle / 2))
         spare = 1 if self.rotation_deg else 0
         return math.ceil(reach + rest[0] + turned[1]) + spare, math.ceil(reach + rest[1] + turned[0]) + spare

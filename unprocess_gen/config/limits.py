@@ -149,7 +149,7 @@ PATCH = Limit(
     f"{MIN_PATCH} to {MAX_PATCH} pixels, count is 1 to {MAX_RANDOM_PATCHES}"
 )
 MAX_BURST_FRAMES = 100
-"""Most frames of a burst: keys have two digits for them."""
+"""Largest number of frames of a burst: keys have two digits for it."""
 
 BURST_KEYS: dict[str, Limit] = {
     "frames": Integers(1, MAX_BURST_FRAMES),

@@ -124,10 +124,10 @@ class SourceConfig(Group):
     patch
         cut images into square patches, after downscaling
     burst
-        make a burst of each patch or picture: frames of a moving camera with 1 / downscale of the resolution, to whose
-        pixels patch then refers; shift in pixels and rotation_deg are the largest motion of a frame, around the centre
-        of the patch; frame k has the exposure time times 2^ev, the k-th of the list, which repeats; ev above 0 needs
-        linear sources, because photographs hold nothing above white
+        make a burst of each patch or picture: frames of a moving camera at 1 / downscale of the resolution; the largest
+        motion of a frame is shift, in pixels of the picture, and rotation_deg about the centre of the patch; exposure
+        times are multiplied by 2^ev, where ev is a list that repeats; an ev above 0 needs linear sources; phase places
+        the centres of pixels
     own_noise
         noise of raw sources themselves: subtract lowers the variance that a profile with two numbers adds by that of
         the source, down to 0; the column zero_variance counts the sites where the source has as much or more

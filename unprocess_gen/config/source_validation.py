@@ -64,8 +64,8 @@ def _check_burst(config: Config) -> None:
         raise refusal("source.kind", "raw", f"{problem}; or set source.burst=null")
     if source.clips or source.downscale != 1:
         key, value = ("clips", True) if source.clips else ("downscale", source.downscale)
-        instead = "its frames are a clip" if source.clips else "use source.burst.downscale"
-        raise refusal(f"source.{key}", value, f"source.burst has frames of its own resolution: {instead}; remove it")
+        instead = "expected false" if source.clips else "expected 1; use source.burst.downscale"
+        raise refusal(f"source.{key}", value, f"frames of source.burst are simulated from one picture; {instead}")
     for name, length in (("side", patch.side), ("stride", patch.stride)) if patch else ():
         if length % rule.tile:
             problem = (

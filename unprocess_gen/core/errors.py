@@ -113,7 +113,7 @@ class FilteredError(SourceError):
 def refused_files(place: str, advice: str = "") -> Iterator[None]:
     """Raise each SourceError of the body as ConfigError: ``place``, its text and ``advice``.
 
-    Keys of ``source.raw`` are mentioned without the group, as tables of files have columns of these names.
+    Keys of ``source.raw`` lose the group, because they are names of columns in tables of files.
     """
     try:
         yield

@@ -26,10 +26,10 @@ def delimiter_of(line: str, column: str) -> str | None:
 def read_table(
     path: Path, required: Collection[str], optional: Collection[str], numbers: Collection[str] = ()
 ) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the place of each line of a CSV file, for messages, and its cells by column, without spaces at their ends.
+    """Yield for each line of a CSV file its place, for messages, and its cells by column, stripped of blanks.
 
-    ``numbers`` are columns that may have decimal commas between semicolons. ConfigError unless the header has the
-    required columns and no others than these and the optional ones.
+    ``numbers`` are columns that may have decimal commas between semicolons. ConfigError if the header misses a
+    required column, or has a column that is neither required nor optional.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -57,7 +57,7 @@ def read_table(
 
 
 def record_of_cells(cells: Mapping[str, Any], kind: type[Record], place: str) -> Record:
-    """Convert the cells of a line to a typed record; empty ones have its defaults. ConfigError names the cell."""
+    """Convert the cells of a line to a record; empty cells get its defaults. ConfigError names a wrong cell."""
     try:
         return check_record({name: cell for name, cell in cells.items() if cell != ""}, kind, strict=False)
     except ValueError as error:

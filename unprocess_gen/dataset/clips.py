@@ -38,7 +38,7 @@ class Clip(_Frames):
     dataset : str
         Name of the dataset, as in `Sample`.
     targets : dict of str to ndarray
-        Stored targets by name, with T as first axis; of a burst those of its first frame.
+        Stored targets by name, with T as first axis; for a burst, the targets of its first frame.
     """
 
     dataset: str
@@ -61,7 +61,7 @@ class Clip(_Frames):
     def target(self) -> NDArray[Any] | None:
         """Stored ``linear_rgb``, or None.
 
-        Of a burst, float32 [s H, s W, 3] with s = ``burst_downscale``: the light of its first frame before it was
+        For a burst, float32 [s H, s W, 3] with s = ``burst_downscale``: the light of its first frame before it was
         averaged, exposed and clipped.
         """
         return self.targets.get(LINEAR_RGB)
@@ -78,9 +78,9 @@ MOTION = "motion_yy", "motion_yx", "motion_y", "motion_xy", "motion_xx", "motion
 
 
 def clip_item(samples: Sequence[Any], options: Options, columns: Sequence[Row] = ()) -> Any:
-    """Convert the frames of a clip, which have been cut, to a `Clip`, or with ``inputs`` to a dict of arrays [T, …].
+    """Convert the cropped frames of a clip to a `Clip`, or with ``inputs`` to a dict of arrays [T, …].
 
-    Frames of a burst have ``motion`` [T, 6], and the target of the first one. ``columns`` are those of the rows that
+    The dict of a burst has ``motion`` [T, 6], and the target of the first frame. ``columns`` are those of the rows that
     this takes; without them, it reads the rows.
     """
     columns, first = columns or [sample.row for sample in samples], samples[0]
@@ -119,7 +119,7 @@ def _stacked(items: Sequence[Any]) -> Any:
 
 
 def stackable_clip(clip: Any) -> Any:
-    """Item that PyTorch's default ``collate_fn`` stacks: a named tuple for a clip; a dict is unchanged."""
+    """Convert a clip to a named tuple that PyTorch's default ``collate_fn`` stacks; a dict is unchanged."""
     if isinstance(clip, dict):
         return clip
     rows = [stackable_row(row, {}) for row in clip.rows]
@@ -129,9 +129,9 @@ def stackable_clip(clip: Any) -> Any:
 class RawClips:
     """Read the clips of a dataset by number: a map-style dataset.
 
-    ``clips[i]`` is a `Clip`. Bursts are clips whose ``target`` is that of the first frame. A clip with several noise
-    levels, draws or patches is an item for each of them, in the order of the manifest. Frames that failed are missing;
-    the column ``frame`` of the rows numbers the others. An instance can be pickled and forked as `RawPairs`.
+    ``clips[i]`` is a `Clip`. A burst is a clip whose ``target`` is the light of its first frame. A clip with several
+    noise levels, draws or patches is an item for each of them, in the order of the manifest. Frames that failed are
+    missing; the column ``frame`` of the rows numbers the others. An instance can be pickled and forked like `RawPairs`.
 
     Parameters
     ----------

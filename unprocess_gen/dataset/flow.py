@@ -14,7 +14,7 @@ from unprocess_gen.simulation.plan import Motion
 
 
 def flow(rows: Sequence[Row] | Mapping[str, Any], k: int, inverse: bool = False) -> NDArray[np.float64]:
-    """Compute the optical flow between the first frame of a burst and another one, from their motion.
+    """Compute the optical flow between the first frame of a burst and another frame, from their motion.
 
     Parameters
     ----------
@@ -22,9 +22,9 @@ def flow(rows: Sequence[Row] | Mapping[str, Any], k: int, inverse: bool = False)
         Manifest rows of the burst's frames, such as ``rows`` of a `Clip`; or ``row`` of an item with ``inputs`` and
         ``rows=True``, also as tensors.
     k : int
-        Number of the other frame, its column ``frame``.
+        Number of the other frame, from 0: its column ``frame``.
     inverse : bool
-        Flow from frame k to frame 0 instead.
+        Compute the flow from frame k to frame 0 instead.
 
     Returns
     -------
@@ -39,8 +39,8 @@ def flow(rows: Sequence[Row] | Mapping[str, Any], k: int, inverse: bool = False)
 
     Notes
     -----
-    High-resolution pixel p of frame k shows the position A p + b of the target (``motion_*`` of its row), and frame 0
-    the position p. So the flow from frame 0 is the inverse of this map in the pixels of the frames::
+    At the resolution of the target, pixel p of frame k shows the position A p + b of the target (``motion_*`` of its
+    row). Frame 0 shows the position p. The flow from frame 0 is the inverse of this map, in pixels of the frames::
 
         frame 0                      frame k
         +-----------+                +-----------+

@@ -20,12 +20,12 @@ def patch_key(index: int, patch: int, several: bool) -> str:
 
 
 def frame_key(sample: str, frame: int) -> str:
-    """Key of a frame of a burst: the burst's, with for example ``-f02``."""
+    """Key of a frame of a burst: the key of the burst, then for example ``-f02``."""
     return f"{sample}-f{frame:02d}"
 
 
 def burst_key(key: str) -> str:
-    """Key of the burst to which a frame belongs, without its number, level and draw."""
+    """Key of the burst of a frame: the key of the frame without number, level and draw."""
     return key.partition("-f")[0]
 
 

@@ -90,7 +90,7 @@ class Origin(PlanRecord, frozen=True, kw_only=True):
         "EXIF orientation that was applied to the source, 1 to 8", Integers(1, 8))] = None
     shard: Annotated[int, Field("number of the shard", Integers(0, 10**9), empty_if="")]
     clip: Annotated[str, Field(
-        "name of the clip; of a burst, the key of its source or patch", ANY_TEXT, needs=CLIPS)] = ""
+        "name of the clip; for a burst, the key of its source or patch", ANY_TEXT, needs=CLIPS)] = ""
     # fmt: on
 
 

@@ -87,8 +87,8 @@ class LivePairs(PairTable):
     the patch is simulated. An instance can be pickled and forked. ``live[epoch, "00000003"]`` is the pair with this
     key, and a slice is a `LivePairs` of those pairs. Both need items that are pairs (``patches=1``).
 
-    Items of ``source.burst`` are bursts: a `Clip`, or with ``inputs`` a dict as `RawClips` gives it. Their keys are
-    those of the first frames.
+    With ``source.burst``, an item is a burst: a `Clip`, or with ``inputs`` a dict like those of `RawClips`. Its key is
+    the key of its first frame.
 
     Parameters
     ----------
@@ -240,10 +240,10 @@ class LivePairs(PairTable):
         return options.item(sample, columns, words, partial(development_parameters, plan), epoch=0)
 
     def _first_frames(self, flip: bool, targets: set[str]) -> NDArray[np.int64]:
-        """Numbers of the pairs that are items: of a burst the first, at each level and draw."""
+        """Numbers of the pairs that are items; for a burst, of its first frame at each level and draw."""
         if flip or targets - {LINEAR_RGB}:
             problem = "flip=True" if flip else f"targets={sorted(targets)}"
-            raise ConfigError(f"LivePairs: {problem}: bursts have the target {LINEAR_RGB} and no flips; leave it out")
+            raise ConfigError(f"LivePairs: {problem}: not possible for bursts; expected no flip, and only {LINEAR_RGB}")
         firsts = []
         for source, rule, start in zip(self._datasets, self._rules, self._starts, strict=False):
             step, numbers = noisy_frames(source.settings.config), np.arange(len(source))

@@ -20,7 +20,7 @@ from unprocess_gen.sources.patches import list_patches
 def redrawn_burst(
     settings: PairSettings, rule: BurstRule, plans: Sequence[Plan], facts: Facts | None, epoch: int
 ) -> list[Plan]:
-    """Draw the parameters of a burst's frames for an epoch, once for each exposure; their motion is not drawn."""
+    """Draw the parameters of a burst's frames for an epoch, once for each exposure, except motion."""
     drawn = [redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch) for plan in plans[: len(rule.ev)]]
     return [drawn[k % len(drawn)].replace(place=plan.place, dark=plan.dark) for k, plan in enumerate(plans)]
 
@@ -39,7 +39,7 @@ def burst_pairs(
 ) -> tuple[list[tuple[Plan, Pair]], dict[str, Any]]:
     """Simulate a crop of a burst in an epoch: each frame with its plan, for rows, and the target if it is named.
 
-    The motion of these plans is that of the crop: its target begins at the crop.
+    The motion of these plans is relative to the crop, whose target begins at the crop.
     """
     motions = [plan.motion for plan in plans if plan.motion]
     light = BurstLight(srgb, plans[0], motions, patch, crop)

@@ -70,7 +70,7 @@ class PlannedImage:
                 yield sample.patch, plan, pair
 
     def samples(self) -> Iterator[Sample]:
-        """List the samples of every patch, in the order of the manifest: frames of bursts, or one sample a patch."""
+        """Yield samples in the order of the manifest: the frames of each burst, or one sample for each patch."""
         rule = None if self.config is None else burst_rule(self.config.source)
         for patch in self.patches:
             if self.plans[0].motion is None:

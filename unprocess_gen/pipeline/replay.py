@@ -124,7 +124,7 @@ class PairRegenerator:
         image = PlannedImage(photograph.srgb, (plan,), (patch,), dark_folder=self._dark_pixels(plan))
         try:
             sample = next(image.samples())
-        except ValueError as error:  # of an edited manifest, whose motion leads outside
+        except ValueError as error:  # an edited manifest, whose motion leads outside
             raise DamageError(str(error)) from error
         pair = next(sample.pairs())
         return {"clean": pair.clean, "noisy": pair.noisy, **sample.targets(names, pair)}

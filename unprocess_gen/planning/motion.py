@@ -9,7 +9,7 @@ from unprocess_gen.simulation.kernels.draws import draws
 from unprocess_gen.simulation.plan import Motion
 
 NUMBERS_OF_PATCH = 2**12
-"""Numbers that a word of the random counter has for levels, and for draws: patches use both."""
+"""Levels, and draws, that a word of the random counter numbers: motion numbers patches by both."""
 
 
 def still(rule: BurstRule) -> Motion:
@@ -33,7 +33,7 @@ def draw_motion(rule: BurstRule, stream_key: int, patch: Patch, frame: int, epoc
 
 
 def cosine_and_sine(angle: float) -> tuple[float, float]:
-    """Sum the power series of both, for angles up to 45 degrees: libm's last bit differs between machines."""
+    """Compute both by power series, for angles up to 45 degrees: libm's last bit differs between machines."""
     cosine, sine, term = 1.0, 0.0, 1.0
     for n in range(1, 20, 2):
         term *= angle / n

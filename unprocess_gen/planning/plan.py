@@ -264,7 +264,7 @@ class Planner:
     ) -> list[tuple[Plan, Selection | None]]:
         """Draw the noise of an image at the level of a place, for each exposure of a burst.
 
-        All frames of a burst have the effects that one of them calls for.
+        All frames of a burst get each effect that one of them needs.
         """
         plans = [self.plan(image, place, dark) for image in images]
         selections = [selection for _, selection in plans if selection is not None]
@@ -324,7 +324,7 @@ class Image(NamedTuple):
     facts: Facts | None
     signals: SignalRange | None
     dark_frames: DarkFrames | None
-    stops: float = 0.0  # of the exposure time, against that of the scene
+    stops: float = 0.0  # of the exposure time, relative to the scene
 
 
 class TwoNumberLevel:

@@ -86,7 +86,7 @@ def grey_tiles(raw: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def moved(picture: NDArray[np.float32], by: Float) -> NDArray[Any]:
-    """Sample a picture at each pixel plus a flow [2, H, W]; NaN outside of it."""
+    """Sample a picture at each pixel plus a flow [2, H, W]; NaN outside the picture."""
     y, x = np.indices(picture.shape, dtype=np.float32) + by
     return np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderValue=float("nan")))
 

@@ -55,7 +55,7 @@ MARK = "unprocess_gen"
 class SheetPair(NamedTuple):
     """The frames, row and plan of a pair, and its source pixels or the reason why they are missing.
 
-    ``base`` has the clean frame and row of the first frame of a burst, for its other frames.
+    ``base`` has the clean frame and row of the first frame of a burst; it is None for that frame and other pairs.
     """
 
     clean: MosaicArray
@@ -101,7 +101,7 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
 
 
 def _part_of_source(row: Row) -> Patch:
-    """Part of a source that a pair shows; of a burst, the target."""
+    """Part of a source that a pair shows; for a burst, its target."""
     patch, step = patch_from_row(row), int(row["burst_downscale"] or 1)
     return Patch(patch.width * step, patch.height * step, patch.patch, patch.patch_y * step, patch.patch_x * step)
 

@@ -1,4 +1,4 @@
-"""Simulate the frames of a burst: the light of one scene, moved and averaged for each frame, then pairs of it."""
+"""Simulate the frames of a burst: the light of one scene, moved and averaged for each frame, then its pairs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from unprocess_gen.simulation.reference import burst as reference
 
 
 class BurstLight:
-    """Light of the part of a picture that frames of a patch show; its frames and target.
+    """Light of the part of a picture that a burst shows, the light of its frames, and its target.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class BurstLight:
     Raises
     ------
     ValueError
-        If a frame shows what is outside of the picture.
+        If a frame shows what is outside the picture.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class BurstLight:
         return np.ascontiguousarray(self._light[y : y + self.crop.height * step, x : x + self.crop.width * step])
 
     def pairs(self, plans: Sequence[Plan], dark_pixels: DarkPixels | None = None) -> Iterator[Pair]:
-        """Simulate pairs of one frame, as `make_pairs`; their plans have its motion."""
+        """Simulate the pairs of one frame by `make_pairs`; all plans have the motion of the frame."""
         motion = plans[0].motion
         assert motion is not None
         return make_pairs(self.frame(motion), [plan.of_light for plan in plans], self.crop.origin, dark_pixels)

@@ -1,4 +1,4 @@
-"""Conditions under which manifests have columns: settings that fields of a plan depend on."""
+"""Declare the settings under which fields of a plan are columns of a manifest."""
 
 from fnmatch import fnmatch
 from typing import Any

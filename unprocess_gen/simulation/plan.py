@@ -352,33 +352,37 @@ class ScenePlan(PlanRecord, frozen=True):
 
 
 class Motion(PlanRecord, frozen=True):
-    """Place of a frame of a burst in the picture of its first frame, the target, and the resolution of the frames.
+    """Map from pixels of a burst's frame to the target, and the resolution of the frame.
 
-    High-resolution pixel (p, q) of the frame shows the position (motion_yy p + motion_yx q + motion_y, motion_xy p +
-    motion_xx q + motion_x) of the target; centres of pixels are integers.
+    The target is the light of the first frame at the resolution of the picture. At this resolution, pixel (p, q) of a
+    frame shows the row motion_yy p + motion_yx q + motion_y and the column motion_xy p + motion_xx q + motion_x of the
+    target. Centres of pixels are integers.
     """
 
     # fmt: off
     motion_yy: Annotated[float, Field(
-        "row in the target that a high-resolution pixel of a burst's frame shows: factor of the pixel's row", FINITE)]
-    motion_yx: Annotated[float, Field("the same row: factor of the pixel's column", FINITE)]
-    motion_y: Annotated[float, Field("the same row: of the pixel (0, 0)", FINITE, "high-resolution pixels")]
+        "factor of p in motion_yy p + motion_yx q + motion_y: the row of the target that pixel (p, q) of a burst's "
+        "frame shows, both at the resolution of the target", FINITE)]
+    motion_yx: Annotated[float, Field("factor of q in the row of the target, see motion_yy", FINITE)]
+    motion_y: Annotated[float, Field(
+        "row of the target that pixel (0, 0) shows, see motion_yy", FINITE, "pixels of the target")]
     motion_xy: Annotated[float, Field(
-        "column in the target that a high-resolution pixel of a burst's frame shows: factor of the pixel's row",
-        FINITE)]
-    motion_xx: Annotated[float, Field("the same column: factor of the pixel's column", FINITE)]
-    motion_x: Annotated[float, Field("the same column: of the pixel (0, 0)", FINITE, "high-resolution pixels")]
+        "factor of p in motion_xy p + motion_xx q + motion_x: the column of the target that pixel (p, q) of a burst's "
+        "frame shows, both at the resolution of the target", FINITE)]
+    motion_xx: Annotated[float, Field("factor of q in the column of the target, see motion_xy", FINITE)]
+    motion_x: Annotated[float, Field(
+        "column of the target that pixel (0, 0) shows, see motion_xy", FINITE, "pixels of the target")]
     burst_downscale: Annotated[int, Field(
-        "side of the squares of high-resolution pixels whose mean is a pixel of a burst's frame", Integers(1, 64),
-        "pixels")] = 1
+        "side s of the square of pixels of the target whose mean is a pixel of a burst's frame", Integers(1, 64),
+        "pixels of the target")] = 1
     burst_phase: Annotated[str, Field(
-        "centre of pixel i of a burst's frame in high-resolution pixels: centre is s i + (s - 1) / 2, corner is s i, "
-        "with s = burst_downscale", Choice("centre", "corner"))] = "centre"
+        "centre of pixel i of a burst's frame in pixels of the target, with s = burst_downscale: s i + (s - 1) / 2 for "
+        "centre, s i for corner", Choice("centre", "corner"))] = "centre"
     # fmt: on
 
     @property
     def pixel_offset(self) -> float:
-        """Offset of the first of the squares' pixels: 0, or with ``corner`` half a square less half a pixel before."""
+        """Offset of the first pixel of a square from s i: 0, or -(s - 1) / 2 with ``corner``."""
         return 0.0 if self.burst_phase == "centre" else -(self.burst_downscale - 1) / 2
 
 
@@ -572,7 +576,7 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
 
     @property
     def of_light(self) -> Self:
-        """Plan whose source is the light of the camera at the resolution of the sensor; without motion, this plan."""
+        """Plan whose source is light in camera RGB at the resolution of the frame; without motion, this plan."""
         if self.motion is None:
             return self
         return self.replace(motion=None, source=CAMERA_LIGHT, highlight="none")

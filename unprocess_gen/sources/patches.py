@@ -31,7 +31,7 @@ def list_patches(
 ) -> tuple[Patch, ...]:
     """List the patches of an image in order; random ones are elsewhere in each epoch.
 
-    Those of bursts are in pixels of their frames. None is closer to the edge of the picture than a frame may move.
+    Patches of bursts are in pixels of their frames. They keep the margin of `BurstRule` from the edges of the picture.
     """
     side = 2 if layout == PACKED else 1
     if burst is not None:

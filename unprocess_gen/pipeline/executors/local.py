@@ -113,7 +113,7 @@ def run_pool(work: Callable[[Any], Any], tasks: Iterable[Any], n_jobs: int, in_o
 
 
 def _work_in(folder: Path, work: Callable[[Any], Any], task: Any) -> Any:
-    """Work in a folder, because loky keeps workers that an earlier run started in another one."""
+    """Call ``work`` in a folder, because loky reuses workers that an earlier run started in another folder."""
     os.chdir(folder)
     return work(task)
 

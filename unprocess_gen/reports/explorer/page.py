@@ -168,7 +168,7 @@ class Page:
         self._update()
 
     def _zoom(self, label: str) -> None:
-        """Show the part that a button asks for."""
+        """Show the part that the label of a button names."""
         if self._shown is not None:
             (top, bottom), (left, right) = views.window_of(label, self._shown).tolist()
             self._x.update(start=left, end=right)

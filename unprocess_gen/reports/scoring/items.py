@@ -1,4 +1,4 @@
-"""Read what methods are scored on: frames and clips of datasets as mosaics in DN, with their rows."""
+"""Read the inputs of methods: frames and clips of datasets as mosaics in DN, with their rows."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from unprocess_gen.reports.scoring.metrics import Scores, frame_scores
 class Item(NamedTuple):
     """Input of a method, and what its output is compared with.
 
-    ``clean`` and ``noisy`` have a frame for each row; the method gets one frame and its row unless it is a clip. Each
-    frame is compared by ``compare``, and an output of the shape of ``target`` with the target. Rows have at least
-    ``key`` and ``source``; a ``group`` is optional. Other kinds of frames need another ``compare``.
+    ``clean`` and ``noisy`` have a frame for each row. Unless the item is a clip, the method gets the frame and its row.
+    ``compare`` compares each frame; an output of the shape of ``target`` is compared with the target. Rows have at
+    least ``key`` and ``source``; ``group`` is optional.
     """
 
     dataset: str
@@ -51,7 +51,7 @@ def dataset_items(folder: AnyPath, keys: str | None = None, split: str | None = 
     folders = {folder_name(dataset): dataset for dataset in dataset_folders(folder)}
     for dataset in [*folders.values()] or [folder]:
         if not (dataset / "dataset.json").exists():
-            advice = "run the command that began it again, or gen-dataset merge after parts"
+            advice = "rerun its command, or run gen-dataset merge after parts"
             raise ConfigError(f"score: {dataset}: is not finished; expected a dataset.json; {advice}")
     chosen = {name: select_pairs(dataset / "manifest.csv", keys) for name, dataset in folders.items() if keys}
     wanted = {(name, row["key"]) for name, selected in chosen.items() for row in selected.rows.values()}
@@ -73,7 +73,9 @@ def _item(samples: Sequence[Sample]) -> Item:
     rows, target = [sample.row for sample in samples], samples[0].targets.get(LINEAR_RGB)
     frames = [[mosaic_dn(frame, row) for frame in sample[:2]] for sample, row in zip(samples, rows, strict=True)]
     if len({clean.shape for clean, _ in frames}) > 1:
-        raise ConfigError(f"score: clip {rows[0]['clip']} has frames of several sizes; expected one; choose others")
+        raise ConfigError(
+            f"score: clip {rows[0]['clip']} has frames of several sizes; expected one size; choose other clips"
+        )
     height, width = (side // 2 * 2 for side in frames[0][0].shape)
     clean, noisy = (np.stack(part)[:, :height, :width] for part in zip(*frames, strict=True))
     is_burst = bool(rows[0].get("burst_downscale"))

@@ -1,8 +1,8 @@
 """Compare frames with clean ones by PSNR and SSIM: raw frames in DN, developed frames, and scene-linear pictures.
 
-Definitions for users: ``docs/guides/score.md``. A score is None where it is not defined: the PSNR of equal values or
-of none, and the SSIM of planes that are smaller than its window. OpenCV and libm may round the last bit in another way
-on another processor, so scores are rounded before they are used (`scoring.DIGITS`).
+Definitions for users: ``docs/guides/score.md``. Why scores are rounded (`scoring.DIGITS`): ``docs/design/reports.md``.
+A score is None if it is not defined: the PSNR of equal values or of none, and the SSIM of planes that are smaller than
+its window.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def psnr(squares: Float, peak: float) -> float | None:
 
 
 def ssim(x: Float, y: Float) -> float:
-    """Structural similarity of two planes whose peak is 1: the mean over the windows that lie inside."""
+    """Structural similarity of two planes whose peak is 1: the mean over the windows inside the plane."""
     inside, side = slice(WINDOW // 2, -(WINDOW // 2)), (WINDOW, WINDOW)
     moments = (cv2.GaussianBlur(values, side, WINDOW_STD)[inside, inside] for values in (x, y, x * x, y * y, x * y))
     x_mean, y_mean, xx, yy, xy = moments

@@ -29,11 +29,7 @@ AS_CLEAN = {"exposure_ratio": 1.0, "iso": None, "exposure_s": None}
 
 @dataclass(frozen=True, slots=True)
 class RealPair:
-    """Line of ``pairs.csv``: names of the files, the group, and from ``scene`` on what not every line has.
-
-    Pairs of one ``scene`` depend on each other, without scenes those of one clean file. ``ratio`` is the exposure of
-    the clean frame divided by that of the noisy one.
-    """
+    """Line of ``pairs.csv``, explained in ``docs/guides/score_real_pairs.md``; cells from ``scene`` on are optional."""
 
     place: str
     folder: Path

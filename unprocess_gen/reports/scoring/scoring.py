@@ -1,7 +1,6 @@
-"""Score a method on frames: a record a frame, and means with intervals by ISO, exposure ratio, camera and level.
+"""Score a method on frames: a record for each frame, and means with intervals by ISO, exposure ratio, camera and level.
 
-Intervals are of 95 %, by bootstrap over sources: frames of one source, or of one clip, are drawn together. The draws
-are those of NumPy's `RandomState`, whose numbers never change.
+Definitions for users: ``docs/guides/score.md``. Reasons: ``docs/design/reports.md``.
 """
 
 from __future__ import annotations
@@ -127,7 +126,7 @@ def _interval(name: str, records: Sequence[Record]) -> dict[str, Any]:
     for record in (record for record in records if record.get(name) is not None):
         sources[record["source"]] += record[name], 1
     sums, random = np.array([*sources.values()]).reshape(-1, 2), np.random.RandomState(0)
-    draws = range(DRAWS if len(sums) > 1 else 0)  # one source says nothing about others
+    draws = range(DRAWS if len(sums) > 1 else 0)  # one source does not show how sources differ
     drawn = [sums[random.randint(0, len(sums), len(sums), np.int64)].sum(axis=0) for _ in draws]
     ends = np.quantile([total / count for total, count in drawn], (0.025, 0.975)) if drawn else (None, None)
     total, count = sums.sum(axis=0)
@@ -140,7 +139,7 @@ def _interval(name: str, records: Sequence[Record]) -> dict[str, Any]:
 
 
 def read_scores(file: Path, data: dict[str, Any]) -> dict[str, Any]:
-    """Read a ``score.json`` of the same datasets; ConfigError if it is none, or of others."""
+    """Read a ``score.json`` of the same datasets; ConfigError if the file is none, or has other pairs."""
     try:
         other = dict[str, Any](parse_json(file.read_bytes()))
         _named(other)

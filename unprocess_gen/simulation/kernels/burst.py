@@ -1,4 +1,4 @@
-"""Compute the light of a scene and of the frames of a burst; values are those of `reference.burst`.
+"""Compute the light of a scene and of the frames of a burst, with the values of `reference.burst`.
 
 A frame has s x s bilinear values for each pixel. One vector holds two neighbours, as they are in memory::
 
@@ -28,7 +28,7 @@ from unprocess_gen.simulation.reference.unprocess import dequantise
 
 
 def scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Normalised:
-    """Light of a scene in all three channels, as `reference.burst.scene_light`."""
+    """Compute the light of a scene in all three channels, with the values of `reference.burst.scene_light`."""
     isp, source, pixels = plan.isp, plan.source, _contiguous(dequantise(srgb, plan, origin))
     curves = None if source.is_linear else light_tables(source.profile, isp.tone, isp.gamma, last_code(pixels) + 1)
     per_channel, gray_mean = (
@@ -41,7 +41,7 @@ def scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Nor
 
 
 def _contiguous(pixels: Any) -> Any:
-    """Return an array of the one kind for which kernels are compiled: a view would be another type."""
+    """Return a contiguous array, the only type for which the kernels are compiled."""
     return pixels if type(pixels) is np.ndarray and pixels.flags.carray else np.array(pixels, order="C")
 
 
@@ -51,8 +51,8 @@ def _fill_scene(
 ) -> None:
     """Fill ``light`` from ``pixels``, both flat; ``curves`` are None for linear sources.
 
-    Both methods of highlights have a ``threshold``, of which at least one is infinite. Light that is not above it has a
-    mask of 0, with which it is multiplied by the gain.
+    ``thresholds`` are those of both methods of highlights; at least one is infinite. Light up to a threshold has the
+    mask 0, and is multiplied by the gain.
     """
     (matrix, gains), (threshold, gray_threshold) = colours, thresholds
     for n in range(0, pixels.size, 3):
@@ -82,7 +82,7 @@ _WEIGHTS = np.array([[1, 1, 1, 0, 0, 0, 0, 0], [-1, -1, -1, 1, 1, 1, 0, 0]], np.
 def frame_light(
     light: Normalised, motion: Motion, corner: tuple[int, int], first: tuple[int, int], shape: tuple[int, int]
 ) -> Normalised:
-    """Light of a frame of a burst or of a crop of it, as `reference.burst.frame_light`."""
+    """Compute the light of a frame, or of a crop of it, with the values of `reference.burst.frame_light`."""
     check_inside(light, motion, corner, first, shape)
     light, (y, x) = _contiguous(light), sample_places(motion, first, shape)
     rows = np.stack([motion.motion_yy * y, motion.motion_xy * y])
@@ -98,9 +98,10 @@ def frame_light(
 def _fill_frame(
     light: Normalised, tail: Normalised, rows: Float, columns: Float, origin: Any, sums: Normalised, out: Normalised
 ) -> None:
-    """Fill ``out``; positions are sums of products of A, in ``rows`` and ``columns``, and b.
+    """Fill ``out`` at the positions A p + b; ``rows`` and ``columns`` have the products of A.
 
-    ``origin`` has b, and row and column of the light. ``tail`` is the last eight elements of the light and zeros.
+    ``origin`` has b, then the row and column of ``light[0, 0]`` in the target. ``tail`` is the last eight elements of
+    the light, then zeros.
     """
     (height, width), count, step = light.shape[:2], columns.shape[1], columns.shape[1] // out.shape[1]
     y0, x0, first_row, first_column = origin
@@ -131,5 +132,5 @@ def _fill_frame(
 
 @inner
 def _pair(pixels: Pointer, end: Pointer, safe: int, start: int) -> Vector:
-    """Load two neighbours from element ``start`` on; from ``safe`` on, of the end of the light."""
+    """Load two neighbours from element ``start`` on; a ``start`` from ``safe`` on is loaded from ``end``."""
     return simd.load(pixels, start) if start < safe else simd.load(end, start - safe)

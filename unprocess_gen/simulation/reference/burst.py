@@ -104,7 +104,7 @@ def sample_places(motion: Motion, first: tuple[int, int], shape: tuple[int, int]
         Downscale s, and the phase: with ``corner``, samples are at -(s - 1) / 2 to (s - 1) / 2 from s·i, else from s·i
         on.
     first, shape : (int, int)
-        Those of `frame_light`.
+        As in `frame_light`.
 
     Returns
     -------
@@ -145,14 +145,14 @@ def check_inside(
 ) -> None:
     """Check that the light of a scene contains all positions of a frame, or of a crop.
 
-    Those of the four corners decide: in floating-point arithmetic, too, positions rise or fall along rows and columns.
+    The four corners decide: positions rise or fall along rows and columns, also in floating-point arithmetic.
 
     Parameters
     ----------
     light : ndarray of float32, [H, W, 3]
         Light of the scene.
     motion, corner, first, shape
-        Those of `frame_light`.
+        As in `frame_light`.
 
     Raises
     ------
