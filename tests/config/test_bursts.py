@@ -25,7 +25,7 @@ ONE = "source.burst={frames: 2}"
         (["source.burst=5"], "source.burst=5: expected null, or a mapping"),
         (["source.burst.frames=7"], "source.burst.frames=7: .*write source.burst={frames: 7}"),
         ([ONE, "source=raw", "source.root=."], "source.kind=raw: a burst needs all colours"),
-        ([ONE, "source.clips=true"], "source.clips=true: .*remove it"),
+        ([ONE, "source.clips=true"], "source.clips=true: .*expected false"),
         ([ONE, "source.downscale=2"], "source.downscale=2: .*use source.burst.downscale"),
         ([ONE, "source.patch=100"], "source.patch=100: side=100 .*expected a multiple of 8 pixels"),
         ([ONE, "source.patch=[grid,96,20]"], "stride=20 .*expected a multiple of 8 pixels"),

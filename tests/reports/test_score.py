@@ -228,7 +228,7 @@ def test_bad_methods_are_refused_in_one_line(
         (("DS", "--to", "DS/in"), "is inside the dataset"),
         (("DS", "--against", "no.json"), "no.json: .*No such file.*; expected a score.json"),
         (("DS", "n_jobs=0"), "n_jobs=0: expected"),
-        (("begun",), "begun: is not finished; expected a dataset.json; run the command"),
+        (("begun",), "begun: is not finished; expected a dataset.json; rerun its command"),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_line(

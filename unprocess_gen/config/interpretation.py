@@ -226,7 +226,7 @@ def burst_rule(source: SourceConfig) -> BurstRule | None:
     for name, value in burst.items():
         if name not in limits.BURST_KEYS:
             names, close = ", ".join(limits.BURST_KEYS), did_you_mean(str(name), limits.BURST_KEYS)
-            raise ConfigError(f"source.burst.{name}: no such key; source.burst has {names}{close}")
+            raise ConfigError(f"source.burst.{name}: no such key; expected one of {names}{close}")
         limit = limits.BURST_KEYS[name]
         if not limit.allows(value):
             raise refusal(f"source.burst.{name}", value, f"expected {limit}")

@@ -126,7 +126,7 @@ class SourceConfig(Group):
     burst
         make a burst of each patch or picture: frames of a moving camera at 1 / downscale of the resolution; the largest
         motion of a frame is shift, in pixels of the picture, and rotation_deg about the centre of the patch; exposure
-        times are multiplied by 2^ev, where ev is a list that repeats; an ev above 0 needs linear sources; phase places
+        times are multiplied by 2^ev, where ev is a list that repeats; an ev above 0 saturates photographs; phase places
         the centres of pixels
     own_noise
         noise of raw sources themselves: subtract lowers the variance that a profile with two numbers adds by that of

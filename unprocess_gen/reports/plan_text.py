@@ -154,7 +154,7 @@ def _burst_sentences(config: Config) -> list[str]:
     return [
         f"{counted(rule.frames, 'frame')} at 1/{rule.downscale} of the resolution, moved by up to {rule.shift:g} "
         f"pixels and {rule.rotation_deg:g} degrees{margin}; ev {exposures}",
-        "ev above 0 saturates photographs, which hold nothing above white; linear sources do" if above else "",
+        "ev above 0 saturates photographs, which contain no light above white; use source.kind=linear" if above else "",
     ]
 
 
