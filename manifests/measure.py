@@ -37,7 +37,7 @@ COLUMNS = tuple(f"{frame}_{domain}_{kind}" for frame in ("noisy", "denoised") fo
 
 
 def measure(dataset: Path) -> dict[str, float]:
-    """Return mean scores of a dataset by ``gen-dataset score``: of noisy frames, then of denoised ones."""
+    """Compute the mean scores of a dataset as ``gen-dataset score`` does: of noisy, then of denoised frames."""
     scored = [score_items(dataset_items(dataset), method)["all"] for method in METHODS]
     means = [scores[f"{domain}_{kind}"]["mean"] for scores in scored for domain in DOMAINS for kind in DIGITS]
     return dict(zip(COLUMNS, means, strict=True))

@@ -1,4 +1,4 @@
-"""Restore frames by simple methods: what ``gen-dataset score --method`` has by name, and examples to write others.
+"""Restore frames by simple methods, which ``gen-dataset score --method`` has by name; examples for others.
 
 A method is a function of a noisy mosaic in DN, [H, W], and its manifest row. For a clip it gets [T, H, W] and the list
 of rows. It returns an array of the same shape in DN.
@@ -29,7 +29,7 @@ def by_frame(restore: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
 
 
 def noisy(noisy: Any, row: Any) -> Any:
-    """Return the input, which scores the noise itself."""
+    """Return the input, to score the noise itself."""
     return noisy
 
 

@@ -1,8 +1,8 @@
-"""Compare bursts of the public generator's chain with those of this package, each with exact light.
+"""Compare bursts of the public generator, and those of this package, with exact light.
 
     python docs/experiments/bursts.py [--to RESULTS.json]
 
-Needs scikit-image (extra photos). The chain is written here from its description: NTIRE 2021, burst super-resolution.
+Needs scikit-image (extra photos). The generator is implemented from its description: NTIRE 2021, burst super-resolution.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def mosaic(rgb: Any) -> Any:
 
 
 def public_frame(light: Any, k: int, draws: Any) -> tuple[Any, Any, Any]:
-    """Return frame k of the public chain, with 8 bits and exactly, and the positions that its pixels show."""
+    """Return frame k of the public generator, with 8 bits and exactly, and the positions that its pixels show."""
     side = light.shape[0]
     turn, (y, x) = (draws.uniform(-DEGREES, DEGREES), draws.uniform(-SHIFT, SHIFT, 2)) if k else (0, (1.5, 1.5))
     matrix = np.vstack((cv2.getRotationMatrix2D((side / 2, side / 2), turn, 1), (0, 0, 1)))
@@ -128,20 +128,20 @@ def judge(frames: Any, exact: Any) -> dict[str, float]:
 
 
 def public_burst(light: Any, place: tuple[int, int], draws: Any) -> list[tuple[Any, Any, Any]]:
-    """Return the frames of a burst of the public chain, whose target begins at a place of a picture."""
+    """Return the frames of a burst of the public generator, whose target begins at a place of a picture."""
     top, left = place[0] - SHIFT, place[1] - SHIFT
     square = light[top : top + SIDE + 2 * SHIFT, left : left + SIDE + 2 * SHIFT]
     return [public_frame(square, k, draws) for k in range(FRAMES)]
 
 
 def align(frame: Any, flow: Any) -> Any:
-    """Read a frame [H, W] at each pixel plus its flow (y, x)."""
+    """Sample a frame [H, W] at each pixel plus its flow (y, x)."""
     y, x = np.indices(frame.shape) + flow
     return sample(frame[..., None], y, x)[..., 0]
 
 
 def rms(frames: Any, base: Any) -> float:
-    """Return the root mean square difference of frames from the first one, without their rims."""
+    """Return the root mean square difference of frames from the first one, without their borders."""
     rim = (..., slice(SIDE // 32, -SIDE // 32), slice(SIDE // 32, -SIDE // 32))
     return float(np.sqrt(np.mean((np.array(frames) - base)[rim] ** 2)))
 

@@ -1,4 +1,4 @@
-"""The flow of a burst is where another frame shows what the first one shows."""
+"""The flow of a burst leads to the place where another frame shows what the first frame shows."""
 
 from typing import Any
 
@@ -40,7 +40,7 @@ def test_flow_aligns_frames_of_a_smooth_scene(downscale: int, phase: str) -> Non
     scene = np.stack([np.sin(y) + np.cos(x)] * 3, axis=-1).astype(np.float32)
     frames = [frame_light(scene, motion, (-margin, -margin), (0, 0), (SIDE, SIDE)) for motion in motions]
     inside = slice(12, -12)  # beyond the largest flow
-    # bilinear light is off by w²/8 an axis with w = 1/4 a pixel, and OpenCV rounds places to 1/32 of a pixel
+    # bilinear light errs by w²/8 for each axis, with w = 1/4 for each pixel; OpenCV rounds places to 1/32 of a pixel
     tolerance = 2 / 16 / 8 + 2 / 4 / 64 + 0.005
     for k in (1, 2):
         aligned = sampled(frames[k], ug.flow(rows, k)) - frames[0]
@@ -52,7 +52,7 @@ def test_flow_aligns_frames_of_a_smooth_scene(downscale: int, phase: str) -> Non
 
 @pytest.mark.parametrize("phase", ["centre", "corner"])
 def test_both_frames_show_one_position_of_the_target(phase: str) -> None:
-    """Pixel i of a frame is centred on s i + (s - 1) / 2, with ``corner`` on s i: A p + b there is that of frame 0."""
+    """Flow agrees with A p + b at the centre of pixel i: s i + (s - 1) / 2, with ``corner`` s i."""
     rows, motions = burst(downscale=3, phase=phase, rotation_deg=20.0)
     centre = 1 if phase == "centre" else 0
     at = np.indices((SIDE, SIDE))
@@ -64,7 +64,7 @@ def test_both_frames_show_one_position_of_the_target(phase: str) -> None:
 
 
 def test_a_point_moves_by_the_flow() -> None:
-    """A point at a high-resolution pixel is in frame k at its place in frame 0 plus the flow."""
+    """The place of a point in frame k is its place in frame 0 plus the flow."""
     rows, motions = burst(downscale=1, shift=5.0, rotation_deg=3.0)
     margin, point = 32, (21, 15)
     scene = np.zeros((SIDE + 2 * margin,) * 2 + (3,), np.float32)

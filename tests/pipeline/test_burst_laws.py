@@ -18,7 +18,7 @@ SIDE = 96
 
 
 def burst_of(light: np.ndarray, folder: Path, *settings: str) -> Any:
-    """Make a burst of a gray picture of light at the camera."""
+    """Make a burst of a gray picture in camera RGB."""
     folder.mkdir(exist_ok=True)
     np.save(folder / "light.npy", np.repeat(light[..., None], 3, axis=2).astype(np.float32))
     fixed = "source.kind=linear", "source.primaries=camera", "output.dtype=float32", "sensor.clip=none", "n_jobs=1"
@@ -34,7 +34,7 @@ def test_flow_returns_frames_within_the_interpolation_error(form: Any, tmp_path:
     light, curvature = 0.5 + 0.2 * np.sin(y / 20) + 0.2 * np.sin(x / 25), 0.2 / 20**2 + 0.2 / 25**2
     burst = f"source.burst={{frames: 4, shift: 12, rotation_deg: {turn}, downscale: {downscale}, phase: {phase}}}"
     clip = burst_of(light, tmp_path, "noise=none", burst)
-    bound = curvature / 8 * (downscale**2 + 2)  # of a frame, and of both frames in the picture
+    bound = curvature / 8 * (downscale**2 + 2)  # error in a frame, plus the errors of both frames in the picture
     errors = []
     for k, inverse in itertools.product(range(1, 4), (False, True)):
         places = np.indices(clip.clean[0].shape) + ug.flow(clip.rows, k, inverse=inverse)
@@ -62,7 +62,7 @@ def test_fixed_pattern_stays_on_the_sensor_and_noise_is_new_in_each_frame(tmp_pa
 
 @pytest.mark.slow
 def test_frames_are_the_exact_light_and_not_that_of_8_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two chains of docs/experiments/bursts.md on a dark picture."""
+    """Both generators of docs/experiments/bursts.md have the stated errors on a dark picture."""
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "docs" / "experiments")
     bursts = importlib.import_module("bursts")
     light, span = next(bursts.lights("dark dead_leaves-0")), bursts.SPAN[14]

@@ -46,7 +46,7 @@ def test_brackets_are_quantised_means_of_the_target(pattern: str) -> None:
         assert plan.scene.ev == ev and (own is None) == (plan.place.frame > 0)
         assert np.abs(pair.clean - exact).max() <= 0.5 + 2.0**-16 * 4 * (white - black)
     assert (made[2][1].clean == white).any() and np.array_equal(made[3][1].clean, made[0][1].clean)
-    assert not np.array_equal(made[3][1].noisy, made[0][1].noisy)  # as noise is new
+    assert not np.array_equal(made[3][1].noisy, made[0][1].noisy)  # because noise is new
 
 
 def test_exposure_times_and_dark_current_follow_and_effects_are_common() -> None:

@@ -16,7 +16,7 @@ SETTINGS = {
     "packed_at_night": [*NIGHT, "source.patch=[random,128,1]", "output.layout=packed"],
     "linear": ["source=linear", "source.burst={frames: 3, ev: [0, 2], downscale: 2}", "source.patch=[random,128,1]"],
 }
-"""Settings with several draws, with a physical profile and planes, and of linear sources."""
+"""Settings: several draws, a physical profile with packed frames, and linear sources."""
 
 
 @pytest.fixture(scope="module", params=SETTINGS)

@@ -30,7 +30,7 @@ def centre(patch: Patch, rule: BurstRule) -> tuple[float, float]:
 
 
 def shift_of(motion: Motion, y: float, x: float) -> tuple[float, float]:
-    """How far a position moves."""
+    """Distance by which a position moves."""
     return (
         motion.motion_yy * y + motion.motion_yx * x + motion.motion_y - y,
         motion.motion_xy * y + motion.motion_xx * x + motion.motion_x - x,
@@ -71,7 +71,7 @@ def test_motion_is_uniform_and_depends_on_seed_image_patch_and_frame_only() -> N
     assert draw_motion(few, 0, patch, 2) == same
     others = [(1, patch, 2), (0, Patch(96, 96, 1), 2), (0, Patch(96, 96, 4096), 2), (0, patch, 3)]
     assert same not in [draw_motion(few, *other) for other in others]
-    assert draw_motion(few, 0, Patch(96, 96, 0, 8, 40), 2) == same  # its place decides nothing
+    assert draw_motion(few, 0, Patch(96, 96, 0, 8, 40), 2) == same  # its place does not matter
     assert draw_motion(few, 0, patch, 2, epoch=1) != same
 
 
@@ -80,7 +80,7 @@ def test_motion_is_uniform_and_depends_on_seed_image_patch_and_frame_only() -> N
 def test_no_frame_sees_beyond_the_margin_and_little_of_it_is_spare(
     rule: BurstRule, patch: Patch, ends: tuple[int, int, int]
 ) -> None:
-    """The farthest motions of all, in the corners of the limits; few pixels more are kept free."""
+    """The margin covers the largest motions, and exceeds them by few pixels."""
     (y, x), sides = centre(patch, rule), (patch.height * rule.downscale, patch.width * rule.downscale)
     cosine, sine = cosine_and_sine(math.radians(rule.rotation_deg) * ends[0])
     motion = Motion(

@@ -29,7 +29,7 @@ DATASETS = {
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the datasets and their sources, which were elsewhere when they were made."""
+    """Return a folder with the datasets and their sources, which had another path when they were made."""
     folder = tmp_path_factory.mktemp("format_1")
     with zipfile.ZipFile(ARCHIVE) as archive:
         archive.extractall(folder)
@@ -56,7 +56,7 @@ def test_kept_dataset_is_read_verified_and_replayed(kept: Path, kind: str, figur
     figure("kept-datasets", f"{kind}: {len(done)} of {len(pairs)} pairs are the same")
 
 
-@pytest.mark.parametrize("kind", sorted(DATASETS.keys() - {"burst", "dark_frames"}))  # for darks it takes no folder
+@pytest.mark.parametrize("kind", sorted(DATASETS.keys() - {"burst", "dark_frames"}))  # no folder of dark frames
 def test_live_pairs_of_a_kept_dataset_are_its_pairs(kept: Path, kind: str) -> None:
     live = ug.LivePairs(kept / kind / "ds", root=kept / kind / "sources", redraw="none")
     for number, (clean, noisy, row) in enumerate(ug.RawPairs(kept / kind / "ds")):

@@ -1,4 +1,4 @@
-"""Scores of pairs that cameras recorded: exact on made-up ones, and those of the experiments on PolyU."""
+"""Scores of recorded pairs: exact on synthetic pairs, and on PolyU those of the experiments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIGNAL, ERROR = RANDOM.integers(0, 300, (24, 32), np.uint16), RANDOM.integers(0,
 
 
 def write(folder: Path, lines: str, **files: Any) -> Path:
-    """Write files, whose names have _ for the point, and their pairs.csv."""
+    """Write files, whose names have _ in place of a point, and their pairs.csv."""
     for name, content in files.items():
         path = folder / name.replace("_", ".")
         path.write_bytes(cv2.imencode(".png", content)[1].tobytes() if path.suffix == ".png" else content)

@@ -29,7 +29,7 @@ ROW: dict[str, Any] = {
     "source": "s",
 }
 LAST_DIGIT = 0.5e-6
-"""Largest error of a score by rounding."""
+"""Largest rounding error of a score."""
 
 
 def random(*shape: int, seed: int = 0) -> Any:
@@ -186,7 +186,7 @@ number = 5
 
 @pytest.fixture(autouse=True)
 def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore the places of modules, to which a method's folder is added."""
+    """Restore ``sys.path``, to which loading a method adds a folder."""
     monkeypatch.setattr(sys, "path", [*sys.path])
 
 

@@ -62,7 +62,7 @@ def by_definition(light: Normalised, motion: Motion, corner: tuple[int, int], sh
 
 
 def kernel_frame(motion: Motion, first: tuple[int, int], shape: tuple[int, int]) -> Normalised:
-    """Return the light of a crop, from no more of the scene than it reads, once the reference agrees."""
+    """Return the light of a crop from the part of the scene that it reads; check that the reference agrees."""
     y0, x0, y1, x1 = scene_box([motion], shape, first)
     light = scene((y0 - 1, x0 - 1, y1 + 1, x1 + 1))[1:-1, 1:-1]
     frame = burst.frame_light(light, motion, (y0, x0), first, shape)
@@ -101,7 +101,7 @@ def test_motion_by_integers_moves_pixels_exactly(y: int, x: int, shape: tuple[in
 
 @given(motions((1, 2, 4)), sides, st.integers(0, 3))
 def test_the_box_is_as_small_as_possible(motion: Motion, shape: tuple[int, int], side: int) -> None:
-    """Any row or column less leaves a position outside, or a neighbour of one."""
+    """Without any row or column of the box, a position or its neighbour is outside."""
     y0, x0, y1, x1 = box = scene_box([motion], shape)
     light = scene(box)[side == 0 : y1 - y0 - (side == 2), side == 1 : x1 - x0 - (side == 3)]
     corner = y0 + (side == 0), x0 + (side == 1)
