@@ -109,7 +109,7 @@ class Measured(PlanRecord, frozen=True, kw_only=True):
     counts: Annotated[Counts | None, FRAMES]
     source_noise_dn: Annotated[float | None, Field(
         "estimated noise of the source itself, in the green plane of the clean frame", Numbers(0), "DN",
-        needs=FOUND_FILES, empty_if=f"{FAILED}, or no tile of 32 x 32 pixels is free of clipping")]
+        needs=FOUND_FILES, empty_if=f"{FAILED}, is that of a burst, or no tile of 32 x 32 pixels is free of clipping")]
     # fmt: on
 
 

@@ -183,13 +183,13 @@ def _motion_panels(
     clean, row = base
     number = int(pair.row["frame"] or 0)
     start, moved = (
-        panels.grey_tiles(to_light(dn, row)) * np.float32(2.0 ** -float(row["ev"] or 0))
+        panels.grey_tiles(to_light(dn, row)) / np.float32(plan_from_row(row).scene.exposure)
         for dn, row in ((clean, row), (pair.clean, pair.row))
     )
     aligned = panels.moved(moved, flow_between_tiles([row, pair.row], number))
     limit = max(RMS_SHOWN * float(np.sqrt(np.mean(np.square(moved - start)))), 1e-6)
     before, after = (np.nan_to_num(frame - start) / limit / 2 + 0.5 for frame in (moved, aligned))
-    note = f"frame {number} - frame 0, +-{limit:.3g} of white, ev undone"
+    note = f"frame {number} - frame 0, +-{limit:.3g} of white, exposure undone"
     shown = (
         ("frame 0, clean", "square root", np.sqrt(np.clip(start, 0, 1))),
         ("difference", note, before),
