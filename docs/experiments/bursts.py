@@ -2,7 +2,7 @@
 
     python docs/experiments/bursts.py [--to RESULTS.json]
 
-Needs scikit-image (extra photos). The generator is implemented from its description: NTIRE 2021, burst super-resolution.
+Needs scikit-image (extra photos). The generator is implemented from its description (NTIRE 2021).
 """
 
 from __future__ import annotations
