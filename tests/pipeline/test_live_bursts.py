@@ -125,7 +125,7 @@ def test_the_target_of_planes_has_the_sites_of_the_planes(tmp_path: Path) -> Non
 
 def test_flips_of_clips_are_refused(dataset: tuple[Path, list[str]]) -> None:
     for clip in (ug.RawClips(dataset[0])[0], ug.RawClips(dataset[0], inputs="mosaic")[0]):
-        with pytest.raises(ValueError, match="x: is a clip, whose motion is not flipped"):
+        with pytest.raises(ValueError, match="x: is a clip, whose motion cannot be flipped"):
             ug.flip(clip, "horizontal")
 
 

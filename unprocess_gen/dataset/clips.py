@@ -52,7 +52,7 @@ class Clip(_Frames):
         dataset: str = "",
         targets: Mapping[str, NDArray[Any]] = MappingProxyType({}),
     ) -> Self:
-        """Tuple of three items with two more attributes."""
+        """Make the tuple, and set its other attributes."""
         clip = super().__new__(cls, clean, noisy, rows)
         clip.dataset, clip.targets = dataset, dict(targets)
         return clip

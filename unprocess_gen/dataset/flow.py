@@ -66,7 +66,7 @@ def flow(rows: Sequence[Row] | Mapping[str, Any], k: int, inverse: bool = False)
     first, other = (_row_of(rows, number) for number in (0, k))
     bursts = [tuple(row.get(name) for name in ("clip", "patch", "level", "draw")) for row in (first, other)]
     if bursts[0] != bursts[1]:
-        raise ValueError(f"flow: frames 0 and {k} are of different bursts; expected the rows of one")
+        raise ValueError(f"flow: frames 0 and {k} are of different bursts; expected the rows of one burst")
     origin, moved = (rebuild(Motion, row) for row in (first, other))
     step, offset = moved.burst_downscale, moved.pixel_offset + (moved.burst_downscale - 1) / 2
     shape = int(first["height"] or 0), int(first["width"] or 0)

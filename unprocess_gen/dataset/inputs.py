@@ -168,7 +168,7 @@ def flip(x: Any, how: str, pattern: str = "RGGB") -> Any:
     if how not in FLIPS:
         raise ValueError(f"how={how!r}: unknown; expected one of {', '.join(FLIPS)}")
     if hasattr(x, "rows") or (isinstance(x, Mapping) and "frame" in x):
-        raise ValueError("x: is a clip, whose motion is not flipped; expected a pair, or its arrays of mosaics")
+        raise ValueError("x: is a clip, whose motion cannot be flipped; expected a pair or a mosaic")
     if isinstance(x, Mapping):
         pattern = FILTERS[int(x["development"].pattern)]
         is_packed = x["noisy"].ndim == 3

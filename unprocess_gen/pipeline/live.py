@@ -335,7 +335,7 @@ class LivePairs(PairTable):
         return plan
 
     def _facts_of(self, number: int, settings: PairSettings, image: LiveImage, srgb: Srgb) -> Facts | None:
-        """Facts about the pixels of an image from which its parameters are redrawn; computed once a pair or burst."""
+        """Facts about the pixels of an image from which its parameters are redrawn, computed once for each item."""
         plan, facts = image.plan, self._facts.get(number)
         if facts is None:
             parts, stated, profile = parts_of(plan), stated_source(plan), plan.source.profile
