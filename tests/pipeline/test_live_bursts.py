@@ -1,6 +1,7 @@
 """Live bursts are the stored ones in epoch 0, and new bursts of the same picture later."""
 
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import unprocess_gen as ug
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.errors import ConfigError, DamageError
 
 NIGHT = ["body=sony_a7s2", "scene=night", "source.burst={frames: 3, ev: [0, -2], phase: corner, downscale: 2}"]
 SETTINGS = {
@@ -139,3 +140,23 @@ def test_a_loader_stacks_bursts(dataset: tuple[Path, list[str]]) -> None:
         assert batch["linear_rgb"].shape[0] == 2
     for bursts in (ug.RawClips(dataset[0]), ug.LivePairs(dataset[0])):
         assert next(iter(data.DataLoader(bursts, batch_size=2))).targets["linear_rgb"].shape[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("edits", "problem"),
+    [
+        ({"motion_yy": "1.7e308"}, "motion_yy=1.7e+308"),
+        ({"motion_y": "-5000.0"}, "00000000-p0000-f00: a frame of the burst shows rows -"),
+        ({"frame": "0"}, "not the first of 3 frames"),
+    ],
+)
+def test_edited_motion_is_damage(tmp_path: Path, edits: dict[str, str], problem: str) -> None:
+    settings = ["source.burst={frames: 3, downscale: 2}", "source.patch=[random,64,1]", "source.limit=1", "n_jobs=1"]
+    ug.generate(ug.load_config([*settings, f"out={tmp_path / 'ds'}"]))
+    manifest = tmp_path / "ds/manifest.csv"
+    header, first, row, last = (line.split(",") for line in manifest.read_text().splitlines())
+    for name, value in edits.items():
+        row[header.index(name)] = value
+    manifest.write_text("".join(",".join(line) + "\n" for line in (header, first, row, last)))
+    with pytest.raises(DamageError, match=re.escape(problem)):
+        ug.LivePairs(tmp_path / "ds")[1, 0]

@@ -18,7 +18,7 @@ from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.arrays import Srgb
-from unprocess_gen.core.errors import ConfigError, UnknownKeyError
+from unprocess_gen.core.errors import ConfigError, DamageError, UnknownKeyError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.forks import SharedCount
 from unprocess_gen.core.object_store import ObjectPath
@@ -128,7 +128,7 @@ class LivePairs(PairTable):
     ConfigError
         If an argument is not allowed, or the sources' folder is unknown.
     DamageError
-        If the manifest is damaged.
+        If the manifest is damaged; for a motion that leads outside of the picture, when the burst is read.
     MachineError
         If a source was changed or deleted, or the self-test fails; when a pair is read.
     SourceError
@@ -257,6 +257,8 @@ class LivePairs(PairTable):
         """Generate a burst: a `Clip`, or a dict with inputs."""
         settings, options, patch = source.settings, self._options, images[0].patch
         plans: Sequence[Plan] = [image.plan for image in images]
+        if not all(plan.motion and plan.place.frame == frame for frame, plan in enumerate(plans)):
+            raise DamageError(f"row {images[0].key}: not the first of the {rule.frames} frames of a burst")
         if epoch and self._redraw == "all":
             facts = facts_of_burst(rule, self._facts_of(number, settings, images[0], srgb))
             plans = redrawn_burst(settings, rule, plans, facts, epoch)
@@ -268,7 +270,10 @@ class LivePairs(PairTable):
             y, x = options.place(crop_words(*words), patch.height, patch.width)
             part = Patch(options.side, options.side, patch.patch, patch.patch_y + y, patch.patch_x + x)
         self_test.check(plans[:1])
-        made, targets = burst_pairs(settings, srgb, plans, patch, part, epoch, self._targets)
+        try:
+            made, targets = burst_pairs(settings, srgb, plans, patch, part, epoch, self._targets)
+        except ValueError as error:  # of an edited manifest, whose motion leads outside
+            raise DamageError(f"row {images[0].key}: {error}") from error
         samples, columns = [], list[Row]()
         for image, (plan, pair) in zip(images, made, strict=True):
             known = partial(Pair, pair.clean, pair.noisy, pair.counts)

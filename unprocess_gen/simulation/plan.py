@@ -351,6 +351,10 @@ class ScenePlan(PlanRecord, frozen=True):
         return power_of_two(self.ev) / self.exposure_ratio
 
 
+TURN, SHIFT = Numbers(-16, 16), Numbers(-(2**40), 2**40)
+"""Factors and offsets of a motion: more than any frame needs, and small enough that positions are finite."""
+
+
 class Motion(PlanRecord, frozen=True):
     """Map from pixels of a burst's frame to the target, and the resolution of the frame.
 
@@ -362,16 +366,16 @@ class Motion(PlanRecord, frozen=True):
     # fmt: off
     motion_yy: Annotated[float, Field(
         "factor of p in motion_yy p + motion_yx q + motion_y: the row of the target that pixel (p, q) of a burst's "
-        "frame shows, both at the resolution of the target", FINITE)]
-    motion_yx: Annotated[float, Field("factor of q in the row of the target, see motion_yy", FINITE)]
+        "frame shows, both at the resolution of the target", TURN)]
+    motion_yx: Annotated[float, Field("factor of q in the row of the target, see motion_yy", TURN)]
     motion_y: Annotated[float, Field(
-        "row of the target that pixel (0, 0) shows, see motion_yy", FINITE, "pixels of the target")]
+        "row of the target that pixel (0, 0) shows, see motion_yy", SHIFT, "pixels of the target")]
     motion_xy: Annotated[float, Field(
         "factor of p in motion_xy p + motion_xx q + motion_x: the column of the target that pixel (p, q) of a burst's "
-        "frame shows, both at the resolution of the target", FINITE)]
-    motion_xx: Annotated[float, Field("factor of q in the column of the target, see motion_xy", FINITE)]
+        "frame shows, both at the resolution of the target", TURN)]
+    motion_xx: Annotated[float, Field("factor of q in the column of the target, see motion_xy", TURN)]
     motion_x: Annotated[float, Field(
-        "column of the target that pixel (0, 0) shows, see motion_xy", FINITE, "pixels of the target")]
+        "column of the target that pixel (0, 0) shows, see motion_xy", SHIFT, "pixels of the target")]
     burst_downscale: Annotated[int, Field(
         "side s of the square of pixels of the target whose mean is a pixel of a burst's frame", Integers(1, 64),
         "pixels of the target")] = 1
