@@ -147,7 +147,7 @@ def test_a_loader_stacks_bursts(dataset: tuple[Path, list[str]]) -> None:
     [
         ({"motion_yy": "1.7e308"}, "motion_yy=1.7e+308"),
         ({"motion_y": "-5000.0"}, "00000000-p0000-f00: a frame of the burst shows rows -"),
-        ({"frame": "0"}, "not the first of 3 frames"),
+        ({"frame": "0"}, "not the first of the 3 frames"),
     ],
 )
 def test_edited_motion_is_damage(tmp_path: Path, edits: dict[str, str], problem: str) -> None:
