@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from unprocess_gen.pipeline.live import LivePairs, LiveSample
     from unprocess_gen.simulation.plan import Plan
 
-__version__ = "0.9.0"
+__version__ = "1.0.0rc1"
 
 __all__ = [
     "CameraFit",
