@@ -204,6 +204,15 @@ def test_patch_is_shown_with_its_part_of_the_source(key: str, gray_world: Path, 
     assert len(places(png(drawn[-1].files[0]), part)) == 1
 
 
+def test_root_may_be_one_photograph(gray_world: Path, make: Make, tmp_path: Path) -> None:
+    photograph = sorted(gray_world.iterdir())[0]
+    make(photograph, tmp_path / "ds")
+    (pair,) = sheets.selected_pairs(tmp_path / "ds", "", photograph)
+    assert pair.source is not None
+    with Image.open(photograph) as picture:
+        assert np.array_equal(pair.source, np.asarray(picture))
+
+
 # The command ----------------------------------------------------------------------------------------------------------
 
 

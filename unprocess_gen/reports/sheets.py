@@ -78,8 +78,8 @@ class SheetFiles(NamedTuple):
 
 def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterator[SheetPair]:
     """Yield the pairs of ``--keys``, by default `PAIRS_SHOWN`, with sources from ``source`` or the recorded folder."""
-    if source is not None and not source.is_dir():
-        raise ConfigError(f"source.root={source}: is not a folder; expected the folder of the photographs")
+    if source is not None and not source.exists():
+        raise ConfigError(f"source.root={source}: does not exist; expected the photographs of the dataset")
     pairs, manifest = RawPairs(folder), folder / "manifest.csv"
     if not len(pairs):
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
