@@ -36,7 +36,7 @@ def ssim(x: Any, y: Any, peak: float) -> float:
     """Structural similarity of two planes: the mean over the windows inside the plane."""
     inside, side, total = slice(WINDOW // 2, -(WINDOW // 2)), (WINDOW, WINDOW), 0.0
     for top in range(0, len(x) - WINDOW + 1, BAND):
-        a, b = (np.ascontiguousarray(plane[top : top + BAND + WINDOW - 1]) / peak for plane in (x, y))
+        a, b = (plane[top : top + BAND + WINDOW - 1].astype(np.float64, "C") / peak for plane in (x, y))
         moments = (cv2.GaussianBlur(band, side, WINDOW_STD)[inside, inside] for band in (a, b, a * a, b * b, a * b))
         a_mean, b_mean, aa, bb, ab = moments
         means, squares = a_mean * b_mean, a_mean * a_mean + b_mean * b_mean
