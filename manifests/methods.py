@@ -23,7 +23,11 @@ def by_frame(restore: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
 
     @functools.wraps(restore)
     def method(noisy: Any, row: Any) -> Any:
-        return restore(noisy, row) if noisy.ndim == 2 else np.stack([*map(restore, noisy, row)])
+        if isinstance(row, list):
+            return np.stack([*map(restore, noisy, row)])
+        if row["pattern"] == "sRGB":
+            raise ValueError("takes no sRGB pictures; use noisy, or a function of your own: FILE.py:function")
+        return restore(noisy, row)
 
     return method
 
@@ -50,6 +54,8 @@ def non_local_means(noisy: Any, row: Any) -> Any:
     """
     from skimage.restoration import denoise_nl_means  # extra "photos"
 
+    if "dark_variance_dn2" not in row:
+        raise ValueError("needs noise parameters, which rows of real pairs lack; use gaussian, or FILE.py:function")
     dark, black, white = (float(row[name] or 0) for name in ("dark_variance_dn2", "black_level_dn", "white_level_dn"))
     dark = max(dark, 0.0)
     gain = max(float(row["a_dn"] or 0), 1e-6 * math.sqrt(dark))  # nearly linear without shot noise

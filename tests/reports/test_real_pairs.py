@@ -67,6 +67,23 @@ def test_raw_pairs_are_compared_at_the_exposure_of_the_clean_frame(run_main: Run
 
 
 @pytest.mark.parametrize(
+    ("name", "method", "problem"),
+    [
+        ("a.png", "gaussian", "takes no sRGB pictures; use noisy, or"),
+        ("c.png", "non_local_means", "lack; use gaussian"),
+    ],
+)
+def test_methods_say_what_real_pairs_they_do_not_take(
+    name: str, method: str, problem: str, run_main: RunMain, tmp_path: Path
+) -> None:
+    pytest.importorskip("skimage")
+    lines = f"noisy,clean,group,pattern,black_dn,white_dn\n{name},{name},x"
+    write(tmp_path, lines + ",RGGB,0,1023" * (name == "c.png"), a_png=CODES.astype(np.uint8), c_png=SIGNAL)
+    done = run_main("score", "--real", tmp_path, "--method", method)
+    assert (done.code, problem in done.err, done.err.count("\n")) == (3, True, 1), done.err
+
+
+@pytest.mark.parametrize(
     ("line", "problem"),
     [
         ("a.png,no.png,x", "line 2: no.png: no such file below"),

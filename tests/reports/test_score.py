@@ -16,9 +16,19 @@ from helpers.commands import Cli, RunMain
 from helpers.datasets import Make, text_rows
 
 import unprocess_gen as ug
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.dataset.row import plan_from_row
 from unprocess_gen.reports.scoring.items import Item, Items, dataset_items
-from unprocess_gen.reports.scoring.metrics import BORDER, raw_scores, scores_of, target_scores
-from unprocess_gen.reports.scoring.scoring import DRAWS, MethodError, score_item, score_items, summaries
+from unprocess_gen.reports.scoring.metrics import BAND, BORDER, _developed, raw_scores, scores_of, target_scores
+from unprocess_gen.reports.scoring.scoring import (
+    DRAWS,
+    MethodError,
+    _expansion,
+    read_scores,
+    score_item,
+    score_items,
+    summaries,
+)
 
 PEAK = 3855
 ROW: dict[str, Any] = {
@@ -59,7 +69,7 @@ def test_sites_that_are_white_in_the_clean_frame_are_left_out() -> None:
     assert raw_scores(np.full_like(clean, 4095), output, ROW)["raw_psnr_unsaturated"] is None
 
 
-@pytest.mark.parametrize("shape", [(11, 40, 3), (30, 17, 4)])
+@pytest.mark.parametrize("shape", [(11, 40, 3), (30, 17, 4), (2 * BAND + 10, 14, 1), (2 * BAND + 11, 14, 1)])
 def test_ssim_is_that_of_scikit_image(shape: tuple[int, ...]) -> None:
     similarity = pytest.importorskip("skimage.metrics").structural_similarity
     x, y = random(*shape), random(*shape) + random(*shape, seed=1) / 4
@@ -76,6 +86,14 @@ def test_target_is_compared_without_its_border() -> None:
     assert target_scores(target, output)["linear_psnr"] is None
     output[BORDER, BORDER, 1] += 0.5
     assert target_scores(target, output)["linear_psnr"] == pytest.approx(10 * math.log10(20 * 24 * 3 / 0.25), abs=1e-9)
+
+
+def test_bands_are_developed_as_the_frame(dataset: Path) -> None:
+    clean, _, row = ug.RawPairs(dataset)[0]
+    repeats = 3 * BAND // clean.shape[0] + 2
+    tall = np.tile(clean, (repeats, 1))[: 2 * BAND + 2]
+    plan = plan_from_row(row)
+    assert (_developed(tall, plan) == isp.to_codes(isp.develop(tall.astype(np.float64), plan))).all()
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +169,12 @@ def test_interval_is_that_of_the_mean_of_independent_sources() -> None:
     assert found["mean"] == pytest.approx(values.mean(), abs=LAST_DIGIT)
     assert found["low"] == pytest.approx(values.mean() - half, abs=tolerance)
     assert found["high"] == pytest.approx(values.mean() + half, abs=tolerance)
+
+
+@pytest.mark.parametrize(("sources", "t", "share"), [(5, 2.776445, 3e-3), (20, 2.093024, 1e-5), (201, 1.971896, 1e-6)])
+def test_intervals_of_few_sources_are_those_of_student(sources: int, t: float, share: float) -> None:
+    """The mean of drawn sources has a variance that is (n - 1) / n of that of the mean of sources."""
+    assert _expansion(sources) == pytest.approx(math.sqrt(sources / (sources - 1)) * t / 1.959964, rel=share)
 
 
 def test_frames_of_a_source_are_drawn_together() -> None:
@@ -268,6 +292,19 @@ def test_methods_are_compared_pair_by_pair_with_the_same_digits_for_any_n_jobs(
     part = run_main("score", dataset, *against, "--keys", lines[0]["key"], "--to", "c")
     assert (part.code, len(part.err.splitlines())) == (2, 1)
     assert "has other pairs; expected the same dataset, --keys and --split" in part.err
+
+
+@pytest.mark.parametrize("value", ["x", [1], math.nan])
+def test_comparison_with_an_edited_file_is_refused(value: Any, tmp_path: Path) -> None:
+    pair = {"key": "0", "dataset": "ds", "source": "s", "raw_psnr": value}
+    other: dict[str, Any] = {
+        "method": "noisy",
+        "data": {"datasets": {"ds": "1"}, "keys": None, "split": None},
+        "pairs": [pair],
+    }
+    (tmp_path / "other.json").write_text(json.dumps(other))
+    with pytest.raises(ConfigError, match=r"other.json: .*; expected a score.json"):
+        read_scores(tmp_path / "other.json", other["data"])
 
 
 @pytest.mark.slow
