@@ -29,6 +29,7 @@ from unprocess_gen.reports.scoring.scoring import (
     score_items,
     summaries,
 )
+from unprocess_gen.simulation.reference import isp
 
 PEAK = 3855
 ROW: dict[str, Any] = {

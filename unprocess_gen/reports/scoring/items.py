@@ -62,7 +62,9 @@ def dataset_items(folder: AnyPath, keys: str | None = None, split: str | None = 
             clip = [row[name] for name in ("clip", "patch", "level", "draw")] if row["clip"] else [row["key"]]
             groups.setdefault((row["dataset"], *clip), []).append(number)
     if not groups:
-        raise ConfigError(f"score: {folder}: no pair of 2 x 2 sites in --keys {keys} --split {split}; expected one")
+        raise ConfigError(
+            f"score: {folder}: none of the pairs has 2 x 2 sites; expected one; choose other --keys or --split"
+        )
     digests = {name: read_dataset(dataset / "dataset.json")["fingerprint"] for name, dataset in folders.items()}
     data = {"name": folder_name(folder), "keys": keys, "split": split, "datasets": digests}
     return Items(data, len(groups), (_item([pairs[number] for number in group]) for group in groups.values()))

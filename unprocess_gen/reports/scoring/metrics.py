@@ -41,7 +41,7 @@ def ssim(x: Any, y: Any, peak: float) -> float:
         a_mean, b_mean, aa, bb, ab = moments
         means, squares = a_mean * b_mean, a_mean * a_mean + b_mean * b_mean
         total += np.sum((2 * means + C1) * (2 * (ab - means) + C2) / ((squares + C1) * (aa + bb - squares + C2)))
-    return float(total) / (x.shape[0] - WINDOW + 1) / (x.shape[1] - WINDOW + 1)
+    return float(total / (x.shape[0] - WINDOW + 1) / (x.shape[1] - WINDOW + 1))
 
 
 def scores_of(domain: str, clean: Any, output: Any, peak: float, unsaturated: Any = None) -> Scores:
