@@ -95,7 +95,7 @@ def test_methods_say_what_real_pairs_they_do_not_take(
         ("a.png,b.png,x,RGGB,0,255", "line 2: a.png has colours; expected a gray picture"),
         ("e.png,e.png,x,RGBG,0,255", "line 2: pattern=RGBG: expected"),
         ("f.png,a.png,x", "f.png: the file of 32 x 24 pixels lacks its IEND chunk"),
-        ("", "lists no pair"),
+        ("", "pairs.csv: no such file; expected a table"),
     ],
 )
 def test_lines_that_are_no_pair_are_refused(line: str, problem: str, run_main: RunMain, tmp_path: Path) -> None:

@@ -222,7 +222,7 @@ def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
         ("mine.py:exits", 3, "raised SystemExit: 4"),
         ("mine.py:nan", 3, "returned NaN"),
         ("mine.py:huge", 3, "values above"),
-        ("mine.py:shape", 3, r"returned uint16 \[\d+, \d+\]; expected numbers \(\d+, \d+\)"),
+        ("mine.py:shape", 3, r"returned uint16 \(\d+, \d+\); expected numbers \(\d+, \d+\)"),
         ("mine.py:text", 3, "returned <U5"),
         ("mine.py:one", 2, r"too many positional arguments; expected a function one\(noisy, row\) in mine.py"),
         ("mine.py:number", 2, "5 is not a callable"),

@@ -142,7 +142,8 @@ class Summary:
         if not self.made:
             return f"{self.out} is complete: {size}, {failures}; nothing to do"
         look = shlex.join(["gen-dataset", "preview", str(self.out), "--to", f"{self.out.name}_sheets"])
-        after = "; next: " + (look if self.has_frames else f'ug.LivePairs("{self.out}")') if has_next else ""
+        look = look if self.has_frames else f'ug.LivePairs("{self.out}")'
+        after = f"; next: {look}" if has_next and self.pairs else ""
         part = f" ({self.made} in this run)" if self.made < self.rows else ""
         return f"{self.out}: {size}{part}, {self.seconds:.1f} s, {failures}{after}"
 

@@ -85,7 +85,7 @@ def _check_size(config: SourceConfig, srgb: Srgb, layout: str, digest: str) -> N
     if burst is not None and not list_patches(rule, 0, *prepared, layout, burst=burst):
         what = "frame" if rule is None else f"patch of {side} x {side}"
         text = f"{width} x {height} pixels contain no {what} with the margin that the motion of source.burst needs"
-        raise SourceError("too_small", text, digest)
+        raise SourceError("too_small", f"{text}; reduce source.burst.shift or source.patch", digest)
     for (height, width), least, problem in (
         (decoded, config.downscale, f"are less than one square of source.downscale={config.downscale}"),
         (prepared, side, f"contain no patch of {side} x {side} (source.patch)"),

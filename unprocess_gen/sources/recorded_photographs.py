@@ -51,7 +51,7 @@ class RecordedPhotographs:
         except SourceError as error:
             if error.sha256 not in (None, recorded):
                 raise SourceChangedError(_changed(str(error.sha256), recorded)) from error
-            text = f"its source cannot be used ({error})"
+            text = f"source {source.name}: cannot be used below {self._root} ({error})"
             raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {RESTORE}")) from error
         except MachineError as error:
             raise SourceChangedError(f"{str(error).partition(';')[0]}; {RESTORE}") from error

@@ -103,6 +103,7 @@ def collect(folder: Path) -> Items:
             if pairs.setdefault(pair.noisy, pair) is not pair:
                 raise ConfigError(f"{place}: noisy={pair.noisy}: also in {pairs[pair.noisy].place}; remove one of them")
     if not pairs:
-        raise ConfigError(f"{table}: lists no pair; expected a table with the columns {','.join(columns[:3])}")
+        problem = "lists no pair" if table.is_file() else "no such file"
+        raise ConfigError(f"{table}: {problem}; expected a table with the columns {','.join(columns[:3])}")
     data = {"keys": None, "split": None, "name": table.parent.name, "datasets": {table.parent.name: file_sha256(table)}}
     return Items(data, len(pairs), (pair.item() for pair in pairs.values()))

@@ -73,7 +73,7 @@ def score_item(name: str, folder: str, item: Item) -> tuple[list[Record], float]
         output = np.asarray(method(noisy, rows) if item.is_clip else method(noisy[0], rows[0]))
         seconds = (time.perf_counter() - started) / (noisy.size / 1e6)
         if output.dtype.kind not in "iuf" or output.shape not in shapes:
-            problem = f"returned {output.dtype} {list(output.shape)}; expected numbers {' or '.join(map(str, shapes))}"
+            problem = f"returned {output.dtype} {output.shape}; expected numbers {' or '.join(map(str, shapes))}"
         elif not (np.abs(output := output.astype(np.float64)) < LARGEST).all():
             problem = "returned NaN, infinity or values above 2^32; expected DN"
     except (Exception, SystemExit) as error:
