@@ -95,7 +95,7 @@ def test_unmatched_files_are_counted_by_suffix_with_advice(tmp_path: Path) -> No
     assert unmatched == {".txt": 2, "": 1, ".jxl": 1, ".png": 1}
     sentence = unmatched_sentence(unmatched)
     assert sentence.startswith("5 files are not matched by source.include (2 .txt, 1 without suffix, ")
-    assert sentence.endswith("; set source.kind=srgb and extend source.include to read .png; convert .jxl to JPEG, PNG or TIFF")
+    assert sentence.endswith("; source.kind=srgb and source.include can read .png; convert .jxl to JPEG, PNG or TIFF")
     assert unmatched_sentence({}) == ""
     assert "9 .e, 19 others" in unmatched_sentence({f".{letter}": 9 for letter in "abcdefg"} | {"": 1})
     fill(tmp_path / "raw", "a.cr2", "b.dng", "c.dng")

@@ -42,7 +42,7 @@ NAMED_SUFFIXES = 5
 """Suffixes of unmatched files that `unmatched_sentence` names; the others are summed."""
 
 ADVICE = {
-    "set source.kind=srgb and extend source.include to read {}": {glob.removeprefix("*") for glob in SourceConfig.include},
+    "source.kind=srgb and source.include can read {}": {glob.removeprefix("*") for glob in SourceConfig.include},
     "convert {} to JPEG, PNG or TIFF": {".gif", ".jp2", ".jxl", ".ppm", ".psd"},
     "source.kind=raw reads {}": {".pgm", *RAW_FILES},
 }
