@@ -148,8 +148,8 @@ def _heading(pair: SheetPair, window: Window) -> list[str]:
     return [
         f"{pair.row['key']}   {pair.row['source']}   {width} x {height} {sensor.pattern}, {sensor.bits} bits, black "
         f"{sensor.black_level_dn}, white {sensor.white_level_dn} DN",
-        f"camera {pair.plan.camera.camera}, scene {scene.scene} (exposure ratio {scene.exposure_ratio:.4g}{stops}), noise "
-        f"{noise.noise}: {' '.join(noise.effects) or 'no effect'}",
+        f"camera {pair.plan.camera.camera}, scene {scene.scene} (exposure ratio {scene.exposure_ratio:.4g}{stops}), "
+        f"noise {noise.noise}: {' '.join(noise.effects) or 'no effect'}",
         f"details: rows {rows.start} to {rows.stop - 1}, columns {columns.start} to {columns.stop - 1}",
     ]
 
