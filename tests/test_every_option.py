@@ -47,7 +47,11 @@ REFUSED = {
     **{("experiment=brooks2019_training", entry): "source.patch=.* complete frames" for entry in ARRAYS[:2]},
     **{(option, entry): "is uint8" for option in LINEAR[:1] for entry in ARRAYS[:2]},
     **{(option, "CameraNoise"): "source.kind=linear: CameraNoise works on" for option in LINEAR},
-    **{(option, entry): "source.(patch|burst)=.* complete|is uint8" for option in LINEAR[1:] for entry in ARRAYS[:2]},
+    **{
+        (option, entry): "source.(patch|burst)=.* (complete|single) frames|is uint8"
+        for option in LINEAR[1:]
+        for entry in ARRAYS[:2]
+    },
     **{("experiment=ntire_burst_sr", entry): "source.(patch|burst)=|output.layout=packed: Camera" for entry in ARRAYS},
     ("experiment=brooks2019_training", "CameraNoise"): "source.downscale=2: CameraNoise keeps the geometry",
 }

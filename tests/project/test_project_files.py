@@ -58,8 +58,14 @@ def test_lock_file_follows_from_the_dependencies_and_names_public_hosts() -> Non
     lock = tomllib.loads(text)
     (own,) = (package for package in lock["package"] if package["name"] == "unprocess-gen")
     groups = {"": PROJECT["dependencies"], **PROJECT["optional-dependencies"]}
-    names = {extra: [Requirement(text).name for text in texts] for extra, texts in groups.items()}
-    wanted = {(name.lower().replace("_", "-"), extra) for extra in names for name in names[extra]}
+
+    def libraries(extra: str) -> set[str]:
+        needed = [*map(Requirement, groups[extra])]
+        own_extras = {inner for one in needed if one.name == "unprocess_gen" for inner in one.extras}
+        others = {one.name.lower().replace("_", "-") for one in needed if one.name != "unprocess_gen"}
+        return others.union(*map(libraries, own_extras))
+
+    wanted = {(name, extra) for extra in groups for name in libraries(extra)}
     recorded = {
         (one["name"], (re.findall(r"extra == '(\w+)'", one.get("marker", "")) or [""])[0])
         for one in own["metadata"]["requires-dist"]
