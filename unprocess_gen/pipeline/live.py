@@ -48,7 +48,7 @@ from unprocess_gen.pipeline.pairs import (
 from unprocess_gen.pipeline.replay import source_of
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.planning.effect_selection import facts_for
-from unprocess_gen.planning.plan import draw_split, next_dark_frame, redraw_plan
+from unprocess_gen.planning.plan import draw_split, next_dark_frame, redraw_plans
 from unprocess_gen.planning.raw_source import parts_of, stated_source
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.conditions import noisy_frames
@@ -261,7 +261,7 @@ class LivePairs(PairTable):
             raise DamageError(f"row {images[0].key}: not the first of the {rule.frames} frames of a burst")
         if epoch and self._redraw == "all":
             facts = facts_of_burst(rule, self._facts_of(number, settings, images[0], srgb))
-            plans = redrawn_burst(settings, rule, plans, facts, epoch)
+            plans = redrawn_burst(settings, plans, facts, epoch)
             plans, patch = moved_burst(settings, rule, plans, patch, (srgb.shape[0], srgb.shape[1]), epoch)
         part = patch
         if options.side is not None:
@@ -334,7 +334,7 @@ class LivePairs(PairTable):
         plan = image.plan
         if self._redraw == "all":
             facts = self._facts_of(number, settings, image, srgb)
-            plan = redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch)
+            (plan,) = redraw_plans(settings.config, plan, facts, settings.dark_frames, epoch)
         if plan.dark and settings.dark_frames is not None:
             plan = next_dark_frame(plan, settings.dark_frames, epoch)
         return plan

@@ -9,7 +9,7 @@ from unprocess_gen.config.interpretation import BurstRule, patch_rule
 from unprocess_gen.core.arrays import Srgb
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.pipeline.pairs import PairSettings, with_motion
-from unprocess_gen.planning.plan import next_dark_frame, redraw_plan
+from unprocess_gen.planning.plan import next_dark_frame, redraw_plans
 from unprocess_gen.simulation.bursts import BurstLight
 from unprocess_gen.simulation.facts import Facts
 from unprocess_gen.simulation.frames import Pair, Patch
@@ -17,11 +17,9 @@ from unprocess_gen.simulation.plan import Plan
 from unprocess_gen.sources.patches import list_patches
 
 
-def redrawn_burst(
-    settings: PairSettings, rule: BurstRule, plans: Sequence[Plan], facts: Facts | None, epoch: int
-) -> list[Plan]:
+def redrawn_burst(settings: PairSettings, plans: Sequence[Plan], facts: Facts | None, epoch: int) -> list[Plan]:
     """Draw the parameters of a burst's frames for an epoch, once for each exposure, except motion."""
-    drawn = [redraw_plan(settings.config, plan, facts, settings.dark_frames, epoch) for plan in plans[: len(rule.ev)]]
+    drawn = redraw_plans(settings.config, plans[0], facts, settings.dark_frames, epoch)
     return [drawn[k % len(drawn)].replace(place=plan.place, dark=plan.dark) for k, plan in enumerate(plans)]
 
 

@@ -101,13 +101,17 @@ def plan_pairs(
     return tuple(plans)
 
 
-def redraw_plan(config: Config, plan: Plan, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int) -> Plan:
-    """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay."""
+def redraw_plans(
+    config: Config, plan: Plan, facts: Facts | None, dark_frames: DarkFrames | None, epoch: int
+) -> list[Plan]:
+    """Draw new parameters of a pair for an epoch; its level, draw, frame, split and dark frame stay.
+
+    There is one plan, or one for each exposure of a burst.
+    """
     planner = _planner(with_raw_sensor(config, parts_of(plan)))
     images = planner.images(plan.seed, plan.stream_key, plan.split, facts, dark_frames, epoch)
-    exposures = planner.plans(images, plan.place, plan.dark)
-    redrawn = exposures[plan.place.frame % len(exposures)][0]
-    return redrawn.decoded(plan.source.profile, plan.source.pixels_xxh3)
+    redrawn = planner.plans(images, plan.place, plan.dark)
+    return [new.decoded(plan.source.profile, plan.source.pixels_xxh3) for new, _ in redrawn]
 
 
 def next_dark_frame(plan: Plan, dark_frames: DarkFrames, epoch: int) -> Plan:
