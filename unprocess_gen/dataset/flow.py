@@ -72,7 +72,7 @@ def flow(rows: Sequence[Row] | Mapping[str, Any], k: int, inverse: bool = False)
     shape = int(first["height"] or 0), int(first["width"] or 0)
     y, x = (step * values.astype(float) + offset for values in np.indices(shape, sparse=True))
     start, end = (moved, origin) if inverse else (origin, moved)
-    y, x = _inverse(end, *_shown(start, y, x))
+    y, x = _inverse(end, *start.position(y, x))
     return np.stack(
         [(at - offset) / step - pixels for at, pixels in zip((y, x), np.indices(shape, sparse=True), strict=True)]
     )
@@ -87,14 +87,6 @@ def _row_of(rows: Sequence[Row], frame: int) -> Row:
     problem = "its row has no motion" if found else f"no frame of this number in the frames {numbers}"
     problem = f"{len(found)} rows have this number" if len(found) > 1 else problem
     raise ValueError(f"flow: frame {frame}: {problem}; expected the rows of a burst, as RawClips gives them")
-
-
-def _shown(motion: Motion, y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Compute the position in the target that a high-resolution pixel of a frame shows."""
-    return (
-        motion.motion_yy * y + motion.motion_yx * x + motion.motion_y,
-        motion.motion_xy * y + motion.motion_xx * x + motion.motion_x,
-    )
 
 
 def _inverse(motion: Motion, y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

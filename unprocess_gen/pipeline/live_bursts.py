@@ -58,7 +58,5 @@ def _of_crop(plan: Plan, patch: Patch, crop: Patch) -> Plan:
             for of_crop, of_patch in zip(crop.origin, patch.origin, strict=True))  # fmt: skip
     if not (y or x):
         return plan
-    return plan.replace(
-        motion_y=motion.motion_yy * y + motion.motion_yx * x + motion.motion_y - y,
-        motion_x=motion.motion_xy * y + motion.motion_xx * x + motion.motion_x - x,
-    )
+    row, column = motion.position(y, x)
+    return plan.replace(motion_y=row - y, motion_x=column - x)

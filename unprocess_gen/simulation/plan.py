@@ -384,6 +384,11 @@ class Motion(PlanRecord, frozen=True):
         "centre, s i for corner", Choice("centre", "corner"))] = "centre"
     # fmt: on
 
+    def position(self, y: Any, x: Any) -> tuple[Any, Any]:
+        """Compute the position in the target that a pixel shows, or arrays of pixels; sums are from left to right."""
+        row = self.motion_yy * y + self.motion_yx * x + self.motion_y
+        return row, self.motion_xy * y + self.motion_xx * x + self.motion_x
+
     @property
     def pixel_offset(self) -> float:
         """Offset of the first pixel of a square from s i: 0, or -(s - 1) / 2 with ``corner``."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -77,7 +76,7 @@ def frame_light(
     for m in range(step):
         row = np.zeros_like(total)
         for n in range(step):
-            y, x = _position(motion, rows[m::step, None], columns[n::step])
+            y, x = motion.position(rows[m::step, None], columns[n::step])
             row += _weighted_columns(light, y, x, corner)
         total += row
     return np.asarray((total[0] + total[1]) / np.float32(step * step))
@@ -171,10 +170,4 @@ def check_inside(
 def _end_positions(motion: Motion, first: tuple[int, int], shape: tuple[int, int]) -> list[tuple[float, float]]:
     """Compute the positions of the four corner samples of a crop."""
     rows, columns = (places[[0, -1]].tolist() for places in sample_places(motion, first, shape))
-    return [_position(motion, y, x) for y in rows for x in columns]
-
-
-def _position(motion: Motion, y: Any, x: Any) -> tuple[Any, Any]:
-    """Compute A·p + b; sums are computed from left to right."""
-    row = motion.motion_yy * y + motion.motion_yx * x + motion.motion_y
-    return row, motion.motion_xy * y + motion.motion_xx * x + motion.motion_x
+    return [motion.position(y, x) for y in rows for x in columns]
