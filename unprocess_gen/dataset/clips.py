@@ -17,6 +17,7 @@ from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.development import development_parameters
 from unprocess_gen.dataset.inputs import Options, stackable_row
+from unprocess_gen.dataset.keys import clip_identity
 from unprocess_gen.dataset.reader import DatasetPath, RawPairs, Sample
 
 
@@ -180,8 +181,7 @@ class RawClips:
         clips: dict[tuple[Any, ...], list[int]] = {}
         for number, (dataset, row) in enumerate(numbered):
             if row["clip"]:
-                place = dataset, row["clip"], row["patch"], row["level"], row["draw"]
-                clips.setdefault(place, []).append(number)
+                clips.setdefault((dataset, *clip_identity(row)), []).append(number)
         if not clips:
             raise ConfigError(
                 f"RawClips: {path}: has no clips; expected a dataset of source.clips=true or source.burst; use RawPairs"

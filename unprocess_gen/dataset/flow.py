@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.dataset.columns import Row, rebuild
+from unprocess_gen.dataset.keys import clip_identity
 from unprocess_gen.dataset.reader import row_of_batch
 from unprocess_gen.simulation.plan import Motion
 
@@ -64,8 +65,7 @@ def flow(rows: Sequence[Row] | Mapping[str, Any], k: int, inverse: bool = False)
         columns = [values.tolist() if hasattr(values, "tolist") else values for values in rows.values()]
         rows = [dict(zip(rows, cells, strict=True)) for cells in zip(*columns, strict=True)]
     first, other = (_row_of(rows, number) for number in (0, k))
-    bursts = [tuple(row.get(name) for name in ("clip", "patch", "level", "draw")) for row in (first, other)]
-    if bursts[0] != bursts[1]:
+    if clip_identity(first) != clip_identity(other):
         raise ValueError(f"flow: frames 0 and {k} are of different bursts; expected the rows of one burst")
     origin, moved = (rebuild(Motion, row) for row in (first, other))
     step, offset = moved.burst_downscale, moved.pixel_offset + (moved.burst_downscale - 1) / 2

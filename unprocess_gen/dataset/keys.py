@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 
-from unprocess_gen.dataset.columns import Row
+from unprocess_gen.dataset.columns import Row, Value
 from unprocess_gen.simulation.plan import Place
 
 
@@ -27,6 +27,11 @@ def frame_key(sample: str, frame: int) -> str:
 def burst_key(key: str) -> str:
     """Key of the burst of a frame: the key of the frame without number, level and draw."""
     return key.partition("-f")[0]
+
+
+def clip_identity(row: Row) -> tuple[Value, ...]:
+    """Cells that the frames of one clip or burst share: clip, patch, level and draw."""
+    return tuple(map(row.get, ("clip", "patch", "level", "draw")))
 
 
 def pair_key(sample: str, place: Place, several: bool) -> str:

@@ -13,6 +13,7 @@ from unprocess_gen.core.paths import AnyPath, folder_name
 from unprocess_gen.core.targets import LINEAR_RGB
 from unprocess_gen.dataset.columns import Row
 from unprocess_gen.dataset.dataset_json import read_dataset
+from unprocess_gen.dataset.keys import clip_identity
 from unprocess_gen.dataset.reader import RawPairs, Sample, dataset_folders, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.reports.scoring.metrics import Scores, frame_scores
@@ -59,7 +60,7 @@ def dataset_items(folder: AnyPath, keys: str | None = None, split: str | None = 
     for number, row in enumerate(pairs.rows):
         has_tile = all(int(row[side] or 0) > 1 for side in ("height", "width"))
         if has_tile and (keys is None or (row["dataset"], row["key"]) in wanted):
-            clip = [row[name] for name in ("clip", "patch", "level", "draw")] if row["clip"] else [row["key"]]
+            clip = clip_identity(row) if row["clip"] else (row["key"],)
             groups.setdefault((row["dataset"], *clip), []).append(number)
     if not groups:
         raise ConfigError(
