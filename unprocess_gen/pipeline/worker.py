@@ -109,10 +109,7 @@ def make_image(
     made.report.warnings += [f"{source.name} {photograph.note}"] if photograph.note else []
     with timed("simulate_s"):
         image = plan_pixels(context.settings, photograph, source, sha256)
-        is_single = (
-            config.source.place is not None and image.plans[0].motion is None
-        )  # means of a burst have less noise
-        noise_dn = source_noise_dn(photograph.srgb, image.plans[0]) if is_single else None
+        noise_dn = None if config.source.place is None else source_noise_dn(photograph.srgb, image.plans[0])
     if config.output.frames:
         _test_kernels(context, image, made)
     identity = source, sha256, photograph.orientation, shard

@@ -57,8 +57,10 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     The mean magnitude of the Laplacian measures the noise of a tile (Immerkær, "Fast noise variance estimation", CVIU
     1996); edges raise it. Tiles are therefore sorted by its value in the codes of the source, where noise depends
     little on brightness, and only the quieter half is used. Tiles with a code at either end of the range have less
-    noise than the others and are left out.
+    noise than the others and are left out. Frames of bursts have no tiles, because their means have less noise.
     """
+    if plan.motion is not None:
+        return TileNoise(np.zeros(0), np.zeros(0))
     codes: Any = _green_sites(srgb, plan.sensor.pattern)
     tiles, last, plane = codes, last_code(srgb), 1 if "R" in plan.sensor.pattern[:2] else 2
     if plan.source.is_linear:

@@ -139,7 +139,6 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         for array in arrays:
             array_xxh3(array)
             hashlib.sha256(array.data)
-    is_single = config.source.place is not None and image.plans[0].motion is None
     warning = clipped_low_warning(clipped, sites) if photograph.raw is not None else ""
     return SourceEstimate(
         source,
@@ -148,7 +147,7 @@ def estimate_source(settings: PairSettings, source: Source) -> SourceEstimate:
         levels=levels,
         patches=len(image.patches),
         pairs=len(image.patches) * len(image.plans),
-        noise_ratio=noise_ratio(photograph.srgb, image.plans[0]) if is_single else None,
+        noise_ratio=None if config.source.place is None else noise_ratio(photograph.srgb, image.plans[0]),
         profile=photograph.profile.name,
         note="; ".join(filter(None, (photograph.note, warning))),
     )
