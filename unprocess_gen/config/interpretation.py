@@ -202,9 +202,10 @@ class BurstRule:
         """Side of a 2 x 2 tile of the sensor in pixels of the picture."""
         return 2 * self.downscale
 
-    def stops(self, frame: int) -> float:
-        """Exposure of a frame in stops."""
-        return self.ev[frame % len(self.ev)]
+    @property
+    def exposures(self) -> tuple[float, ...]:
+        """Exposures in stops that a frame has; frame k has the one with number k modulo their count."""
+        return self.ev[: self.frames]
 
     def margin(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of the picture that frames may show beyond a target of these sides."""

@@ -72,7 +72,7 @@ def _check_burst(config: Config) -> None:
                 f"{name}={length} with source.burst.downscale={rule.downscale}; expected a multiple of {rule.tile}"
             )
             raise refusal("source.patch", source.patch, f"{problem} pixels, 2 x 2 sites of the sensor")
-    stops, ev = rule.ev[: rule.frames], EV.parse("scene.ev", config.scene.ev)
+    stops, ev = rule.exposures, EV.parse("scene.ev", config.scene.ev)
     ends = lowest(ev) + min(stops), highest(ev) + max(stops)
     if not EV.numbers.low <= ends[0] <= ends[1] <= EV.numbers.high:
         problem = f"with scene.ev exposures from {ends[0]:g} to {ends[1]:g} stops; expected {EV.numbers}"

@@ -212,7 +212,7 @@ class Planner:
         levels_dn, saturated_as = (sensor.black_level_dn, sensor.white_level_dn), interpretation.saturated_as(config)
         self._sensor = SensorPlan(sensor.pattern, sensor.bits, *levels_dn, sensor.clip, saturated_as)
         rule = burst_rule(config.source)
-        self._stops = (0.0,) if rule is None else rule.ev[: rule.frames]
+        self._stops = (0.0,) if rule is None else rule.exposures
         self._motion = None if rule is None else still(rule)
         clean_dtype = FLOAT32 if interpretation.has_float_clean(config) else ""
         self._output = OutputPlan(config.output.dtype, config.output.layout, clean_dtype)

@@ -148,7 +148,7 @@ def _burst_sentences(config: Config) -> list[str]:
     if rule is None:
         return []
     margin = f", a margin of {rule.margin(patch.side, patch.side)[0]} pixels" if patch else ""
-    stops = sorted({rule.stops(frame) for frame in range(rule.frames)})
+    stops = sorted({*rule.exposures})
     exposures = ", ".join(f"{stop:g}" for stop in stops)
     above = config.source.kind == "srgb" and stops[-1] > 0
     return [
