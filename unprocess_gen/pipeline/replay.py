@@ -114,8 +114,7 @@ class PairRegenerator:
         self_test.check([plan], names)
         photograph = self._photographs.load(source_of(row), str(row["source_sha256"]), plan.source)
         plan, patch = plan.decoded(photograph.profile, photograph.pixels_xxh3), patch_from_row(row)
-        step = plan.motion.burst_downscale if plan.motion else 1
-        height, width = (side // step for side in photograph.srgb.shape[:2])
+        height, width = (side // plan.pixel_side for side in photograph.srgb.shape[:2])
         if patch.patch_y + patch.height > height or patch.patch_x + patch.width > width:
             raise DamageError(
                 f"its patch of {patch.width} x {patch.height} pixels at row {patch.patch_y}, column {patch.patch_x} "

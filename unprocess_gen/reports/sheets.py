@@ -89,7 +89,7 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
         plan, part, missing = plan_from_row(row), None, ""
         try:
             photograph = sources.load(source_of(row), str(row["source_sha256"]), plan.source)
-            part = crop_patch(photograph.srgb, _part_of_source(row))
+            part = crop_patch(photograph.srgb, _part_of_source(row, plan))
             plan = plan.decoded(photograph.profile, photograph.pixels_xxh3)
         except (SourceChangedError, DamageError, ConfigError) as error:  # the sheet is drawn without this photograph
             missing = str(error)
@@ -100,9 +100,9 @@ def selected_pairs(folder: AnyPath, keys: str, source: AnyPath | None) -> Iterat
         yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan, part, missing, base)
 
 
-def _part_of_source(row: Row) -> Patch:
+def _part_of_source(row: Row, plan: Plan) -> Patch:
     """Part of a source that a pair shows; for a burst, its target."""
-    patch, step = patch_from_row(row), int(row["burst_downscale"] or 1)
+    patch, step = patch_from_row(row), plan.pixel_side
     return Patch(patch.width * step, patch.height * step, patch.patch, patch.patch_y * step, patch.patch_x * step)
 
 
@@ -214,8 +214,7 @@ def flow_between_tiles(rows: Sequence[Row], frame: int) -> Float:
 def _views(pair: SheetPair, source: Srgb, window: Window, panel_px: tuple[int, int]) -> tuple[Float, Float]:
     """The source scaled to a panel, and its detail, in [0, 1]; light of a linear source may be beyond."""
     white = 1.0 if source.dtype.kind == "f" else float(last_code(source))
-    step = 1 if pair.plan.motion is None else pair.plan.motion.burst_downscale
-    rows, columns = (slice(part.start * step, part.stop * step) for part in window)
+    rows, columns = (slice(part.start * pair.plan.pixel_side, part.stop * pair.plan.pixel_side) for part in window)
     detail = panels.fit_image(
         source[rows, columns], (window[0].stop - window[0].start, window[1].stop - window[1].start)
     )

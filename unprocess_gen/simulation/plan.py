@@ -584,6 +584,11 @@ class Plan(PlanRecord, frozen=True, kw_only=True):
         return f"Plan(stream_key={key:016x}, camera={camera}, noise={noise}, scene={scene}, accuracy={self.accuracy})"
 
     @property
+    def pixel_side(self) -> int:
+        """Side of the square of the picture that a pixel of the frames shows: more than 1 for bursts only."""
+        return 1 if self.motion is None else self.motion.burst_downscale
+
+    @property
     def of_light(self) -> Self:
         """Plan whose source is light in camera RGB at the resolution of the frame; without motion, this plan."""
         if self.motion is None:
